@@ -68,7 +68,7 @@ def settings_for(world: Path, split_s: float) -> Settings:
 
 
 def server_over(settings: Settings) -> EpisodicServer:
-    """Returns a server whose catalogue knows every bag."""
+    """Returns a server that has every bag stored."""
     memory = build_memory(settings)
     memory.index.refresh()
     made_known(memory, settings)

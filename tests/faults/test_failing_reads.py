@@ -12,13 +12,13 @@ import random
 import resource
 import sqlite3
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 import zstandard
 
+from ros2_memory.columns.fill import RETRY_NS, Progress
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.index.file_state import RETRY_SOON_NS
 from ros2_memory.serving.health import Health
@@ -124,24 +124,21 @@ async def test_a_disk_that_fails_under_a_running_memory_loses_nothing(
     assert (await Health(memory, "1")())["status"] == "ok"
 
 
-def test_a_disk_that_fails_while_bags_are_digested_has_them_digested_later(
+def test_a_disk_that_fails_while_bags_are_stored_has_them_stored_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     write_bags(tmp_path, COUNT)
-    memory, filler = served(tmp_path)
     clock = SettableClock(NOW.now())
-    memory = replace(memory, clock=clock)
-    filler._memory = memory
+    memory, filler = served(tmp_path, clock)
     right = told(memory, count=COUNT)
     for after in range(0, 60, 3):
         with failing(monkeypatch, OPEN) as disk:
             disk.fail(errno.EIO, after=after)
             fill_up(filler)
-    assert memory.recall is not None
-    clock.at += 600 * RETRY_SOON_NS
+    assert filler.progress().refused
+    clock.at += RETRY_NS
     fill_up(filler)
-    assert filler.progress().waiting == 0
-    assert filler.progress().refused == 0
+    assert filler.progress() == Progress(COUNT, COUNT)
     assert told(memory, count=COUNT) == right
 
 

@@ -12,9 +12,10 @@ import pytest
 import structlog
 
 from ros2_memory.bag_dir.durable_write import write_all_durably, write_durably
-from ros2_memory.catalogue.store import FILE, FOLDER
-from tests.faults.test_catalogue_faults import assert_sound, trouble_of
-from tests.faults.world import fill_up, plainly, served, told, write_bags
+from ros2_memory.columns.fill import Progress
+from tests.faults.test_store_faults import assert_sound
+from tests.faults.world import fill_up, plainly, served, store_of, told, write_bags
+from tests.support.column_worlds import store_file
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,7 +34,7 @@ def no_file_grows_beyond(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [4096, 20_000])
-def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
+def test_a_store_that_cannot_be_written_costs_no_answer_and_is_filled_later(
     tmp_path: Path, size: int
 ) -> None:
     (tmp_path / "recorder.json").write_text("{}")
@@ -45,17 +46,17 @@ def test_a_catalogue_that_cannot_be_written_costs_no_answer_and_is_filled_later(
     with no_file_grows_beyond(size), structlog.testing.capture_logs() as logs:
         for _ in range(3):
             fill_up(filler)
-        assert "cannot be used" in (trouble_of(filler) or "")
-        assert filler.progress().waiting == 3
+        assert "cannot be used" in (store_of(filler).trouble or "")
+        assert filler.progress() == Progress(6, 3, 3)
         assert told(memory, count=6) == right
     events = [each["event"] for each in logs if each["event"].startswith("database")]
-    # Once each: the file of digests, and that of columns.
-    assert events == ["database_failed"] * 2
+    assert events == ["database_failed"]
     filler.look_after(thorough=True)
     fill_up(filler)
-    assert (trouble_of(filler), filler.progress().waiting) == (None, 0)
+    assert store_of(filler).trouble is None
+    assert filler.progress() == Progress(6, 6)
     assert told(memory, count=6) == right
-    assert_sound(tmp_path / FOLDER / FILE)
+    assert_sound(store_file(tmp_path))
 
 
 @pytest.mark.parametrize("function", ["fsync", "open", "replace"])

@@ -1,4 +1,4 @@
-"""SIGKILL of the server at any moment, while clients ask and its helper digests.
+"""SIGKILL of the server at any moment, while clients ask and its helper stores bags.
 
 `FAULTS_KILLS` is how many (2 unless given): `FAULTS_KILLS=200 uv run pytest -n0 -s
 tests/faults/test_kills.py` takes some minutes, and prints how long the next start took to answer.
@@ -20,26 +20,32 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import children_of, is_alive, load, serving, start, stop
 from tests.faults.world import write_bags
+from tests.support.column_worlds import store_file
 from tests.support.processes import until
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 KILLS = int(os.environ.get("FAULTS_KILLS", "2"))
 COUNT = 60
-"""Bags: more than the server digests by itself, so that its helper runs."""
-LONGEST_S = 2.0
+"""Bags: more than the server stores by itself, so that its helper runs."""
+MOST_ANSWERS = 100
+"""Answers before a kill: about as many as clients get in two seconds."""
 
 
 def gone(number: int) -> bool:
     return not is_alive(number)
 
 
+def has_answered(answered: Sequence[str], least: int) -> bool:
+    return len(answered) >= least
+
+
 def sound(bag_dir: Path) -> bool:
-    path = bag_dir / FOLDER / FILE
+    path = store_file(bag_dir)
     if not path.exists():
         return True
     with closing(sqlite3.connect(path)) as base:
@@ -60,7 +66,7 @@ def test_after_a_kill_at_any_moment_the_next_start_answers_the_same(
     try:
         for nth in range(KILLS):
             with load(running, COUNT) as answered:
-                time.sleep(draw.uniform(0, LONGEST_S))
+                until(partial(has_answered, answered, draw.randint(0, MOST_ANSWERS)))
                 helpers = children_of(bag_dir)
                 running.kill()
             helped += bool(helpers)
@@ -69,8 +75,8 @@ def test_after_a_kill_at_any_moment_the_next_start_answers_the_same(
                 until(partial(gone, helper))
             assert sound(bag_dir), nth
             if nth % 2:
-                # So that there is something to digest when it is killed again.
-                shutil.rmtree(bag_dir / FOLDER, ignore_errors=True)
+                # So that there is something to store when it is killed again.
+                shutil.rmtree(store_file(bag_dir).parent, ignore_errors=True)
             begun = time.monotonic()
             running = start(bag_dir, tmp_path / f"log_{nth}")
             assert running.ask("get_topic_at_time", {"topic": "/odom", "timestamp": 1700000042})
@@ -86,7 +92,7 @@ def test_after_a_kill_at_any_moment_the_next_start_answers_the_same(
         )
 
 
-def test_the_helper_that_digests_dies_with_its_server(tmp_path: Path) -> None:
+def test_the_helper_that_stores_bags_dies_with_its_server(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir, COUNT)
     running = start(bag_dir, tmp_path / "log")
@@ -104,4 +110,4 @@ def test_a_helper_whose_server_is_gone_before_it_begins_does_nothing(tmp_path: P
     environment = os.environ | {"MEMORY_BAG_DIR": str(tmp_path)}
     ended = subprocess.run(command, env=environment, capture_output=True, check=False)
     assert ended.returncode == 2
-    assert not (tmp_path / FOLDER).exists()
+    assert not store_file(tmp_path).parent.exists()

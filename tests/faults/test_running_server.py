@@ -1,8 +1,8 @@
 """A running server whose files are taken, filled, locked and given back.
 
 What is promised of each: right answers or honest ones meanwhile, the reason in `/health`, and
-everything as it was when the fault is over, without a restart. With `FAULTS_ALL=1` every fault of a
-catalogue is tried on a server, which takes a minute, and otherwise a few.
+everything as it was when the fault is over, without a restart. With `FAULTS_ALL=1` every fault of the
+store is tried on a server, which takes a minute, and otherwise a few.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ros2_memory.catalogue.store import FILE, FOLDER
-from tests.faults import test_catalogue_faults as faults
+from tests.faults import test_store_faults as faults
 from tests.faults.running import Running, serving
 from tests.faults.small_disk import filled, mount, needs_mounts, small_disk, unmount
 from tests.faults.world import write_bag, write_bags
+from tests.support.column_worlds import store_file
 from tests.support.processes import until
 
 COUNT = 12
@@ -32,18 +32,18 @@ FAULTS = (
 
 
 def is_ready(running: Running, bags: int) -> bool:
-    """Whether nothing is amiss, and all these bags are in the catalogue."""
+    """Whether nothing is amiss, and all these bags are stored."""
     reply = running.health()
-    catalogue = reply.get("catalogue", {})
-    known = (catalogue.get("bags"), catalogue.get("waiting"), catalogue.get("state"))
+    store = reply.get("store", {})
+    known = (store.get("bags"), store.get("waiting"), store.get("state"))
     return reply["status"] == "ok" and known == (bags, 0, "ready")
 
 
 def holds(path: Path, bags: int) -> bool:
-    """Whether another program finds a whole catalogue there, with so many bags in it."""
+    """Whether another program finds a whole store there, with so many bags in it."""
     try:
         with closing(sqlite3.connect(f"file:{path}?mode=rw", uri=True)) as base:
-            [(count,)] = base.execute("SELECT count(*) FROM bags").fetchall()
+            [(count,)] = base.execute("SELECT count(*) FROM bag WHERE size >= 0").fetchall()
             return bool(count == bags) and base.execute("PRAGMA quick_check").fetchone() == ("ok",)
     except sqlite3.Error:
         return False
@@ -70,10 +70,10 @@ def is_honest(answer: str) -> bool:
     return isinstance(reply, dict) and ("error" in reply or bool(reply.get("notes")))
 
 
-def test_the_catalogue_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None:
+def test_the_store_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir, COUNT)
-    path = bag_dir / FOLDER / FILE
+    path = store_file(bag_dir)
     with serving(bag_dir, tmp_path / "log") as running:
         recovers(running, COUNT)
         right = running.ask_all(COUNT)
@@ -91,22 +91,22 @@ def test_the_catalogue_comes_back_whatever_becomes_of_it(tmp_path: Path) -> None
     faults.assert_sound(path)
 
 
-def test_a_catalogue_that_another_program_holds_is_said_and_waited_for(tmp_path: Path) -> None:
+def test_a_store_that_another_program_holds_is_said_and_waited_for(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir, COUNT)
-    path = bag_dir / FOLDER / FILE
+    path = store_file(bag_dir)
     with serving(bag_dir, tmp_path / "log") as running:
         recovers(running, COUNT)
         with closing(sqlite3.connect(path, isolation_level=None)) as other:
             other.execute("BEGIN EXCLUSIVE")
             before = len(running.events("database_failed"))
             write_bag(bag_dir, COUNT)
-            says(running, "the catalogue cannot be used: database is locked")
+            says(running, "the store of columns cannot be used: database is locked")
             answers = running.ask_all(COUNT + 1)
         recovers(running, COUNT + 1)
         assert running.ask_all(COUNT + 1) == answers
         assert "thing12" in answers[3]
-        # Once by the server, and by its child that digested the first bags, if that still ran.
+        # Once by the server, and by its child that stored the first bags, if that still ran.
         assert len(running.events("database_failed")) - before in {1, 2}
 
 
@@ -135,8 +135,9 @@ def test_a_disk_that_is_unmounted_and_mounted_again_loses_nothing(tmp_path: Path
         mount(kept, "--bind", str(bag_dir))
         try:
             write_bags(bag_dir, COUNT)
-            # The catalogue in the cache folder is the one that could be purged meanwhile.
-            with serving(bag_dir, tmp_path / "log", "recorder=none", environment=cache) as running:
+            # The store in the cache folder is the one that could be pruned meanwhile.
+            told = ("recorder=none", "logging.level=debug")
+            with serving(bag_dir, tmp_path / "log", *told, environment=cache) as running:
                 recovers(running, COUNT)
                 right = running.ask_all(COUNT)
                 unmount(bag_dir)
@@ -144,17 +145,17 @@ def test_a_disk_that_is_unmounted_and_mounted_again_loses_nothing(tmp_path: Path
                 for answer in running.ask_all(COUNT):
                     assert is_honest(answer), answer
                 assert not list(bag_dir.iterdir())
-                digested = len(running.events("bag_digested"))
+                assert len(running.events("bag_stored")) == COUNT
                 mount(bag_dir, "--bind", str(kept))
                 recovers(running, COUNT)
                 assert running.ask_all(COUNT) == right
-                assert len(running.events("bag_digested")) == digested
+                assert len(running.events("bag_stored")) == COUNT
         finally:
             unmount(kept)
 
 
 @needs_mounts
-def test_a_full_disk_under_the_catalogue_is_said_and_got_over(tmp_path: Path) -> None:
+def test_a_full_disk_under_the_store_is_said_and_got_over(tmp_path: Path) -> None:
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir, COUNT)
     with small_disk(tmp_path / "cache", "4m") as cache, ExitStack() as stack:
@@ -164,7 +165,7 @@ def test_a_full_disk_under_the_catalogue_is_said_and_got_over(tmp_path: Path) ->
         running = stack.enter_context(
             serving(bag_dir, tmp_path / "log", "recorder=none", environment=place)
         )
-        says(running, "the catalogue is kept in memory: no file can be written for it")
+        says(running, "the store of columns is kept in memory: no file can be written for it")
         right = running.ask_all(COUNT)
         full.close()
         recovers(running, COUNT)
@@ -205,11 +206,11 @@ def test_after_a_crash_by_a_truncated_shared_memory_file_the_next_start_is_right
     """The system ends a program whose mapped file is cut: nothing can be done but to start anew."""
     bag_dir = tmp_path / "bags"
     write_bags(bag_dir, COUNT)
-    path = bag_dir / FOLDER / FILE
+    path = store_file(bag_dir)
     with serving(bag_dir, tmp_path / "log") as running:
         recovers(running, COUNT)
         right = running.ask_all(COUNT)
-        os.truncate(path.with_name(f"{FILE}-shm"), 0)
+        os.truncate(path.with_name(f"{path.name}-shm"), 0)
     with serving(bag_dir, tmp_path / "log") as running:
         recovers(running, COUNT)
         assert running.ask_all(COUNT) == right

@@ -7,10 +7,10 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
-from ros2_memory.catalogue.store import FILE, FOLDER
 from tests.faults.running import load, serving
-from tests.faults.test_catalogue_faults import assert_sound
+from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import write_bag, write_bags
+from tests.support.column_worlds import store_file
 from tests.support.processes import until
 
 if TYPE_CHECKING:
@@ -23,12 +23,14 @@ COUNT = 12
 
 def is_ready(running: Running, count: int) -> bool:
     health = running.health()
-    return (health["bags"], health["catalogue"]["state"]) == (count, "ready")
+    return (health["bags"], health["store"]["state"]) == (count, "ready")
 
 
-def entries(path: Path) -> list[str]:
+def stored(path: Path) -> list[str]:
     with closing(sqlite3.connect(path)) as base:
-        return [row[0] for row in base.execute("SELECT path FROM bags ORDER BY path")]
+        return [
+            row[0] for row in base.execute("SELECT path FROM bag WHERE size >= 0 ORDER BY path")
+        ]
 
 
 def test_two_servers_share_a_directory_and_one_goes_on_without_the_other(tmp_path: Path) -> None:
@@ -54,8 +56,8 @@ def test_two_servers_share_a_directory_and_one_goes_on_without_the_other(tmp_pat
             assert each.events("database_set_aside") == []
             assert each.events("database_lost") == []
             assert each.events("tool_failed") == []
-    path = bag_dir / FOLDER / FILE
-    assert entries(path) == sorted({f"rec/rec_{n}.mcap" for n in range(COUNT + 2)})
+    path = store_file(bag_dir)
+    assert stored(path) == sorted({f"rec/rec_{n}.mcap" for n in range(COUNT + 2)})
     assert_sound(path)
     with serving(bag_dir, tmp_path / "third") as third:
         until(partial(is_ready, third, COUNT + 2))

@@ -28,6 +28,8 @@ from tests.support.memories import memory_of
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from ros2_memory.columns.store import ColumnStore
+    from ros2_memory.core.timebase import Clock
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
 
@@ -89,21 +91,27 @@ def told(
     return answers
 
 
-def served(bag_dir: Path) -> tuple[Memory, Backfill]:
-    """A memory as the server builds it, and what fills its catalogue."""
+def served(bag_dir: Path, clock: Clock = NOW) -> tuple[Memory, Backfill]:
+    """A memory as the server builds it, and what fills its store of columns."""
     settings = load_settings((), {"MEMORY_BAG_DIR": str(bag_dir)})
     memory = build_memory(settings)
     # Every question looks, and the clock stands long after the bags.
-    plain = memory_of(bag_dir, clock=NOW)
-    memory = replace(memory, clock=NOW, index=plain.index, reader=plain.reader)
+    plain = memory_of(bag_dir, clock=clock)
+    memory = replace(memory, clock=clock, index=plain.index, reader=plain.reader)
     return memory, build_backfill(settings, memory)
 
 
+def store_of(filler: Backfill) -> ColumnStore:
+    """The store that is filled."""
+    assert filler.filling is not None
+    return filler.filling.store
+
+
 def fill_up(filler: Backfill) -> None:
-    """Digests all that waits."""
+    """Stores all that waits."""
     fill_store(filler)
 
 
 def plainly(bag_dir: Path, *, count: int = 12) -> list[str]:
-    """What is answered without a catalogue, by a memory that has seen nothing before."""
+    """What is answered without a store, by a memory that has seen nothing before."""
     return told(memory_of(bag_dir, clock=NOW), count=count)

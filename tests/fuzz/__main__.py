@@ -28,7 +28,7 @@ _COLUMNS: Final = {
     "peak_mb": 8,
     "slowest_s": 10,
     "cpu_s": 7,
-    "digest_s": 9,
+    "store_s": 8,
     "recover_s": 10,
 }
 

@@ -41,7 +41,7 @@ class Tally:
     peak_mb: float = 0.0
     slowest_s: float = 0.0
     cpu_s: float = 0.0
-    digest_s: float = 0.0
+    store_s: float = 0.0
     recover_s: float = 0.0
     found: list[dict[str, Any]] = field(default_factory=list)
 
@@ -59,7 +59,7 @@ class Tally:
             self.peak_mb = max(self.peak_mb, verdict["peak_mb"])
             self.slowest_s = max(self.slowest_s, verdict["seconds"])
             self.cpu_s = max(self.cpu_s, verdict["cpu_s"])
-            self.digest_s = max(self.digest_s, verdict["digest_s"])
+            self.store_s = max(self.store_s, verdict["store_s"])
             self.recover_s = max(self.recover_s, verdict["recover_s"])
         if verdict["faults"]:
             self.faults += 1

@@ -55,7 +55,7 @@ class Mutant:
         self.files.clear()
         if self.lay is not None:
             self.lay(folder)
-        # Another time for each, or the catalogue would take it for the one before.
+        # Another time for each, or the store would take it for the one before.
         for path in [*folder.rglob("*"), folder]:
             when = LONG_AGO_S + number
             os.utime(path, (when, when), follow_symlinks=False)

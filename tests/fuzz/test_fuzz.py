@@ -68,7 +68,7 @@ def test_the_oracle_agrees_with_a_good_bag_and_misses_a_message(tmp_path: Path, 
     mutant = mutant_of(good, good.plain)
     truth = truth_of(mutant, good)
     assert truth is not None
-    world = World(tmp_path, "rosbag2", catalogue=False)
+    world = World(tmp_path, "rosbag2", stored=False)
     path = mutant.place(world.bag_dir, 0)
     memory, server = world.serving()
     [bag] = [each for each in memory.index.snapshot().bags if each.path == path]

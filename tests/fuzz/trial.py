@@ -1,4 +1,4 @@
-"""One mutant beside two good bags: asked, digested, sometimes recovered, and judged."""
+"""One mutant beside two good bags: asked, stored, sometimes recovered, and judged."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Verdict:
     asked: int = 0
     seconds: float = 0.0
     cpu_s: float = 0.0
-    digest_s: float = 0.0
+    store_s: float = 0.0
     recover_s: float = 0.0
     peak_mb: float = 0.0
     left_mb: float = 0.0
@@ -73,15 +73,15 @@ class Verdict:
 
 
 class World:
-    """A bag directory with two good bags, one storage, with a catalogue or without."""
+    """A bag directory with two good bags, one storage, with a store of columns or without."""
 
-    def __init__(self, root: Path, storage: str, *, catalogue: bool) -> None:
-        self.bag_dir = root / f"bags {storage} {catalogue}"
+    def __init__(self, root: Path, storage: str, *, stored: bool) -> None:
+        self.bag_dir = root / f"bags {storage} {stored}"
         self.settings: Settings = load_settings(
             [f"storage={storage}", "recorder=none", f"recording.bag_dir='{self.bag_dir}'"], env={}
         )
         self.storage = storage
-        self.catalogue = catalogue
+        self.stored = stored
         self.clear()
         self._known: list[Any] = []
         self._served = 0
@@ -173,8 +173,8 @@ async def _asked(
     if verdict.cpu_s > MOST_S:
         verdict.faults.append(f"slow: looking into the bag took {verdict.cpu_s:.1f} s")
     rng = job.rng
-    if world.catalogue and job.number % 2:
-        _digested(world, memory, verdict)
+    if world.stored and job.number % 2:
+        _fill(world, memory, verdict)
     for name, given in of_mutant(rng)[:_ASKED_OF_MUTANT]:
         await _timed(server, name, given, verdict)
     told = await _timed(server, "data_time_range", {}, verdict)
@@ -182,8 +182,8 @@ async def _asked(
     held = next((each for each in memory.index.snapshot().bags if each.path == bag), None)
     if truth and held is not None:
         verdict.faults += await hold(memory, server, held, truth, rng)
-    if world.catalogue and not job.number % 2:
-        _digested(world, memory, verdict)
+    if world.stored and not job.number % 2:
+        _fill(world, memory, verdict)
     for at in rng.sample(range(len(OF_GOOD)), _ASKED_OF_GOOD):
         name, given = OF_GOOD[at]
         answer = comparable(await _timed(server, name, given, verdict))
@@ -264,12 +264,12 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
         verdict.faults.append(f"states {summary.count} messages, gives {read}, says nothing")
 
 
-def _digested(world: World, memory: Memory, verdict: Verdict) -> None:
+def _fill(world: World, memory: Memory, verdict: Verdict) -> None:
     begun = time.process_time()
     fill_store(build_backfill(world.settings, memory))
-    verdict.digest_s = time.process_time() - begun
-    if verdict.digest_s > MOST_S:
-        verdict.faults.append(f"slow: digesting took {verdict.digest_s:.1f} s")
+    verdict.store_s = time.process_time() - begun
+    if verdict.store_s > MOST_S:
+        verdict.faults.append(f"slow: storing took {verdict.store_s:.1f} s")
 
 
 def _recovered(world: World, verdict: Verdict) -> None:

@@ -36,7 +36,7 @@ def main() -> None:
     # Descriptor 1 is kept for verdicts alone.
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
-    worlds = {key: World(root, key[0], catalogue=key[1]) for key in _COMBINATIONS}
+    worlds = {key: World(root, key[0], stored=key[1]) for key in _COMBINATIONS}
     for line in sys.stdin:
         job = Job(**json.loads(line))
         out.write(json.dumps({"begun": job.number}) + "\n")
@@ -56,11 +56,11 @@ def _verdict(worlds: dict[tuple[str, bool], World], job: Job) -> dict[str, objec
     try:
         mutant, good, mutation = job.made()
         turn = job.number % len(_COMBINATIONS)
-        storage, catalogue = _COMBINATIONS[turn]
+        storage, stored = _COMBINATIONS[turn]
         if good.needs_rosbag2 and job.number % 16 > 1:
             storage = "rosbag2"
         told |= {"good": good.kind, "mutation": mutation, "told": mutant.told, "storage": storage}
-        verdict = tried(worlds[storage, catalogue], job, mutant, good)
+        verdict = tried(worlds[storage, stored], job, mutant, good)
         if verdict.left_mb > _MUCH_MB:
             _let_go(worlds.values())
             verdict.left_mb = resident_mb()

@@ -18,10 +18,11 @@ from mcp import Client
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
-from ros2_memory.catalogue.store import FILE, FOLDER
+from ros2_memory.columns.store import FILE
 from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import Served, serving
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.column_worlds import store_file
 from tests.support.forked_commands import forked_commands
 from tests.support.housekeepers import recorded_before
 from tests.support.processes import PATIENCE_S, until
@@ -132,49 +133,53 @@ async def test_no_server_with_the_shipped_defaults_writes_beside_strangers_bags(
     with serving(strangers, tmp_path / "log", f"storage={storage}", **env) as served:
         async with Client(served.url("/mcp")) as client:
             await ask_everything(client, of_several_robots=True)
-        until(lambda: catalogue(served.get("/health")[1])["state"] == "ready")
+        until(lambda: is_full(served))
         assert state(strangers) == before
     assert state(strangers) == before
     assert [*(tmp_path / "cache").rglob(FILE)]
 
 
-def catalogue(health: bytes) -> dict[str, object]:
-    shown: dict[str, object] = json.loads(health)["catalogue"]
-    return shown
+def is_full(served: Served) -> bool:
+    """Whether no bag waits to be stored."""
+    return bool(json.loads(served.get("/health")[1])["store"]["state"] == "ready")
 
 
 def moved_to(served: Served) -> list[str]:
-    """Where databases were moved to: the catalogue and the columns, each when it is tried again."""
+    """Where the store was moved to."""
     return [each["path"] for each in served.events() if each["event"] == "database_moved"]
 
 
-def entries(file: Path) -> int:
+def times_stored(served: Served) -> int:
+    """How often a bag was stored, by the server or its helper."""
+    return sum(each["event"] == "bag_stored" for each in served.events())
+
+
+def numbered(file: Path) -> dict[str, int]:
+    """The number of each stored bag; another one where it was stored anew."""
     with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
-        return int(base.execute("SELECT count(*) FROM bags").fetchone()[0])
+        return dict(base.execute("SELECT path, id FROM bag WHERE size >= 0").fetchall())
 
 
-async def test_when_a_recorder_comes_the_catalogue_goes_beside_the_bags_with_all_it_holds(
+async def test_when_a_recorder_comes_the_store_goes_beside_the_bags_with_all_it_holds(
     strangers: Path, tmp_path: Path, env: dict[str, str]
 ) -> None:
-    beside = strangers / FOLDER / FILE
+    beside = store_file(strangers)
     with serving(strangers, tmp_path / "log", "logging.level=debug", **env) as served:
-        until(lambda: catalogue(served.get("/health")[1])["state"] == "ready")
+        until(lambda: is_full(served))
         [cached] = (tmp_path / "cache").rglob(FILE)
-        known = entries(cached)
-        assert known > 0
+        known = numbered(cached)
+        assert known
         recorded_before(strangers)
         until(lambda: str(beside) in moved_to(served))
-        digested = [each for each in served.events() if each["event"] == "bag_digested"]
-        assert entries(beside) == known == len(digested)
+        assert numbered(beside) == known
+        assert times_stored(served) == len(known)
         async with Client(served.url("/mcp")) as client:
             await ask_everything(client, of_several_robots=True)
-        assert len(digested) == len(
-            [each for each in served.events() if each["event"] == "bag_digested"]
-        )
+        assert times_stored(served) == len(known)
     # Started where there is one already, it takes over what the cache holds just the same.
-    shutil.rmtree(strangers / FOLDER)
+    shutil.rmtree(beside.parent)
     assert run(env, strangers, "info").returncode == 0
-    assert entries(beside) == known
+    assert numbered(beside) == known
 
 
 def test_it_stays_in_the_cache_where_nothing_is_recorded_though_a_heartbeat_was_copied_along(
@@ -184,15 +189,9 @@ def test_it_stays_in_the_cache_where_nothing_is_recorded_though_a_heartbeat_was_
     before = state(strangers)
     for preset in ("query_only", "replay"):
         ran = run({**env, "MEMORY_DEPLOYMENT": preset}, strangers, "index")
-        assert "in the catalogue" in ran.stderr
+        assert "bags are stored" in ran.stderr
         assert state(strangers) == before
     assert (strangers / HEARTBEAT_FILE).is_file()
-
-
-def numbered(file: Path) -> dict[str, int]:
-    """The number of each bag's entry; another one where the bag was digested anew."""
-    with closing(sqlite3.connect(f"{file.as_uri()}?mode=ro", uri=True)) as base:
-        return dict(base.execute("SELECT path, id FROM bags").fetchall())
 
 
 def unshared(found: Mapping[str, object]) -> dict[str, object]:
@@ -200,21 +199,21 @@ def unshared(found: Mapping[str, object]) -> dict[str, object]:
     return {path: each for path, each in found.items() if not path.endswith(("-shm", "-wal"))}
 
 
-def test_what_a_recorders_preset_indexed_serves_who_only_looks(
+def test_what_a_recorders_preset_stored_serves_who_only_looks(
     strangers: Path, tmp_path: Path, env: dict[str, str]
 ) -> None:
     recorded_before(strangers)
     assert run({**env, "MEMORY_DEPLOYMENT": "robot"}, strangers, "index").returncode == 0
-    indexed = numbered(strangers / FOLDER / FILE)
-    assert indexed
+    stored = numbered(store_file(strangers))
+    assert stored
     before = unshared(state(strangers))
     assert run({**env, "MEMORY_DEPLOYMENT": "replay"}, strangers, "index").returncode == 0
     assert unshared(state(strangers)) == before
     # This preset's reader also opens `.db3` files.
     [cached] = (tmp_path / "cache").rglob(FILE)
     found = numbered(cached)
-    assert indexed.items() < found.items()
-    assert {path.rpartition(".")[2] for path in found.keys() - indexed.keys()} == {"db3"}
+    assert stored.items() < found.items()
+    assert {path.rpartition(".")[2] for path in found.keys() - stored.keys()} == {"db3"}
     # And the first one's leaves them there.
     assert run({**env, "MEMORY_DEPLOYMENT": "local"}, strangers, "index").returncode == 0
     assert numbered(cached) == found

@@ -535,7 +535,7 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
     chromium.looks(width=1200, height=900)
     with serving(bag_dir, scratch / "log_live", "storage=mcap", "recorder=none") as server:
         show(chromium, server)
-        chromium.awaits("return state.view.catalogue === null")
+        chromium.awaits("return state.view.filling === null")
         assert chromium.run("return state.view.robot.x") == 20
         assert chromium.text("#moment-title") == "Now"
         assert "newest data" in chromium.text("#moment-time")
@@ -564,7 +564,7 @@ def test_what_is_answerable_is_shown_by_the_next_poll(chromium: Browser, scratch
     drive(bag_dir, "one", begin, 20)
     with serving(bag_dir, scratch / "log_polled", "storage=mcap", "recorder=none") as server:
         show(chromium, server)
-        chromium.awaits("return state.view.catalogue === null && state.view.isWhole")
+        chromium.awaits("return state.view.filling === null && state.view.isWhole")
         assert chromium.run("return POLL_MS") <= 2000
         # Every look, when it was begun, and how far what was shown after it reaches.
         chromium.run(

@@ -27,12 +27,12 @@ def main() -> int:
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.ERROR))
     wrong = 0
     for name in given.world or WORLDS:
-        for catalogue in (False, True):
+        for stored in (False, True):
             with tempfile.TemporaryDirectory() as place:
                 os.environ["XDG_CACHE_HOME"] = f"{place}/cache"
                 draw = random.Random(given.seed)
                 world = WORLDS[name](Path(place) / name, draw)
-                server = Server(world.folder, world, catalogue=catalogue)
+                server = Server(world.folder, world, stored=stored)
                 try:
                     report = examine(world, History(world.folder), server, draw, given.questions)
                 finally:
@@ -40,7 +40,7 @@ def main() -> int:
             for each in report.wrong:
                 print(each)  # noqa: T201 - what it is for
             wrong += len(report.wrong)
-            how = "with a catalogue" if catalogue else "from the bags"
+            how = "with a store" if stored else "from the bags"
             print(f"{name}, {how}: {report.total - len(report.wrong)} of {report.total} right")  # noqa: T201
     return 1 if wrong else 0
 

@@ -78,10 +78,10 @@ class Server:
 
     Args:
         bag_dir: the folder, which is only read.
-        catalogue: fill the catalogue first, below the environment's cache folder.
+        stored: fill the store first, below the environment's cache folder.
     """
 
-    def __init__(self, bag_dir: Path, world: World, *, catalogue: bool) -> None:
+    def __init__(self, bag_dir: Path, world: World, *, stored: bool) -> None:
         settings = load_settings(
             [
                 f"recording.bag_dir={bag_dir}",
@@ -94,7 +94,7 @@ class Server:
             env={},
         )
         memory = build_memory(settings)
-        if catalogue:
+        if stored:
             fill_store(build_backfill(settings, memory))
         self._dispatcher = build_dispatcher(settings, memory)
 

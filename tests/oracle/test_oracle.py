@@ -22,9 +22,9 @@ QUESTIONS: Final = 2000 if LONG else 50
 SEEDS: Final = range(5) if LONG else range(1)
 
 
-def held(world: World, seed: int, *, catalogue: bool) -> None:
+def held(world: World, seed: int, *, stored: bool) -> None:
     history = History(world.folder)
-    server = Server(world.folder, world, catalogue=catalogue)
+    server = Server(world.folder, world, stored=stored)
     try:
         report = examine(world, history, server, random.Random(seed), QUESTIONS)
     finally:
@@ -35,28 +35,28 @@ def held(world: World, seed: int, *, catalogue: bool) -> None:
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The catalogue lies in this test's own cache folder."""
+    """The store lies in this test's own cache folder."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize("stored", [False, True], ids=["bags", "store"])
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("name", WORLDS)
-def test_answers_about_odd_worlds(name: str, seed: int, catalogue: bool, tmp_path: Path) -> None:
-    held(WORLDS[name](tmp_path / name, random.Random(seed)), seed, catalogue=catalogue)
+def test_answers_about_odd_worlds(name: str, seed: int, stored: bool, tmp_path: Path) -> None:
+    held(WORLDS[name](tmp_path / name, random.Random(seed)), seed, stored=stored)
 
 
 @needs_recorded
-@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize("stored", [False, True], ids=["bags", "store"])
 @pytest.mark.parametrize("name", ["session_mcap", "session_zstd", "session_sqlite3"])
-def test_answers_about_recorded_sessions(name: str, catalogue: bool) -> None:
+def test_answers_about_recorded_sessions(name: str, stored: bool) -> None:
     storage = "rosbag2" if name.endswith("sqlite3") else "mcap"
     tf = (("/tf", False), ("/tf_static", True))
-    held(World(RECORDED / name, storage, tf=tf), 7, catalogue=catalogue)
+    held(World(RECORDED / name, storage, tf=tf), 7, stored=stored)
 
 
 @needs_real
-@pytest.mark.parametrize("catalogue", [False, True], ids=["bags", "catalogue"])
+@pytest.mark.parametrize("stored", [False, True], ids=["bags", "store"])
 @pytest.mark.parametrize(
     "name",
     [
@@ -69,6 +69,6 @@ def test_answers_about_recorded_sessions(name: str, catalogue: bool) -> None:
         "cougars_auv_mcap",
     ],
 )
-def test_answers_about_public_bags(name: str, catalogue: bool) -> None:
+def test_answers_about_public_bags(name: str, stored: bool) -> None:
     storage = "rosbag2" if name.endswith("db3") else "mcap"
-    held(World(REAL / name, storage, odometry=()), 7, catalogue=catalogue)
+    held(World(REAL / name, storage, odometry=()), 7, stored=stored)

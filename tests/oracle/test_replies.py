@@ -41,7 +41,7 @@ def short_sample() -> Mapping[str, set[int]]:
     return sample(short, FOR_EACH_WORLD)
 
 
-def held(name: str, *, catalogue: bool) -> None:
+def held(name: str, *, stored: bool) -> None:
     world, comparison = WORLDS[name], Comparison()
     if world.absent is not None:
         pytest.skip(world.absent)
@@ -50,19 +50,19 @@ def held(name: str, *, catalogue: bool) -> None:
             f"not recorded yet: python -m tests.oracle.replies record --world {name} --long"
         )
     chosen = None if LONG else short_sample()[name]
-    asked = compare(world, records()[name], comparison, catalogue=catalogue, chosen=chosen)
+    asked = compare(world, records()[name], comparison, stored=stored, chosen=chosen)
     assert asked
     assert not comparison.differences, "\n".join(map(str, comparison.differences[:10]))
 
 
 @pytest.mark.parametrize("name", ASKED)
 def test_replies_from_bags_are_those_recorded(name: str) -> None:
-    held(name, catalogue=False)
+    held(name, stored=False)
 
 
 @pytest.mark.parametrize("name", ASKED if LONG else ["session_zstd", "damaged", "resets"])
-def test_replies_with_a_catalogue_are_those_recorded(name: str) -> None:
-    held(name, catalogue=True)
+def test_replies_with_a_store_are_those_recorded(name: str) -> None:
+    held(name, stored=True)
 
 
 def test_the_sample_asks_every_tool_and_way_in_every_kind_of_world() -> None:

@@ -26,7 +26,7 @@ ANSWERING: Final = {
     "rosbags",
     *(
         f"ros2_memory.{room}"
-        for room in ("catalogue", "history.context", "queries", "serving.dispatch", "tools")
+        for room in ("columns", "history.context", "queries", "serving.dispatch", "tools")
     ),
 }
 CONFIGURING: Final = {"hydra", "omegaconf", "yaml"}
@@ -119,7 +119,7 @@ def test_the_recorder_imports_nothing_that_answers(env: dict[str, str]) -> None:
         "seen()\n"
     )
     ((*there,),) = imported(program, env)
-    rooms = {f"ros2_memory.{room}" for room in ("catalogue", "history.context", "queries")}
+    rooms = {f"ros2_memory.{room}" for room in ("columns", "history.context", "queries")}
     assert (SERVING | PEOPLE | rooms | {"anyio"}) & {*there} == set()
 
 

@@ -9,7 +9,6 @@ from typing import Final
 
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.timebase import NS_PER_S, Clock
-from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper

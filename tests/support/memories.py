@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -13,11 +12,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 import yaml
 
+from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.store import FILE as COLUMNS
-from ros2_memory.columns.store import BagKey, ColumnStore
-from ros2_memory.core.errors import BagError, EpisodicError
+from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
@@ -101,7 +100,7 @@ def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
 
 def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scanner:
     """A scanner over a store that has the first `part` of the closed bags."""
-    store = ColumnStore([bag_dir / FOLDER / COLUMNS], memory.reader.definition)
+    store = ColumnStore([bag_dir / OWN_FOLDER / FILE], memory.reader.definition)
     scanner = Scanner(store, bag_dir)
     later = SettableClock(memory.clock.now())
     filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=1.0))

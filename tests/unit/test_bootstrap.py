@@ -12,7 +12,7 @@ from ros2_memory.bootstrap import (
     build_memory,
     build_reader,
     build_server,
-    digest_config,
+    reading_of,
 )
 from ros2_memory.config import load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
@@ -46,14 +46,14 @@ def test_what_a_reader_refuses_is_told_in_its_own_words(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("preset", ["robot", "robot_live", "query_only", "replay", "local"])
-def test_every_preset_uses_the_digests_of_every_other(tmp_path: Path, preset: str) -> None:
+def test_every_preset_uses_what_every_other_stored(tmp_path: Path, preset: str) -> None:
     plain, other = settings(tmp_path), settings(tmp_path, f"deployment={preset}")
     labels = settings(tmp_path, "data.min_score=0.5", "data.labels_file=null")
     schemas = load_message_schemas(plain)
     for each in (other, labels):
-        assert digest_config(each, load_message_schemas(each)) == digest_config(plain, schemas)
+        assert reading_of(each, load_message_schemas(each)) == reading_of(plain, schemas)
     elsewhere = settings(tmp_path, "data.pose_topic=/amcl_pose")
-    assert digest_config(elsewhere, schemas).base != digest_config(plain, schemas).base
+    assert reading_of(elsewhere, schemas) != reading_of(plain, schemas)
 
 
 def test_the_limits_of_the_configuration_reach_the_questions(tmp_path: Path) -> None:

@@ -6,9 +6,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bootstrap import (
     build_backfill,
-    build_filling,
     build_memory,
-    catalogue_paths,
     column_paths,
 )
 from ros2_memory.cli.maintenance.index import fill_store
@@ -25,7 +23,7 @@ if TYPE_CHECKING:
 T0 = 1_700_000_000 * 10**9
 
 
-def test_columns_lie_beside_the_catalogue_also_where_one_recording_answers(
+def test_columns_lie_beside_the_bags_also_where_one_recording_answers(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
@@ -33,9 +31,7 @@ def test_columns_lie_beside_the_catalogue_also_where_one_recording_answers(
     given = {"MEMORY_BAG_DIR": str(tmp_path), "MEMORY_DEPLOYMENT": "robot"}
     paths = column_paths(load_settings([], given))
     assert paths[0] == tmp_path / ".episodic" / FILE
-    assert [path.parent for path in paths] == [
-        path.parent for path in catalogue_paths(load_settings([], given))
-    ]
+    assert paths[1].is_relative_to(tmp_path / "cache")
     assert column_paths(load_settings(["data.recording=rec"], given)) == paths
 
 
@@ -50,7 +46,7 @@ def test_a_memory_stores_columns_unless_it_is_told_not_to(
     memory = build_memory(without)
     assert memory.columns is not None
     assert memory.columns.store is None
-    assert build_filling(without, memory) is None
+    assert build_backfill(without, memory).filling is None
     settings = load_settings([], given)
     memory = build_memory(settings)
     assert memory.columns is not None
@@ -71,7 +67,7 @@ def test_index_stores_the_columns_of_every_bag(
     backfill = build_backfill(settings, memory)
     monkeypatch.setattr("ros2_memory.index.scan.YOUNG_NS", 0)
     fill_store(backfill)
-    assert backfill.not_stored() == []
+    assert backfill.waiting() == []
     assert memory.columns is not None
     assert memory.columns.store is not None
     assert len(memory.columns.store.paths()) == 3

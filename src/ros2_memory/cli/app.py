@@ -118,8 +118,8 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     ),
     "index": CommandEntry(
         "maintenance.index.index",
-        "index every bag now, so that answers take milliseconds",
-        {0: "every bag that can be indexed is indexed"},
+        "store the columns of every bag now, so that answers take milliseconds",
+        {0: "every bag that can be stored is stored"},
     ),
     "ship": CommandEntry(
         "maintenance.ship.ship",

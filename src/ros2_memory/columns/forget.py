@@ -68,6 +68,8 @@ def delete_catalogue(file: Path) -> None:
     Raises:
         BagError: it is there, and cannot be deleted.
     """
+    if file.parent.is_symlink():
+        return
     try:
         if file.is_file() and not file.is_symlink() and _is_catalogue(file):
             for one in files_of(file):

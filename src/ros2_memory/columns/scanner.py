@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import Channel, IntArray
 
 T = TypeVar("T", bound="Sized")
 
@@ -138,6 +138,13 @@ class Scanner:
     def coverage(self, timeline: Timeline) -> Coverage | None:
         """Returns which bags of a timeline are stored; None without a store."""
         return None if self._covering is None else self._covering.of(timeline)
+
+    def channels(self, timeline: Timeline, bag: BagFile) -> list[Channel]:
+        """Returns the channels of all that was ever stored; none where a bag is not stored."""
+        coverage = self.coverage(timeline)
+        if self.store is None or coverage is None or bag in coverage.missing:
+            return []
+        return [topic.channel for topic in self.store.topics().values()]
 
     def parts(self, topic: str, window: TimeWindow, coverage: Coverage) -> list[PartHead]:
         """Returns the parts of a topic that may have rows in a window."""

@@ -304,10 +304,12 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    bag = view.snapshot.timeline.first_with(topic, type_name)
+    timeline, columns = view.snapshot.timeline, view.memory.columns
+    bag = timeline.first_with(topic, type_name)
+    channels = None if columns is None else columns.channels(timeline, bag)
     reasons = [
         view.memory.reader.undecodable(channel)
-        for channel in view.bags.channels(bag)
+        for channel in channels or view.bags.channels(bag)
         if channel.topic == topic and channel.type == type_name
     ]
     return next(filter(None, reversed(reasons)), None)

@@ -5,7 +5,7 @@
 keeps calls and replies in tests/data/replies; `comparison` tells which differences matter.
 
     python -m tests.oracle.replies record [--world NAME] [--long]
-    python -m tests.oracle.replies compare [--world NAME] [--long] [--catalogue]
+    python -m tests.oracle.replies compare [--world NAME] [--long] [--store]
 
 `record` is run where the replies are right, and its result committed; `compare` prints each
 difference and exits with 1 where there is any. Where today's reply is known to be wrong,

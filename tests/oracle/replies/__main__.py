@@ -32,7 +32,7 @@ def main() -> int:
             size += found.write()
             asked = len(found.replies)
         else:
-            asked = compare(world, Record.read(name), comparison, catalogue=given.catalogue)
+            asked = compare(world, Record.read(name), comparison, stored=given.store)
             size += path_of(name).stat().st_size
         calls += asked
         for difference in comparison.differences[before:]:
@@ -54,10 +54,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--long", action="store_true", help="also worlds that take minutes to make")
     parser.add_argument(
-        "--catalogue",
+        "--store",
         action=argparse.BooleanOptionalAction,
         default=False,
-        help="compare what is answered with a filled catalogue; else from the bags alone",
+        help="compare what is answered with a filled store; else from the bags alone",
     )
     return parser
 

@@ -104,7 +104,7 @@ class Call:
 
 @contextmanager
 def still_time(cache: Path) -> Iterator[None]:
-    """The wall clock stands still in UTC, no time runs out, and catalogues lie in a new folder."""
+    """The wall clock stands still in UTC, no time runs out, and stores lie in a new folder."""
     own = {"XDG_CACHE_HOME": str(cache), "TZ": "UTC", "COLUMNS": "160", "MPLBACKEND": "agg"}
     others = [name for name in os.environ if name.startswith("MEMORY_")]
     with (
@@ -138,7 +138,7 @@ class Asked:
         folder: of the world: its bags lie in `bags`; other files may be written beside them.
         settings: besides those of every world.
         places: the named places, as places.yaml has them.
-        catalogue: whether a catalogue is filled first; else bags alone answer.
+        stored: whether a store is filled first; else bags alone answer.
     """
 
     def __init__(
@@ -147,7 +147,7 @@ class Asked:
         settings: Sequence[str],
         places: Mapping[str, Any],
         *,
-        catalogue: bool,
+        stored: bool,
     ) -> None:
         self._folder, self._bags = folder, folder / "bags"
         places_file = folder / "places.yaml"
@@ -160,7 +160,7 @@ class Asked:
         ]
         loaded = self._loaded()
         self.memory = build_memory(loaded)
-        if catalogue:
+        if stored:
             fill_store(build_backfill(loaded, self.memory))
         self._dispatcher = build_dispatcher(loaded, self.memory)
         self._page = Starlette(routes=page_routes(self._dispatcher))

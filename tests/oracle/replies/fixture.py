@@ -1,7 +1,8 @@
 """The recorded calls and replies: for each world a file of JSON lines in tests/data/replies.
 
 The first line has the world's name, its settings and its named places; each other one a call, its
-reply from the bags alone, and, under `catalogue`, the reply with a catalogue where that differs.
+reply from the bags alone, and, under `catalogue`, what served as a store then, the reply with it
+where that differs.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ _MOST_BYTES: Final = 100_000_000
 
 @dataclass
 class Replied:
-    """A call and its replies; `catalogue` is None where a catalogue changes nothing."""
+    """A call and its replies; `stored` is None where a store changes nothing."""
 
     call: Call
     reply: Any
-    catalogue: Any = None
+    stored: Any = None
 
 
 @dataclass
@@ -47,9 +48,7 @@ class Record:
         rows: list[dict[str, Any]] = [head]
         for replied in self.replies:
             row = {"call": replied.call.as_json(), "reply": replied.reply}
-            rows.append(
-                row | ({} if replied.catalogue is None else {"catalogue": replied.catalogue})
-            )
+            rows.append(row | ({} if replied.stored is None else {"catalogue": replied.stored}))
         lines = [json.dumps(row, ensure_ascii=False, separators=(",", ":")) for row in rows]
         packed = zstandard.ZstdCompressor(level=_LEVEL).compress("\n".join(lines).encode())
         FOLDER.mkdir(parents=True, exist_ok=True)

@@ -36,12 +36,12 @@ def made(world: ReplyWorld) -> Iterator[Path]:
 
 
 def record(world: ReplyWorld, comparison: Comparison) -> Record:
-    """Draws calls, and returns their replies; differences with a catalogue are collected.
+    """Draws calls, and returns their replies; differences with a store are collected.
 
-    With a catalogue, ways that take long are not asked: they show what tools reply.
+    With a store, ways that take long are not asked: they show what tools reply.
     """
     with made(world) as folder:
-        looked = Asked(folder, world.settings, {}, catalogue=False)
+        looked = Asked(folder, world.settings, {}, stored=False)
         facts = Facts(looked, Random(f"places {world.name}"))
         looked.stop()
         drawn = Calls(facts, Random(f"calls {world.name}"), shows_messages=world.shows_messages)
@@ -50,18 +50,18 @@ def record(world: ReplyWorld, comparison: Comparison) -> Record:
         found.replies = [Replied(*answered) for answered in asked_all(folder, found, calls)]
         quick = [replied for replied in found.replies if replied.call.what not in _SLOW]
         calls = [replied.call for replied in quick]
-        again = asked_all(folder, found, calls, catalogue=True)
+        again = asked_all(folder, found, calls, stored=True)
         for replied, (call, reply) in zip(quick, again, strict=True):
             if not comparison.compare(world.name, call, replied.reply, reply):
-                replied.catalogue = reply
+                replied.stored = reply
     return found
 
 
 def asked_all(
-    folder: Path, record: Record, calls: Collection[Call], *, catalogue: bool = False
+    folder: Path, record: Record, calls: Collection[Call], *, stored: bool = False
 ) -> Iterator[tuple[Call, object]]:
     """Yields the reply to each call."""
-    asked = Asked(folder, record.settings, record.places, catalogue=catalogue)
+    asked = Asked(folder, record.settings, record.places, stored=stored)
     try:
         for call in calls:
             yield call, asked.answer(call)
@@ -74,17 +74,17 @@ def compare(
     record: Record,
     comparison: Comparison,
     *,
-    catalogue: bool = False,
+    stored: bool = False,
     chosen: Collection[int] | None = None,
 ) -> int:
     """Asks what was recorded again; `chosen` are numbers of calls. Returns how many were asked."""
     replies = record.replies
     asked = replies if chosen is None else [replies[number] for number in sorted(chosen)]
     with made(world) as folder:
-        again = asked_all(folder, record, [row.call for row in asked], catalogue=catalogue)
+        again = asked_all(folder, record, [row.call for row in asked], stored=stored)
         for row, (call, reply) in zip(asked, again, strict=True):
-            noted = catalogue and row.catalogue is not None
-            comparison.compare(world.name, call, row.catalogue if noted else row.reply, reply)
+            noted = stored and row.stored is not None
+            comparison.compare(world.name, call, row.stored if noted else row.reply, reply)
     return len(asked)
 
 

@@ -1,6 +1,6 @@
 """The worlds that are asked: folders of bags that are the same whenever they are made.
 
-Those of the shared folder are copied, so that times of files and catalogues lie apart from it.
+Those of the shared folder are copied, so that times of files and stores lie apart from it.
 """
 
 from __future__ import annotations

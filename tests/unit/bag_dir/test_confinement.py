@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sqlite3
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,9 +25,10 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
-from ros2_memory.catalogue.sql import TABLES
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
+from ros2_memory.columns.forget import delete_catalogue
+from ros2_memory.columns.store import TABLES
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
@@ -95,7 +97,7 @@ def asking(bag_dir: Path) -> Iterator[EpisodicServer]:
     memory = build_memory(settings)
     filler = build_backfill(settings, memory)
     for bag in filler.waiting():
-        filler.digest(bag)
+        filler.store(bag)
     server = build_server(settings, memory)
     try:
         yield server
@@ -144,7 +146,7 @@ LINKS = {
         (bags / "two").symlink_to("one"),
         (bags / "x.mcap").symlink_to("two/rec_0.mcap"),
     ],
-    "the catalogue's folder": lambda bags, rec: (bags / ".episodic").symlink_to(rec),
+    "the store's folder": lambda bags, rec: (bags / ".episodic").symlink_to(rec),
     "metadata": lambda bags, rec: (bags / "run/metadata.yaml").symlink_to(rec / "metadata.yaml"),
     "a journal": lambda bags, rec: [
         write_db3(bags / "own.db3", [boolean(T0, data=True)]),
@@ -348,20 +350,32 @@ class TestDeletions:
             build_repairer().repair(bags / "x.mcap")
         assert (outside / "rec_0.mcap").exists()
 
-    def test_a_catalogue_behind_a_link_is_neither_written_nor_set_aside(
+    def test_a_store_behind_a_link_is_neither_written_nor_set_aside(
         self, bags: Path, outside: Path
     ) -> None:
-        (outside / "catalogue.sqlite").write_text("somebody's own")
+        (outside / "columns.sqlite").write_text("somebody's own")
         before = contents(outside)
         (bags / ".episodic").symlink_to(outside)
         (bags / "own").mkdir()
-        for name in ("catalogue.sqlite", "catalogue.sqlite-wal", "catalogue.sqlite-shm"):
+        for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
             link = bags / "own" / name
-            link.symlink_to(outside / "catalogue.sqlite")
-            refused = open_file([bags / "own" / "catalogue.sqlite"], TABLES)
+            link.symlink_to(outside / "columns.sqlite")
+            refused = open_file([bags / "own" / "columns.sqlite"], TABLES)
             assert "symbolic link" in str(refused)
             link.unlink()
-        assert "symbolic link" in str(open_file([bags / ".episodic" / "catalogue.sqlite"], TABLES))
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"], TABLES))
+        assert contents(outside) == before
+
+    def test_a_catalogue_behind_a_link_is_not_deleted(self, bags: Path, outside: Path) -> None:
+        with closing(sqlite3.connect(outside / "catalogue.sqlite")) as base:
+            for name in ("bags", "configs", "held", "shapes"):
+                base.execute(f"CREATE TABLE {name} (content TEXT)")
+        before = contents(outside)
+        (bags / ".episodic").symlink_to(outside)
+        delete_catalogue(bags / ".episodic" / "catalogue.sqlite")
+        (bags / "own").mkdir()
+        (bags / "own" / "catalogue.sqlite").symlink_to(outside / "catalogue.sqlite")
+        delete_catalogue(bags / "own" / "catalogue.sqlite")
         assert contents(outside) == before
 
 

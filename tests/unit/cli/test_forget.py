@@ -15,10 +15,10 @@ import yaml
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.columns.pack import decompressed
-from ros2_memory.columns.store import FILE as COLUMNS
+from ros2_memory.columns.store import CATALOGUE, FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
@@ -67,9 +67,9 @@ def bags(bag_dir: Path) -> list[str]:
 
 
 def known(bag_dir: Path) -> int:
-    """How many bags the catalogue knows."""
-    with closing(sqlite3.connect(bag_dir / FOLDER / FILE)) as base:
-        return int(base.execute("SELECT count(*) FROM bags").fetchone()[0])
+    """How many bags are stored as columns."""
+    with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as base:
+        return int(base.execute("SELECT count(*) FROM bag").fetchone()[0])
 
 
 def test_bags_that_lie_wholly_inside_go(bag_dir: Path, capsys: Capture) -> None:
@@ -168,10 +168,11 @@ def test_a_bag_with_another_name_is_reported(bag_dir: Path, capsys: Capture) -> 
     assert "delete the moment's folder" in capsys.readouterr().out
 
 
-def test_the_catalogue_forgets_with_them(bag_dir: Path, capsys: Capture) -> None:
+def test_the_store_forgets_with_them(bag_dir: Path, capsys: Capture) -> None:
     assert cli.main(["index"]) == 0
     assert known(bag_dir) == 4
     assert forget(20, 35, "--yes") == 0
+    assert cli.main(["index"]) == 0
     assert known(bag_dir) == 3
     asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
     assert cli.main(["ask", "find_last_match", asked, "--json"]) == 0
@@ -182,21 +183,38 @@ def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
     bag_dir: Path, capsys: Capture
 ) -> None:
     assert cli.main(["index"]) == 0
-    store = bag_dir / FOLDER / COLUMNS
+    store = bag_dir / OWN_FOLDER / FILE
     assert all(f"secret{n}".encode() in unpacked(store) for n in range(4))
     assert forget(20, 35, "--yes") == 0
     assert b"secret1" not in unpacked(store) + all_bytes(bag_dir)
     (bag_dir / "rec_1" / "rec_2.mcap").unlink()
     assert forget(40, 55, "--yes") == 0
     assert "nothing to delete" in capsys.readouterr().out
-    assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / FOLDER)
+    assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / OWN_FOLDER)
     assert cli.main(["index"]) == 0
     assert b"secret3" in unpacked(store)
 
 
+def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(bag_dir: Path) -> None:
+    folder, beside = bag_dir / OWN_FOLDER, bag_dir / CATALOGUE
+    folder.mkdir(exist_ok=True)
+    old, lakes = folder / CATALOGUE, folder / f"lake-{CATALOGUE}"
+    for path in (old, old.with_name(f"{CATALOGUE}.aside"), beside):
+        with closing(sqlite3.connect(path)) as base:
+            for name in ("bags", "configs", "held", "shapes"):
+                base.execute(f"CREATE TABLE {name} (content TEXT)")
+            base.execute("INSERT INTO bags VALUES ('secret1')")
+            base.commit()
+    with closing(sqlite3.connect(lakes)) as base:
+        base.execute("CREATE TABLE iceberg_tables (content TEXT)")
+    assert forget(20, 35, "--yes") == 0
+    assert sorted(path.name for path in folder.glob("*catalogue*")) == [lakes.name]
+    assert beside.is_file()
+
+
 def test_a_dry_run_leaves_the_columns(bag_dir: Path) -> None:
     assert cli.main(["index"]) == 0
-    store = bag_dir / FOLDER / COLUMNS
+    store = bag_dir / OWN_FOLDER / FILE
     (bag_dir / "rec_1" / "rec_2.mcap").unlink()
     forget(40, 55, "--dry-run")
     assert b"secret2" in unpacked(store)

@@ -1,7 +1,7 @@
 """`ros2-memory forget --topic`, `--where`: some messages of bags go without a trace, others stay.
 
 What stays is read by plain rosbags, before and after; what goes is looked for in every byte of the
-bag directory, in decompressed chunks and in what the catalogue unpacks.
+bag directory, in decompressed chunks and in what is stored of them.
 """
 
 from __future__ import annotations
@@ -27,17 +27,13 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import message_id
+from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
-from ros2_memory.bootstrap import build_memory
-from ros2_memory.catalogue.packing import unpacked
-from ros2_memory.catalogue.store import FILE, FOLDER
 from ros2_memory.cli.maintenance import forget as cli_forget
 from ros2_memory.columns.pack import decompressed
-from ros2_memory.columns.store import FILE as COLUMNS
-from ros2_memory.columns.store import BagKey
-from ros2_memory.config import load_settings
+from ros2_memory.columns.store import FILE
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -160,26 +156,10 @@ def traces(root: Path, needle: str) -> list[str]:
                         inner = breakup_chunk(record)
                         parts += [getattr(each, "data", b"") for each in inner]
         if path.name == FILE:
-            parts += packed_in(path)
-        if path.name == COLUMNS:
             parts += columns_in(path)
         if any(needle.encode() in part for part in parts):
             found.append(str(path.relative_to(root)))
     return found
-
-
-def packed_in(catalogue: Path) -> Iterator[bytes]:
-    """All that a catalogue packs, unpacked."""
-    with closing(sqlite3.connect(catalogue)) as base:
-        for topic, kind, model in base.execute("SELECT * FROM models").fetchall():
-            yield bytes(model)
-            if kind in {"zones", "poses", "ranges", "texts", "rests", "story"}:
-                table = "tales" if kind in {"rests", "story"} else "held"
-                rows = base.execute(
-                    f"SELECT {kind} FROM {table} WHERE id >> 40 = ?",  # noqa: S608 - constants
-                    (topic,),
-                )
-                yield from (unpacked(each, model) for (each,) in rows if each)
 
 
 def columns_in(store: Path) -> Iterator[bytes]:
@@ -221,12 +201,10 @@ def test_nothing_of_it_is_left_anywhere(
     tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     indexed()
-    assert f"{FOLDER}/{COLUMNS}" in " ".join(traces(tmp_path, SAID))
-    catalogue, columns = bag_dir / FOLDER / FILE, bag_dir / FOLDER / COLUMNS
-    # A query server has both files open, so that their logs lie beside them.
-    with closing(sqlite3.connect(catalogue)) as server, closing(sqlite3.connect(columns)) as other:
-        server.execute("SELECT count(*) FROM bags").fetchone()
-        other.execute("SELECT count(*) FROM bag").fetchone()
+    assert f"{OWN_FOLDER}/{FILE}" in " ".join(traces(tmp_path, SAID))
+    # A query server has the file open, so that its log lies beside it.
+    with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as server:
+        server.execute("SELECT count(*) FROM bag").fetchone()
         assert forget(0, 100, "--topic", CAMERA) == 0
         assert traces(tmp_path, SAID) == []
     indexed()
@@ -262,26 +240,6 @@ def test_a_moment_that_is_kept_meanwhile_follows(
     assert forget(0, 100, "--topic", CAMERA) == 0
     assert link.samefile(source)
     assert traces(tmp_path, SAID) == []
-
-
-def test_what_the_catalogue_says_of_the_others_stays(bag_dir: Path) -> None:
-    indexed()
-
-    def said() -> list[object]:
-        memory = build_memory(load_settings([]))
-        memory.index.refresh()
-        assert memory.recall is not None
-        catalogue = memory.recall.catalogue
-        bags = [each for each in memory.index.snapshot().bags if each.path.stem == "rec_a_2"]
-        numbers = [each for each in catalogue.find([BagKey.of(b, bag_dir) for b in bags]) if each]
-        assert numbers
-        found = [catalogue.relatched(topic, numbers) for topic in (CAMERA, MIC, "/odom")]
-        known = catalogue.known_files(bag_dir)[bags[0].file].summary
-        return [*found, known]
-
-    before = said()
-    assert forget(0, 15, "--topic", CAMERA, "--topic", "/odom") == 0
-    assert said() == before
 
 
 def test_a_hard_link_elsewhere_is_named(tmp_path: Path, bag_dir: Path, capsys: Capture) -> None:
@@ -603,6 +561,6 @@ def cut_off_after(patch: pytest.MonkeyPatch, steps: int) -> None:
         (eraser, "correct"),
         (eraser, "append_losses"),
         (ERASING, "remove"),
-        (cli_forget, "purge"),
+        (cli_forget, "forget_columns"),
     ):
         patch.setattr(place, name, counting(getattr(place, name)))

@@ -285,21 +285,22 @@ class TestRecordings:
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         own_all(folder)
-        for bag in folder.rglob("*.mcap"):  # one that changed just now is not digested yet
+        for bag in folder.rglob("*.mcap"):  # one that changed just now is not stored yet
             os.utime(bag, (1_700_000_000,) * 2)
         monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
         monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
         _, shown = run(capsys, "index", "data.recording=a", "--json")
-        assert json.loads(shown) == {"bags": 2, "in_catalogue": 2, "refused": 0}
-        (catalogue,) = (folder / ".cache").rglob("*.sqlite")
-        with closing(sqlite3.connect(catalogue)) as base:
-            assert base.execute("SELECT count(*) FROM bags").fetchone() == (2,)
+        assert json.loads(shown) == {"bags": 2, "stored": 2, "refused": 0}
+        (store,) = folder.rglob("columns.sqlite")
+        with closing(sqlite3.connect(store)) as base:
+            assert base.execute("SELECT count(*) FROM bag").fetchone() == (2,)
         forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
         code, shown = run(capsys, *forgetting)
         assert (code, json.loads(shown)["stays"]) == (0, [])
-        with closing(sqlite3.connect(catalogue)) as base:  # less the bag that had some of it
-            assert base.execute("SELECT count(*) FROM bags").fetchone() == (1,)
+        # Without the bag that had some of it, and what has a part in common with that.
+        with closing(sqlite3.connect(store)) as base:
+            assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
     def test_what_deletes_looks_at_all_of_them(self, folder: Path, capsys: Capture) -> None:
         words = ["forget", "--last", "9000", "--yes", "deployment=robot", "data.recording=a"]

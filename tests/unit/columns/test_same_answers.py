@@ -114,9 +114,7 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
 @example(clock="auto", seed=572545084, part=1.0)
 @example(clock="stamp", seed=246, part=1.0)
 @example(clock="auto", seed=11445, part=1.0)
-def test_every_question_is_answered_as_without_a_store(
-    clock: str, seed: int, part: float
-) -> None:
+def test_every_question_is_answered_as_without_a_store(clock: str, seed: int, part: float) -> None:
     draw = random.Random(seed)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bootstrap import build_memory, digest_config
+from ros2_memory.bootstrap import build_memory, reading_of
 from ros2_memory.cli.doctor import _size
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.config import load_settings
@@ -105,7 +105,7 @@ def test_definitions_of_messages_are_found(tmp_path: Path, bags: Path) -> None:
         os.mkdir("msg", dir_fd=inner)
         os.close(os.open("msg/Deep.msg", os.O_CREAT | os.O_WRONLY, dir_fd=inner))
     settings = load_settings([f"recording.bag_dir={tmp_path}", f"reader.custom_msg_paths=[{bags}]"])
-    assert digest_config(settings, {}).base
+    assert reading_of(settings, {})
     build_memory(settings)
 
 

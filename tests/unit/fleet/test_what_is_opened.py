@@ -42,8 +42,9 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
         memory = build_memory(own, shared)
         memory.index.refresh()
         fill_store(build_backfill(own, memory))
-        assert memory.recall is not None
-        memory.recall.catalogue.close()
+        assert memory.columns is not None
+        assert memory.columns.store is not None
+        memory.columns.store.close()
     reader = NotingReader()
     noted = shared._replace(reader=reader)
     fleet = Fleet(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -191,18 +190,6 @@ def test_a_search_that_got_nowhere_in_its_time_does_not_say_how_far(bag_dir: Pat
         last(memory_of(bag_dir), "contains", "scissors", call=call)
     assert caught.value.searched_back_to is None
     assert "searched_back_to" not in Replies(bag_dir, 4000).error(caught.value).text
-
-
-def test_a_catalogue_that_is_gone_in_the_middle_changes_no_answer(bag_dir: Path) -> None:
-    memory, _ = filled(bag_dir)
-    expected = last(memory_of(bag_dir, clock=memory.clock), "contains", "scissors")
-    assert memory.recall is not None
-    assert last(memory, "contains", "scissors") == expected
-    memory.recall.catalogue.close()
-    for wanted in ("scissors", "cup", "elephant"):
-        assert last(memory, "contains", wanted) == last(
-            replace(memory, recall=None), "contains", wanted
-        )
 
 
 @pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, memory_of, with_store, replied
+from tests.support.memories import asked, memory_of, replied, with_store
 from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:

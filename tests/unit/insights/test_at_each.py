@@ -16,7 +16,7 @@ from ros2_memory.core.errors import NoDataReason
 from ros2_memory.tools.arguments import MOST_TIMES
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store, replied
+from tests.support.memories import asked, memory_of, replied, with_store
 from tests.support.random_histories import write_history
 
 if TYPE_CHECKING:

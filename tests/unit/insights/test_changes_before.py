@@ -20,7 +20,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of, with_store, replied
+from tests.support.memories import asked, memory_of, replied, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path

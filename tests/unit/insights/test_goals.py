@@ -20,7 +20,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
 from tests.support.bags import Msg, goals, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, with_store, replied
+from tests.support.memories import memory_of, replied, with_store
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

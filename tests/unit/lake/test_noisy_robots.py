@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from ros2_memory.catalogue.digest import DIGEST_VERSION
 from ros2_memory.core.errors import NotShippedError
 from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.tables import ROWS_VERSION
 from tests.support.fleets import fleet_memory
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots
 from tests.support.memories import with_store
@@ -184,7 +184,7 @@ def test_events_are_known_where_digests_are_of_another_version(
 ) -> None:
     memories = {"hall": robots.mounted.robots["hall"].memory()}
     with monkeypatch.context() as patched:
-        patched.setattr("ros2_memory.lake.rows.DIGEST_VERSION", DIGEST_VERSION + 1)
+        patched.setattr("ros2_memory.lake.rows.ROWS_VERSION", ROWS_VERSION + 1)
         catalog = lake_in(tmp_path)
         fill(catalog, memories)
     of_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory

@@ -376,7 +376,9 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
             assert visit.closest_m <= distance + 2 * TOLERANCE_M
             assert {visit.arrived, visit.departed} <= {t for t, *_ in poses} | {None}
         assert told.total == len(told.visits)
-        assert visits(with_store(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
+        assert (
+            visits(with_store(plain, bag_dir), Call(), *place, radius_m=radius, limit=100) == told
+        )
 
 
 @settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])

@@ -25,11 +25,11 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bootstrap import build_memory, build_server
+from ros2_memory.columns.fill import Progress
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.backfill import Progress
-from ros2_memory.serving.mcp_server import Filling
+from ros2_memory.serving.mcp_server import Storing
 from ros2_memory.tools.spec_tools import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
@@ -288,9 +288,9 @@ async def test_a_client_that_asks_for_progress_receives_it(
     """The call waits for a first report, so it cannot be faster than one."""
     write_run(tmp_path)
     monkeypatch.setattr("ros2_memory.serving.mcp_server.PROGRESS_EVERY_S", 0.001)
-    states = iter([Progress(10, 6, 0), *[Progress(10, 4, 0)] * 100_000])
+    states = iter([Progress(10, 4, 6), *[Progress(10, 6, 4)] * 100_000])
     asked = build_server(
-        settings_of(tmp_path), build_memory(settings_of(tmp_path)), catalogue=lambda: next(states)
+        settings_of(tmp_path), build_memory(settings_of(tmp_path)), progress=lambda: next(states)
     )
     reported: list[tuple[float, float | None, str | None]] = []
     was_reported = anyio.Event()
@@ -312,15 +312,15 @@ async def test_a_client_that_asks_for_progress_receives_it(
                 "list_frames", {}, progress_callback=note, meta={"progress_token": 0}
             )
     assert [each[0] for each in reported[:2]] == [1, 2]
-    assert reported[0][2] == "catalogue 40 %"
-    assert str(reported[1][2]).startswith("catalogue 60 %, about ")
+    assert reported[0][2] == "40 % of the bags stored"
+    assert str(reported[1][2]).startswith("60 % of the bags stored, about ")
 
 
-def test_how_long_the_catalogue_takes_is_told_from_its_rate() -> None:
-    states = iter([Progress(100, 60, 0), Progress(100, 40, 0), Progress(100, 0, 0)])
+def test_how_long_storing_takes_is_told_from_its_rate() -> None:
+    states = iter([Progress(100, 40, 60), Progress(100, 60, 40), Progress(100, 100, 0)])
     times = iter([10.0, 12.0])
-    filling = Filling(lambda: next(states), lambda: next(times))
-    assert filling.sentence() == "catalogue 40 %"
-    assert filling.sentence() == "catalogue 60 %, about 4 s"
-    assert filling.sentence() is None
-    assert Filling(None).sentence() is None
+    storing = Storing(lambda: next(states), lambda: next(times))
+    assert storing.sentence() == "40 % of the bags stored"
+    assert storing.sentence() == "60 % of the bags stored, about 4 s left"
+    assert storing.sentence() is None
+    assert Storing(None).sentence() is None

@@ -23,6 +23,7 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.cli.plot.scene import opened, recap_in
+from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -31,7 +32,6 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
-from ros2_memory.serving.backfill import Progress
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
@@ -48,7 +48,7 @@ from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
-from tests.support.memories import memory_of, with_store, stored_columns
+from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
@@ -89,10 +89,10 @@ def patience(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(span, "_QUICK_S", 60.0)
 
 
-@pytest.fixture(params=["plain", "catalogue"])
+@pytest.fixture(params=["plain", "store"])
 def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     found = memory_of(bag_dir)
-    return with_store(found, bag_dir) if request.param == "catalogue" else found
+    return with_store(found, bag_dir) if request.param == "store" else found
 
 
 def shown(memory: Memory, query: str = "", **more: Any) -> dict[str, Any]:
@@ -120,7 +120,7 @@ def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
     assert [(each["x"], each["y"]) for each in stops] == [(10.0, 0.0), (20.0, 0.0), (30.0, 0.0)]
     assert {each["text"] for each in found["events"] if each["kind"] == "thing"} == {"cup in view"}
     assert found["distance_m"] == 30.0
-    assert found["catalogue"] is None
+    assert found["filling"] is None
     assert "questions" not in found
 
 
@@ -209,20 +209,20 @@ def test_where_a_part_takes_too_long_the_others_are_shown(
         raise QueryTimeoutError("it takes too long")
 
     monkeypatch.setattr(span, "recap", slow)
-    found = shown(memory, "last=1000", progress=lambda: Progress(closed=3, waiting=2, refused=0))
-    assert found["catalogue"] == {"closed": 3, "waiting": 2}
+    found = shown(memory, "last=1000", progress=lambda: Progress(closed=3, waiting=2))
+    assert found["filling"] == {"closed": 3, "waiting": 2}
     assert "events" not in found
     assert "the events are not known yet: it takes too long" in found["notes"]
     assert found["path"]["x"][-1] == 30.0
 
 
 @pytest.mark.parametrize(("waiting", "is_shown"), [(0, False), (3, False), (4, True)])
-def test_bags_that_were_just_closed_are_no_catalogue_that_is_being_filled(
+def test_bags_that_were_just_closed_are_no_store_that_is_being_filled(
     memory: Memory, waiting: int, is_shown: bool
 ) -> None:
     """A robot that records always has one: the page would ask for everything again and again."""
-    found = shown(memory, progress=lambda: Progress(closed=50, waiting=waiting, refused=0))
-    assert (found["catalogue"] is not None) == is_shown
+    found = shown(memory, progress=lambda: Progress(closed=50, waiting=waiting))
+    assert (found["filling"] is not None) == is_shown
 
 
 def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:

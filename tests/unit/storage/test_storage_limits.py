@@ -15,7 +15,6 @@ import zstandard
 
 from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.analysis.payload_templates import PayloadTemplate
-from ros2_memory.catalogue.digest import Digester
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -357,13 +356,3 @@ class TestSqlite:
             )
             with pytest.raises(sqlite3.OperationalError, match="interrupted"):
                 base.execute(endless)
-
-
-class TestDigests:
-    def test_a_bag_whose_messages_unpack_to_far_more_than_it_is_not_digested(
-        self, tmp_path: Path
-    ) -> None:
-        packed = zstandard.compress(text(0, "x" * 30 * MB).payload)
-        path = bag(tmp_path, *STRINGS, *(message(1, n, packed) for n in range(4)))
-        with pytest.raises(BagError, match="unpack to more"):
-            Digester(McapReader()).digest(path)

@@ -27,7 +27,7 @@ from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import log_entry
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store, replied
+from tests.support.memories import asked, memory_of, replied, with_store
 from tests.unit.things.test_find import (
     AWAY,
     BEGIN,

@@ -26,7 +26,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store, replied
+from tests.support.memories import asked, memory_of, replied, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

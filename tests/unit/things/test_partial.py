@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
@@ -41,14 +42,17 @@ def call(looks: int) -> Call:
 
 @pytest.fixture
 def fresh(tmp_path: Path) -> Callable[[], Memory]:
-    """Makes memories of eight bags, each with a thing of its own; the catalogue knows two bags.
+    """Makes memories of eight bags, each with a thing of its own; two bags are stored.
 
     None knows what another has read.
     """
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write(tmp_path, [message for some in moments for message in some])
-    recall = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).recall
-    return lambda: replace(memory_of(tmp_path, limits=NAMED), recall=recall)
+    stored = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).columns
+    assert stored is not None
+    return lambda: replace(
+        memory_of(tmp_path, limits=NAMED), columns=Scanner(stored.store, tmp_path)
+    )
 
 
 def begin_of(nth: int) -> int:
