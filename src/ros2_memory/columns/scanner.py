@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray
 
@@ -129,6 +130,10 @@ class Scanner:
         made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments.setdefault(kind.name, made))
+
+    def fragments_of_others(self) -> list[Ns]:
+        """Returns where slices begin that have fragments of other settings alone, newest first."""
+        return [] if self.store is None else self.store.fragments_of_others(self._settings)
 
     def write_fragments(self) -> None:
         """Stores the fragments that were made since."""

@@ -474,6 +474,24 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
+    def fragments_of_others(self, reading: str) -> list[Ns]:
+        """Returns where slices begin whose fragments all depend on other settings, newest first.
+
+        `reading` ends the name of a kind that depends on these.
+        """
+
+        def ask(connection: sqlite3.Connection) -> list[Ns]:
+            rows = connection.execute(
+                "SELECT DISTINCT start_ns FROM (SELECT start_ns FROM fragment"
+                " GROUP BY substr(kind, 1, instr(kind, ' ')), start_ns"
+                " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
+                " ORDER BY start_ns DESC",
+                (reading,),
+            )
+            return [start for (start,) in rows]
+
+        return self.read(ask, [])
+
     def _numbers(self, parts: str) -> tuple[int, ...]:
         return tuple(self.offset + part for part in json.loads(parts))
 

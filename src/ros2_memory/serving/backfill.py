@@ -17,9 +17,10 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.columns.fill import Progress
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
@@ -32,7 +33,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ros2_memory.columns.fill import Filling
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
 
 T = TypeVar("T")
@@ -46,6 +48,8 @@ PRUNE_INTERVAL_S: Final = 600.0
 
 LONGEST_TURN_S: Final = 600.0
 """How long one of several stores is filled before it is the next one's turn."""
+_AGAIN: Final = 4
+"""Slices of the clock of which what follows is made again in a round."""
 _LATELY: Final = 4
 """Intervals between scans after which bags count as out of reach."""
 
@@ -66,6 +70,7 @@ class Backfill:
         self._memory = memory
         self.filling = filling
         self.undecodable: dict[str, str] = {}
+        self._of_others: list[Ns] | None = None
 
     def progress(self) -> Progress:
         """Returns how much is stored."""
@@ -86,13 +91,27 @@ class Backfill:
         timeline = self._memory.index.snapshot().timeline
         return self.filling is not None and self.filling.fill(bag, timeline)
 
-    def merge(self) -> None:
-        """Makes parts of what is stored and over, and keeps the store within what it may take."""
+    def merge(self) -> bool:
+        """Makes parts of what is stored and over, and keeps the store within what it may take.
+
+        Then makes again, a few at a time, the newest first, what followed from parts under other
+        settings.
+
+        Returns:
+            Whether there is more of that.
+        """
         snapshot = self._memory.index.snapshot()
-        if self.filling is not None and snapshot.problem is None:
-            make_fragments(self._memory, self.filling.merge(snapshot.timeline))
-            self.filling.thin()
-            self.filling.trim()
+        if self.filling is None or snapshot.problem is not None:
+            return False
+        make_fragments(self._memory, self.filling.merge(snapshot.timeline))
+        self.filling.thin()
+        self.filling.trim()
+        if self._of_others is None:
+            scanner = self._memory.columns
+            self._of_others = [] if scanner is None else scanner.fragments_of_others()
+        now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
+        make_fragments(self._memory, [TimeWindow(start, start + PART_NS) for start in now])
+        return bool(self._of_others)
 
     def look_after(self, *, thorough: bool = False) -> None:
         """Returns the store to its file, unless the bag directory itself is missing.

@@ -51,11 +51,13 @@ def bag(bag_dir: Path, number: int, *, finish: bool = True) -> Path:
     return write_mcap(path, messages, McapLayout(finish=finish, chunk_size=300))
 
 
-def storing(bag_dir: Path, clock: SettableClock | None = None) -> tuple[Memory, Backfill]:
+def storing(
+    bag_dir: Path, clock: SettableClock | None = None, *, reading: str = ""
+) -> tuple[Memory, Backfill]:
     """A memory as a new process has it, and what fills its store."""
     memory = memory_of(bag_dir, clock=clock, reader=BagDirReader(McapReader(), bag_dir))
     store = ColumnStore([bag_dir / OWN_FOLDER / FILE], memory.reader.definition)
-    scanner = Scanner(store, bag_dir)
+    scanner = Scanner(store, bag_dir, reading)
     filling = Filling(scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
     memory = replace(memory, columns=scanner)
     return memory, Backfill(memory, filling)
@@ -133,6 +135,25 @@ def test_what_the_database_refuses_is_told_of_and_not_tried_for_ever(
         assert fill_store(backfill) == Progress(1, 0, 0, 1)
     (finding,) = check_columns(memory)
     assert "1 bag could not be stored (too large)" in finding.seen
+
+
+def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
+    tmp_path: Path,
+) -> None:
+    for number in range(6):
+        bag(tmp_path, 60 * number)  # each in ten minutes of its own
+    fill_store(storing(tmp_path, reading="before")[1])
+    memory, backfill = storing(tmp_path, reading="after")
+    assert memory.columns is not None
+    before = len(memory.columns.fragments_of_others())
+    assert backfill.merge()
+    assert 0 < len(memory.columns.fragments_of_others()) < before
+    while backfill.merge():
+        pass
+    assert memory.columns.fragments_of_others() == []
+    known = storing(tmp_path, reading="before")[0].columns
+    assert known is not None
+    assert known.fragments_of_others() == []
 
 
 def test_what_is_stored_of_bags_that_are_gone_is_dropped(tmp_path: Path) -> None:

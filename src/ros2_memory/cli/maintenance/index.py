@@ -150,7 +150,7 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
             for number, bag in enumerate(backfill.waiting()[:_BATCH]):
                 show(replace(progress, stored=progress.stored + number))
                 done |= backfill.store(bag)
-            backfill.merge()
+            done |= backfill.merge()
     backfill.prune()
     backfill.precompute()
     return backfill.progress()
