@@ -9,6 +9,7 @@ elements of a sequence lie under its path and `#`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -38,7 +39,7 @@ DROPPED: Final = "dropped"
 ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PackedPart:
     """A part as it is stored.
 
@@ -56,10 +57,15 @@ class PackedPart:
     bags: tuple[int, ...]
     columns: Mapping[str, Packed]
 
+    @cached_property
+    def first_of(self) -> dict[bytes, str]:
+        """By data, the path of the first column that has it: it is stored once."""
+        return {packed.data: path for path, packed in reversed(self.columns.items())}
+
     @property
     def size(self) -> int:
         """How many bytes its data takes."""
-        return sum(len(packed.data) for packed in self.columns.values())
+        return sum(map(len, self.first_of))
 
 
 def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:

@@ -78,7 +78,7 @@ TABLES: Final = Tables(
         "deletion",
     ),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
-    pragmas=("page_size = 4096", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
+    pragmas=("page_size = 1024", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
     statements="""
 CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
   size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
@@ -97,8 +97,8 @@ CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
   bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
-CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, data BLOB NOT NULL,
-  UNIQUE (part, path));
+CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
+  data BLOB NOT NULL, UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
   codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
   nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
@@ -431,7 +431,9 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> bytes | None:
             row = connection.execute(
-                "SELECT data FROM part_column WHERE part = ? AND path = ?",
+                "SELECT coalesce(other.data, own.data) FROM part_column AS own"
+                " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
+                " WHERE own.part = ? AND own.path = ?",
                 (part - self.offset, path),
             ).fetchone()
             return None if row is None else row[0]

@@ -130,7 +130,8 @@ def thin_parts(
 def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> None:
     """Leaves of a part the zones of its columns, and the times of its messages."""
     rows = connection.execute(
-        "SELECT path FROM part_column WHERE part = ? AND length(data) > 0", (part,)
+        "SELECT path FROM part_column WHERE part = ? AND (length(data) > 0 OR same NOT NULL)",
+        (part,),
     )
     paths = [path for (path,) in rows if path not in ALWAYS]
     if not paths:
@@ -196,12 +197,13 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
     )
     number = int(cursor.lastrowid or 0)
     connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?)",
+        "INSERT INTO part_column VALUES (?, ?, ?, ?)",
         [
-            (number, path, packed.data)
+            (number, path, *((None, packed.data) if same == path else (same, b"")))
             for path, packed in part.columns.items()
             # Numbers that are rounded to one take no bytes, but are no constant.
             if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
+            for same in [part.first_of[packed.data]]
         ],
     )
     connection.executemany(

@@ -66,9 +66,19 @@ class Record:
         text = zstandard.ZstdDecompressor().decompress(packed, max_output_size=_MOST_BYTES)
         head, *rows = map(json.loads, text.decode().split("\n"))
         replies = [
-            Replied(Call.from_json(row["call"]), row["reply"], row.get("catalogue")) for row in rows
+            Replied(
+                Call.from_json(row["call"]), _renamed(row["reply"]), _renamed(row.get("catalogue"))
+            )
+            for row in rows
         ]
         return cls(head["world"], head["settings"], head["places"], replies)
+
+
+def _renamed(reply: Any) -> Any:
+    """A reply with today's name of how far the store is filled, which the page shows."""
+    if isinstance(reply, dict) and "catalogue" in reply:
+        return {"filling" if key == "catalogue" else key: each for key, each in reply.items()}
+    return reply
 
 
 def path_of(world: str) -> Path:
