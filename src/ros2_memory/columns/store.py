@@ -98,7 +98,7 @@ CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
-  data BLOB NOT NULL, UNIQUE (part, path));
+  data BLOB, UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
   codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
   nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
@@ -431,7 +431,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> bytes | None:
             row = connection.execute(
-                "SELECT coalesce(other.data, own.data) FROM part_column AS own"
+                "SELECT coalesce(own.data, other.data) FROM part_column AS own"
                 " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
                 " WHERE own.part = ? AND own.path = ?",
                 (part - self.offset, path),

@@ -199,7 +199,7 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
     connection.executemany(
         "INSERT INTO part_column VALUES (?, ?, ?, ?)",
         [
-            (number, path, *((None, packed.data) if same == path else (same, b"")))
+            (number, path, *((None, packed.data) if same == path else (same, None)))
             for path, packed in part.columns.items()
             # Numbers that are rounded to one take no bytes, but are no constant.
             if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
