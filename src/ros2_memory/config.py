@@ -79,11 +79,12 @@ def _home_expanded(path: Path) -> Path:
         raise ValueError(f"must be a path that can be found: {error}") from error
 
 
-def _in_config_dir(path: Path, info: ValidationInfo[Path]) -> Path:
-    """Resolves `config/x` against the configuration directory in use."""
+def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
+    """Resolves `config/x` against the first of the given folders that has it, or the last one."""
     if path.parts[0] != "config":
         return path
-    return info.context.joinpath(*path.parts[1:])
+    found = [folder.joinpath(*path.parts[1:]) for folder in info.context]
+    return next((each for each in found if each.is_file()), found[-1])
 
 
 def _below(name: str) -> str:
@@ -308,7 +309,7 @@ class ServerSettings:
 
     `tools`: all, or those of the specification; `write_tools`: also those that write. `metrics` and
     `traces` need the extra `observability`. `keep_questions`: how many of the latest calls are kept
-    in memory, with their replies, for the page; 0 for none.
+    in memory, with their replies, for the page; 0 for none. `page`: whether that is served.
     """
 
     name: Text
@@ -319,6 +320,7 @@ class ServerSettings:
     max_reply_chars: Annotated[int, Field(strict=True, ge=1000)]
     tools: Literal["all", "spec"]
     write_tools: Flag
+    page: Flag
     keep_questions: Annotated[int, Field(strict=True, ge=0, le=1000)]
     metrics: Flag
     traces: Flag
@@ -642,8 +644,10 @@ def load_explained(
         _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         raw = OmegaConf.to_container(composed, resolve=False)
+    # What users keep beside them wins over what is shipped, unless they chose a folder.
+    folders = [folder] if "MEMORY_CONFIG_DIR" in given else [Path("config").absolute(), folder]
     settings = validated(
-        Settings, data, config_dir=folder, source=sources, raw=raw, adapters=_NODES
+        Settings, data, config_dirs=folders, source=sources, raw=raw, adapters=_NODES
     )
     return settings, sources
 
@@ -759,7 +763,7 @@ def _load_file(model: type[_T], key: str, path: Path) -> _T:
 
     with foreign_errors_as_config_error(f"{key}: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)
-    return validated(model, data, config_dir=path.parent, source=source)
+    return validated(model, data, config_dirs=[path.parent], source=source)
 
 
 @contextmanager

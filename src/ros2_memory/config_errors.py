@@ -20,7 +20,7 @@ from yaml import YAMLError
 from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from pydantic_core import ErrorDetails
@@ -53,7 +53,7 @@ def validated(
     model: type[_T],
     data: object,
     *,
-    config_dir: Path,
+    config_dirs: Sequence[Path],
     source: Callable[[str], str],
     raw: object = None,
     adapters: Mapping[str, type] | None = None,
@@ -63,7 +63,7 @@ def validated(
     Args:
         model: a class of the configuration.
         data: the composed configuration, interpolations resolved.
-        config_dir: the folder that paths which begin with `config/` are relative to.
+        config_dirs: the folders in which a path that begins with `config/` is looked for.
         source: returns who set the key of a dot-path, as a phrase that follows "set".
         raw: `data` with its interpolations unresolved. A key that only repeats another key's
             refused value is not reported again.
@@ -74,7 +74,7 @@ def validated(
     """
     nodes = adapters or {}
     try:
-        return TypeAdapter(model).validate_python(data, context=config_dir)
+        return TypeAdapter(model).validate_python(data, context=config_dirs)
     except ValidationError as error:
         faults = [(_dot_path(fault, nodes), fault) for fault in error.errors(include_url=False)]
     refused = {key for key, _fault in faults}

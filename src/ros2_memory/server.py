@@ -159,7 +159,7 @@ def _parts_of_one(
     backfill = build_backfill(settings, memory)
     server = build_server(settings, memory, telemetry, backfill.progress)
     page, warm_page = None, None
-    if settings.server.transport != "stdio":
+    if settings.server.transport != "stdio" and settings.server.page:
         from ros2_memory.serving.page.routes import page_routes, warm_up
 
         page = page_routes(server.dispatcher, backfill.progress)

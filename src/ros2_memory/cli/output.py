@@ -271,11 +271,8 @@ def _format_list(values: Sequence[JsonValue]) -> str:
 def _format_object(value: Mapping[str, JsonValue]) -> str:
     """Formats an object: `x 1.5, y 2, yaw_deg 90 (map)`, `label: cup; score: 0.9`."""
     if _is_vector(value):
-        is_planar = "w" not in value and not value.get("z")
         text = ", ".join(
-            f"{key} {format_value(each)}"
-            for key, each in value.items()
-            if key != "frame_id" and not (key == "z" and is_planar)
+            f"{key} {format_value(each)}" for key, each in value.items() if key != "frame_id"
         )
         frame = value.get("frame_id")
         return text if frame is None else f"{text} ({format_value(frame)})"

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
 from ros2_memory.core.reply import Scope, render, shown, with_notes
-from ros2_memory.core.text import listed as named
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
-from ros2_memory.tools.reply_size import largest, to_json_text, without_constant_zeros
+from ros2_memory.tools.reply_size import largest, to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,11 +26,8 @@ if TYPE_CHECKING:
 
 ROBOT_NAME: Final = "robot_name"
 """The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""
-ZEROS_SHOWN_BELOW_CHARS: Final = 4000
-"""A range shorter than this keeps its constant zeros: there is room, and whole values read best."""
 FINE_PATH_M: Final = 0.05 + 1e-9
 """The deviation that a simplified path is expected to have; a larger one is noted."""
-_MAX_ZEROS_NAMED: Final = 20
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
 _COMPARISONS: Final = tuple(compared(most) for most in range(5, 0, -1))
@@ -58,8 +54,6 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
             reply = _shortest(answer, bag_dir, _COMPARISONS)
         case results.Things():
             reply = _things(answer, bag_dir)
-        case results.TopicRange(fields=()):
-            reply = _samples(answer, bag_dir)
         case _:
             reply = render(_with_all_notes(answer), bag_dir)
     return reply
@@ -138,21 +132,6 @@ def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
         return render(few, bag_dir, _SHORT_THINGS)
 
     return first(largest(1, len(answer.things), lambda count: _is_short(first(count))) or 1)
-
-
-def _samples(answer: results.TopicRange, bag_dir: Path) -> JsonObject:
-    """Returns the samples of a window, without the numbers that are 0 throughout a long reply."""
-    reply = render(answer, bag_dir)
-    if len(to_json_text(reply)) <= ZEROS_SHOWN_BELOW_CHARS:
-        return reply
-    values, zeros = without_constant_zeros([sample.value for sample in answer.samples])
-    if not zeros:
-        return reply
-    note = f"0 in every sample and left out: {named(zeros, at_most=_MAX_ZEROS_NAMED)}"
-    samples = tuple(
-        replace(sample, value=value) for sample, value in zip(answer.samples, values, strict=True)
-    )
-    return render(replace(answer, samples=samples, notes=(*answer.notes, note)), bag_dir)
 
 
 def _path_notes(path: Trajectory) -> Iterator[str]:

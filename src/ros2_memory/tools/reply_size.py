@@ -11,18 +11,16 @@ import json
 import math
 from bisect import bisect_left
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
-
-_Path: TypeAlias = tuple[str, ...]
 
 EVENLY_THINNED: Final = frozenset({"samples", "rows", "waypoints", "value"})
 """Rows along time: some of every part say more than all of one part. Others lose their end."""
@@ -68,28 +66,6 @@ def fit_reply(reply: JsonObject, max_chars: int) -> str:
     return to_json_text(_outline(reply, max_chars))
 
 
-def without_constant_zeros(samples: Sequence[JsonValue]) -> tuple[list[JsonValue], list[str]]:
-    """Returns the samples without the numbers that are 0 in every one of them, and their paths.
-
-    Only leaves of objects are removed, and never all of one object: a structure that is 0
-    throughout means something and stays whole. Fewer than two samples are returned as they are.
-    """
-    if len(samples) < 2:
-        return list(samples), []
-    shared = [path for path, item in _items(samples[0]) if _is_zero(item)]
-    removed = set(shared)
-    for sample in samples[1:]:
-        removed = {path for path in removed if _is_zero(_found(sample, path))}
-    for sample in samples:
-        for path in {path[:-1] for path in removed}:
-            item = _found(sample, path)
-            leaves = {(*path, key) for key in item} if isinstance(item, dict) else set()
-            if leaves <= removed:
-                removed -= leaves
-    named = [".".join(path) for path in shared if path in removed]
-    return [_without(sample, removed) for sample in samples] if removed else list(samples), named
-
-
 def _representable(value: JsonValue) -> JsonValue:
     if isinstance(value, str):
         return _encodable(value)
@@ -104,35 +80,6 @@ def _representable(value: JsonValue) -> JsonValue:
 
 def _encodable(text: str) -> str:
     return text if text.isascii() else text.encode("utf-8", "replace").decode("utf-8")
-
-
-def _is_zero(value: JsonValue) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and value == 0
-
-
-def _items(value: JsonValue, path: _Path = ()) -> Iterator[tuple[_Path, JsonValue]]:
-    """Yields everything in an object, at any depth, with its path."""
-    if isinstance(value, dict):
-        for key, item in value.items():
-            yield (*path, key), item
-            yield from _items(item, (*path, key))
-
-
-def _found(value: JsonValue, path: _Path) -> JsonValue:
-    """Returns what an object has at a path; None where it has nothing there."""
-    for key in path:
-        value = value.get(key) if isinstance(value, dict) else None
-    return value
-
-
-def _without(value: JsonValue, removed: set[_Path], path: _Path = ()) -> JsonValue:
-    if not isinstance(value, dict):
-        return value
-    return {
-        key: _without(item, removed, (*path, key))
-        for key, item in value.items()
-        if (*path, key) not in removed
-    }
 
 
 def _notes(reply: JsonObject) -> list[JsonValue]:

@@ -89,8 +89,10 @@ class Signature:
             }
             properties[name] = _with_plain_times(shown) if self._plain_times else shown
         closed: JsonObject = {"additionalProperties": False}
-        if self._required:
-            closed["required"] = [*self._required]
+        # The specification's tools take one time; those beyond it take one of several forms.
+        required = [*self._required, *(self._either[:1] if self._plain_times else ())]
+        if required:
+            closed["required"] = [*required]
         return {"type": "object", "properties": properties, **closed}
 
     def parse(self, given: Mapping[str, object]) -> Arguments:

@@ -5,11 +5,10 @@ import math
 from itertools import pairwise
 from typing import Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.tools.reply_size import fit_reply, to_json_text, without_constant_zeros
+from ros2_memory.tools.reply_size import fit_reply, to_json_text
 
 FLOATS = st.floats(allow_nan=True, allow_infinity=True)
 SCALARS = st.none() | st.booleans() | st.integers() | FLOATS | st.text(max_size=60)
@@ -165,53 +164,3 @@ def test_a_long_note_does_not_drive_out_the_answer() -> None:
     shown = strict(fit_reply({"value": 1, "notes": ["n" * 3000] * 50}, 24_000))
     assert shown["value"] == 1
     assert shown["notes"][-1] == "and 38 more notes"
-
-
-def odom(x: float, *, vx: float = 0.0) -> dict[str, Any]:
-    return {
-        "position": {"x": x, "y": 2.0, "z": 0.0},
-        "linear_velocity": {"x": vx, "y": 0.0, "z": 0.0},
-        "ok": False,
-    }
-
-
-def test_numbers_that_are_zero_in_every_sample_are_left_out_and_named() -> None:
-    kept, names = without_constant_zeros([odom(1.0, vx=0.5), odom(0.0)])
-    assert kept == [
-        {"position": {"x": 1.0, "y": 2.0}, "linear_velocity": {"x": 0.5}, "ok": False},
-        {"position": {"x": 0.0, "y": 2.0}, "linear_velocity": {"x": 0.0}, "ok": False},
-    ]
-    assert names == ["position.z", "linear_velocity.y", "linear_velocity.z"]
-
-
-def test_a_structure_that_is_zero_throughout_stays_whole() -> None:
-    kept, names = without_constant_zeros([odom(1.0), odom(2.0)])
-    assert kept[0] == {
-        "position": {"x": 1.0, "y": 2.0},
-        "linear_velocity": {"x": 0.0, "y": 0.0, "z": 0.0},
-        "ok": False,
-    }
-    assert names == ["position.z"]
-
-
-@pytest.mark.parametrize("values", [[], [odom(0.0)], [0, 0], [[0], [0]], [None, {"a": 0}]])
-def test_single_samples_lists_and_bare_numbers_are_left_as_they_are(values: list[Any]) -> None:
-    assert without_constant_zeros(values) == (values, [])
-
-
-def test_a_key_that_some_samples_lack_is_no_constant() -> None:
-    values: list[Any] = [{"a": 0, "b": 1}, {"b": 1}]
-    assert without_constant_zeros(values) == (values, [])
-
-
-@given(st.lists(st.dictionaries(st.sampled_from("abc"), VALUES), min_size=2, max_size=5))
-def test_leaving_out_zeros_removes_nothing_else(values: list[Any]) -> None:
-    shown, names = without_constant_zeros(values)
-    kept: list[Any] = [*shown]
-    for before, after in zip(values, kept, strict=True):
-        for name in names:
-            owner, _, leaf = name.rpartition(".")
-            if "." not in owner:
-                held = before if not owner else before[owner]
-                assert held[leaf] == 0
-        assert set(after) | {name for name in names if "." not in name} == set(before)
