@@ -20,7 +20,6 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events
 from ros2_memory.columns.truth import ColumnCondition
-from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.counts.bins import BinnedWindow
 from ros2_memory.counts.time_bins import TrueIntervals
@@ -141,8 +140,6 @@ def _events(
 
     try:
         parts.extend(events_back(view, topic, window, may_match=may_match, reached=reached))
-    except GoneError:
-        raise
     except QueryTimeoutError:
         if not parts:
             raise

@@ -17,7 +17,6 @@ from ros2_memory.analysis.motion.trajectory import (
 )
 from ros2_memory.analysis.poses import NO_POSES
 from ros2_memory.columns.motion import PATHS
-from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -152,8 +151,6 @@ def _slices_in(
             since = start
             if made.poses or made.invalid:
                 found.append(made)
-    except GoneError:
-        raise
     except QueryTimeoutError:
         if not found:
             raise
