@@ -6,6 +6,7 @@ import math
 import re
 from contextlib import suppress
 from difflib import get_close_matches
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
@@ -219,12 +220,13 @@ def topics_with(view: View, what: str) -> list[str]:
 
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
-    kinds_of = view.memory.extractor.kinds_of
+    kinds_of, types = view.memory.extractor.kinds_of, view.snapshot.timeline.types
+    carriers = {each for each in set(chain(*types.values())) if what in kinds_of(each)}
     return [
         f"{topic} ({type_name})"
-        for topic in view.snapshot.timeline.topics()
-        for type_name in sorted(view.snapshot.timeline.types_of(topic))
-        if what in kinds_of(type_name)
+        for topic, names in types.items()
+        for type_name in names
+        if type_name in carriers
     ]
 
 
