@@ -62,7 +62,6 @@ if TYPE_CHECKING:
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
-_NO_POSES: Final = "no topic has the robot's poses"
 _MOST_BAGS_OF_BODY: Final = 128
 """Bags of which transforms are read for a path."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
@@ -340,7 +339,7 @@ def _rank(frame: str) -> int:
 
 def body_by_transforms(view: View) -> Body | None:
     """Returns the robot's body where transforms alone show it; None where a topic has its poses."""
-    return None if view.has_poses else robot_body(view)
+    return None if view.memory.stated is not None or view.has_poses else robot_body(view)
 
 
 def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = False) -> str:
@@ -354,7 +353,7 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
     topics = transform_topics(view)
     body, why = None, ""
     if name is None:
-        body, why = body_by_transforms(view), f": {_NO_POSES}"
+        body, why = body_by_transforms(view), ": no topic has the robot's poses"
     elif name in topics:
         body = robot_body(view)
     if body is None:
@@ -409,8 +408,8 @@ def poses_of_body(
     bags = view.stream.overlapping_bags(transform_topics(view), window)
     if len(bags) > _MOST_BAGS_OF_BODY:
         raise InvalidArgumentsError(
-            f"{_NO_POSES}, and by transforms a path is read from {_MOST_BAGS_OF_BODY} bags at "
-            f"most: these are {len(bags)}; ask about a shorter window"
+            f"by transforms, a path is read from {_MOST_BAGS_OF_BODY} bags at most: these are "
+            f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
     sessions = sessions_of(view)
