@@ -8,8 +8,7 @@ import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
-from ros2_memory.history.driven_path import pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.map_placement import map_placement
@@ -58,7 +57,7 @@ def count_visits(
     window = search_window(TimeRange(start_s, end_s), wall)
     view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
-    topic = resolve_pose_topic(view)
+    topic = resolve_path_topic(view)
     note_robots(view, topic, asked)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame

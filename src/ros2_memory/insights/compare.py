@@ -14,8 +14,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
-from ros2_memory.history.driven_path import length_notes, pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import length_notes, pose_frame, resolve_path_topic
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
@@ -157,7 +156,7 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
 
 def _placement(view: View) -> MapPlacement | None:
     try:
-        topic = resolve_pose_topic(view)
+        topic = resolve_path_topic(view)
         return map_placement(view, pose_frame(view, topic), topic)
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None
@@ -222,7 +221,7 @@ def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther |
 
 def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
     """Whether all poses of two windows are of one session, whose odometry goes on."""
-    topic, sessions = resolve_pose_topic(view), sessions_of(view)
+    topic, sessions = resolve_path_topic(view), sessions_of(view)
     found = {
         sessions.of(recording)
         for recording, span in view.snapshot.timeline.recordings(topic).items()

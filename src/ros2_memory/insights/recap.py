@@ -26,8 +26,8 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
 )
-from ros2_memory.history.driven_path import length_notes, way_in
-from ros2_memory.history.no_data import resolve_pose_topic, seconds
+from ros2_memory.history.driven_path import length_notes, resolve_path_topic, way_in
+from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
@@ -287,7 +287,7 @@ def _with_way_there(
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
     driven = None
     if drive.path is not None:
-        way, _ = way_in(view, resolve_pose_topic(view), window)
+        way, _ = way_in(view, resolve_path_topic(view), window)
         driven = totals_inside(way.line, there.spans) if way is not None and way.poses else None
     return replace(
         answer,

@@ -30,6 +30,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.counts.tested import tested
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
+from ros2_memory.history.driven_path import body_by_transforms, resolve_path_topic
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -38,14 +39,14 @@ from ros2_memory.history.reverse_search import (
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.transforms import connects, newest_in_session, transform_at
+from ros2_memory.history.transforms import connects, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import placed, with_place
+from ros2_memory.places.pose_frames import newest_pose, placed, with_place
 from ros2_memory.places.scope import Scope
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
@@ -518,12 +519,9 @@ def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | 
     is in this recording, has poses, it is one of these.
     """
     window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
-    found = newest_in_session(view, view.pose_topic, window, recording)
-    message = None if found is None else view.bags.decode(found)
-    if found is None or message is None:
-        return None
-    pose = view.memory.extractor.pose(message, found.record.channel.type)
-    if pose is None or not all(map(math.isfinite, pose.position)):
+    topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
+    found, pose = newest_pose(view, topic, window, recording) or (None, None)
+    if found is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     there = placed(view, pose, found.time, found.bag.recording, frame_id)
     return with_place(view, there, found.time, found.bag.recording)

@@ -155,8 +155,9 @@ class RobotTracks:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for _, part in found)
         one, *others = _by_robot(found)
-        tracks = tuple(joined_track(parts) for parts in others)
-        return JoinedTrack(joined_track(one), since, left_out, tracks)
+        fastest = view.memory.limits.max_plausible_speed_mps
+        tracks = tuple(joined_track(parts, fastest) for parts in others)
+        return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
     def make(self, window: TimeWindow) -> None:
         """Makes the tracks that follow from parts alone, of those in a window and beside it.
