@@ -52,6 +52,13 @@ _FROM_START: Final = 1
 _TO_END: Final = 2
 
 
+def pieces_of(times: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Returns when the pieces of ascending times begin and end: a silence parts them."""
+    new = np.diff(times) > SILENCE_NS
+    begins, ends = np.append([True], new), np.append(new, [True])
+    return times[begins[: len(times)]], times[ends[: len(times)]]
+
+
 class VisibleInterval(NamedTuple):
     """An object in view: log times of the first and last message that contain it (inclusive).
 
