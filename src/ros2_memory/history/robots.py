@@ -8,7 +8,7 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import combinations, islice
+from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -365,10 +365,10 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     return found
 
 
-def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> None:
+def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
     """Does as `note_robots` for the first few of some topics."""
-    for topic in topics[:_MAX_TOPICS]:
-        note_robots(view, topic, window)
+    every = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
+    return united(chain.from_iterable(every))
 
 
 def note_robots_near(view: View, found: StoredMessage) -> None:

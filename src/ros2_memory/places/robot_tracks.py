@@ -501,7 +501,7 @@ def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
             others.append(beside)
         times = np.concatenate([part.times for part in own])
         times.sort()
-        starts, stops = pieces_of(times)
+        starts, stops = pieces_of(times, times)
         placed.append(_Pieces(starts, stops, int(starts[0]), int(stops[-1])))
     return [kept, *others]
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
-from ros2_memory.history.robots import note_robots
+from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import PLACE, placed_times, track_in
@@ -175,8 +175,10 @@ class _States:
         topics, timeline = self._search.topics, self._view.snapshot.timeline
         if self._holds_on:
             spans = [span for topic in topics for span in timeline.recordings(topic).values()]
-            return [(min(spans)[0], MAX_NS)]
-        return _heard(self._view, topics, window.widened(SILENCE_NS))
+            known = [(min(spans)[0], MAX_NS)]
+        else:
+            known = _heard(self._view, topics, window.widened(SILENCE_NS))
+        return without(known, note_robots_on(self._view, topics, window))
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message then met the condition; False without one."""
@@ -213,20 +215,18 @@ def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
 
     Of a bag that holds a topic for no longer, its first and its last message say enough.
     """
-    times = []
+    spans = [(np.empty(0, np.int64), np.empty(0, np.int64))]
     for topic in topics:
-        every = [each.bounds(topic) for each in view.snapshot.timeline.segments_in(window)]
-        times += [moments for bounds in every for moments in bounds]
-        within = united(
-            (first, last + 1)
-            for firsts, lasts in every
-            for first, last in np.stack((firsts, lasts), axis=1)[
-                lasts - firsts > SILENCE_NS
-            ].tolist()
-        )
+        within: list[tuple[Ns, Ns]] = []
+        for segment in view.snapshot.timeline.segments_in(window):
+            firsts, lasts = segment.bounds(topic)
+            is_long = lasts - firsts > SILENCE_NS
+            spans.append((firsts[~is_long], lasts[~is_long]))
+            within += zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
         if within:
-            found = scan(view, topic, window, columns=False, within=within)
-            times += [rows.times for rows in found]
-    moments = np.sort(np.concatenate([np.empty(0, np.int64), *times]))
-    starts, stops = pieces_of(moments)
+            every = scan(view, topic, window, columns=False, within=united(within))
+            spans += [pieces_of(rows.times, rows.times) for rows in every]
+    starts, stops = (np.concatenate(some) for some in zip(*spans, strict=True))
+    order = np.argsort(starts, kind="stable")
+    starts, stops = pieces_of(starts[order], stops[order])
     return list(zip(starts.tolist(), (stops + 1).tolist(), strict=True))

@@ -166,15 +166,17 @@ def test_a_topic_that_seldom_speaks_is_known_from_its_first_message_on(
     assert (later["total"], "unknown_s" in later) == (1, False)
 
 
-def test_where_two_robots_are_is_unknown(tmp_path: Path) -> None:
+def test_what_two_robots_do_at_once_is_unknown(tmp_path: Path) -> None:
     world(tmp_path, life(90), name="left")
-    shifted = [
-        odom(one.log_time + 70_000_000, 30.0, 0.0)
-        for one in life(120, {"/odom": [(0, 3)]})
-        if one.topic == "/odom"
-    ]
-    memory = world(tmp_path, shifted, name="right")
-    for tool, asks in (("visits", FAR), ("find_matches", {**PRESSED, "where": FAR})):
+    own = [one for one in life(120, {"/odom": [(0, 3)]}) if one.topic == "/odom"]
+    other = [odom(one.log_time + 70_000_000, 30.0, 0.0) for one in own]
+    memory = world(tmp_path, other, name="right")
+    drives = {"topic": "/odom", "field": "linear_velocity.x", "condition_type": "above", "value": 1}
+    for tool, asks in (
+        ("visits", FAR),
+        ("find_matches", {**PRESSED, "where": FAR}),
+        ("find_matches", {**PRESSED, "while": drives}),
+    ):
         reply = asked(memory, tmp_path, tool, **asks)
         assert (reply["total"], reply["unknown_s"]) == (0, pytest.approx(86.73, abs=0.01))
         assert any("as from several robots" in note for note in reply["notes"])
