@@ -14,7 +14,7 @@ from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import PLACE, placed_times, places_in, track_in
+from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
@@ -68,7 +68,7 @@ def count_visits(
     track = track_in(view, placement.frame_id, binned.window)
     known = placed_times(track, mixed)
     binned.add_lengths("placed_s", "duration", known)
-    binned.add_unknown(unknown_times(view, binned.counted, known, PLACE))
+    binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
     if place is not None:
         stayed = robot_inside(track, place.region, binned.window)
         if not stayed and asked_frame is None:

@@ -531,7 +531,7 @@ def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | 
 
 
 def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
-    """Returns which recording has a message of a sighting: the last one may be of a later one."""
+    """Returns the recording of a sighting's message at a time: its last may be of a later one."""
     topic, own = newest.record.channel.topic, newest.bag.recording
     bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
     every = {each.bag.recording for each in bags}

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.places.where import Where
 
 
-PLACE: Final = "where the robot was"
+WHEREABOUTS: Final = "where the robot was"
 """What is not known without poses, for sentences."""
 _CLOSE_NS: Final[Ns] = 60 * NS_PER_S
 _MOST_JOINED: Final = 50

@@ -18,7 +18,7 @@ from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, c
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import PLACE, placed_times, track_in
+from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.where import note_other_frame, parse_where
 
@@ -69,9 +69,10 @@ class Scope:
             track, inside = _in_region(view, parse_where(view.memory.limits, where), window)
             self._inside = [(each.start, each.stop) for each in inside]
             known = placed_times(track, note_robots(view, resolve_path_topic(view), window))
-            self.unknown = unknown_times(view, window, known, PLACE)
-        self._states = None if during is None else _States(view, during)
-        if during is not None and self._states is not None:
+            self.unknown = unknown_times(view, window, known, WHEREABOUTS)
+        self._states: _States | None = None
+        if during is not None:
+            self._states = _States(view, during)
             known = self._states.known_in(window)
             unknown = unknown_times(view, window, known, f"what {during.topic} said")
             self.unknown = united([*self.unknown, *unknown])
@@ -124,7 +125,7 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> Sequence[In
 
 
 def _in_region(view: View, where: Where, window: TimeWindow) -> tuple[RobotTrack, Sequence[Inside]]:
-    """Returns the robot's track with the same."""
+    """Returns the robot's track, and when it was in a region."""
     topic = resolve_path_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
     track = track_in(view, where.frame_id or placement.frame_id, window)
@@ -174,8 +175,8 @@ class _States:
         """Returns when the topics said something: without silences, unless that holds on."""
         topics, timeline = self._search.topics, self._view.snapshot.timeline
         if self._holds_on:
-            spans = [span for topic in topics for span in timeline.recordings(topic).values()]
-            known = [(min(spans)[0], MAX_NS)]
+            begins = [span[0] for topic in topics for span in timeline.recordings(topic).values()]
+            known = [(min(begins, default=MAX_NS), MAX_NS)]
         else:
             known = _heard(self._view, topics, window.widened(SILENCE_NS))
         return without(known, note_robots_on(self._view, topics, window))

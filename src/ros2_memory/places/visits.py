@@ -33,7 +33,7 @@ from ros2_memory.history.view import TimeRange, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import (
-    PLACE,
+    WHEREABOUTS,
     place_visits,
     placed_times,
     places_in,
@@ -184,11 +184,7 @@ def asked_place(
 
 
 def _by_track(
-    view: View,
-    topic: str,
-    frame_id: str,
-    place: Where,
-    bounds: tuple[TimeWindow, Ns, int],
+    view: View, topic: str, frame_id: str, place: Where, bounds: tuple[TimeWindow, Ns, int]
 ) -> _Known:
     """Returns the visits by the robot's track; those to show by its poses."""
     window, now, limit = bounds
@@ -204,7 +200,7 @@ def _unknown(
     view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans, elapsed: Elapsed
 ) -> Ns:
     """Returns for how long it is not known where the robot was, by a track for each frame."""
-    every = (unknown_times(view, window, placed_times(one, mixed), PLACE) for one in tracks)
+    every = (unknown_times(view, window, placed_times(one, mixed), WHEREABOUTS) for one in tracks)
     return elapsed.among(united(chain.from_iterable(every)))
 
 
