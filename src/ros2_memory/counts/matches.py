@@ -82,7 +82,7 @@ def count_matches(
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)
     note_robots_on(view, topics, binned.counted)
-    held, since = None, None
+    held, since, unknown = None, None, []
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
     alone = where is None and during is None and len(topics) == 1
@@ -92,8 +92,10 @@ def count_matches(
         scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
         held = TrueIntervals.of([(first, last, True) for first, last in spans])
+        unknown = scope.unknown
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
+    binned.add_unknown(unknown)
     binned.add_held(held)
     return binned.answer()
 

@@ -21,7 +21,7 @@ from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, track_in
+from ros2_memory.places.region_visits import place_visits, places_in, track_in
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
@@ -244,7 +244,8 @@ def _places(
     found: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            visited = place_visits(view, places, placement, window)
+            placed = places_in(view, places, placement, window)
+            visited = place_visits(view, placed, window, passed)
             durations = {each.place: each.duration for each in visited}
         else:
             inside = times_inside(view, where, placement.frame_id, window)

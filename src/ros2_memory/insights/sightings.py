@@ -207,6 +207,7 @@ def find_matches(
         start=start,
         end=end,
         now=now,
+        unknown=elapsed.among(scope.unknown),
         notes=view.notes.sentences(),
     )
 
@@ -450,7 +451,7 @@ def _sighting(
     thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
     robot_at_first = thing is None and matches.begun
     at = matches.first if robot_at_first else newest.time
-    robot = _robot(view, at, newest.bag.recording, frame_id)
+    robot = _robot(view, at, _recording_at(view, newest, at), frame_id)
     return Sighting(
         topic=matches.topic,
         first=matches.first,
@@ -525,6 +526,14 @@ def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | 
         return None
     there = placed(view, pose, found.time, found.bag.recording, frame_id)
     return with_place(view, there, found.time, found.bag.recording)
+
+
+def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
+    """Returns the recording of a sighting's message at a time: its last may be of a later one."""
+    topic, own = newest.record.channel.topic, newest.bag.recording
+    bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
+    every = {each.bag.recording for each in bags}
+    return own if own in every else min(every, default=own)
 
 
 def _spot_of(

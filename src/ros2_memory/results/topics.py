@@ -305,6 +305,7 @@ class Sighting:
 @result(
     OBJECTS("sightings").along("last_seen"),
     TOTAL("total", "counted").merged("added"),
+    SECONDS("unknown_s").if_any.merged("added"),
     TIME("searched_from", "start").merged("earliest"),
     TIME("searched_to", "end").merged("newest"),
     LOCAL("local", "start", "end"),
@@ -314,7 +315,8 @@ class Sighting:
 class Sightings(AnswerWithNotes):
     """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
 
-    `total` is how many there are; None if the search ended before it had counted all.
+    `total` is how many there are; None if the search ended before it had counted all. `unknown` is
+    for how long something was recorded, and it is not known whether matches count.
     """
 
     sightings: tuple[Sighting, ...]
@@ -323,6 +325,7 @@ class Sightings(AnswerWithNotes):
     start: Ns | None
     end: Ns | None
     now: Ns
+    unknown: Ns = 0
 
     @property
     def oldest(self) -> Ns | None:

@@ -657,3 +657,30 @@ def test_the_robot_is_where_it_was_when_something_began(tmp_path: Path) -> None:
     [found] = asked(memory_of(tmp_path), tmp_path, "find_matches", **given)["sightings"]
     assert found["first_seen"] == BEGIN / S + 5
     assert (found["robot"]["at"], found["robot"]["x"]) == ("first_seen", 5.0)
+
+
+@each_way
+@pytest.mark.parametrize("pause_s", [0.05, 2.0, 8.0])
+def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
+    tmp_path: Path, pause_s: float, recalls: bool
+) -> None:
+    """The bumper is pressed from 40 s on, the recorder is started again at 50 s."""
+    for nth in range(2):
+        begin = BEGIN + round(nth * (50 + pause_s) * S)
+        steps = [(begin + step * S // 5, step) for step in range(250)]
+        messages = [odom(at, step * 0.1, float(nth)) for at, step in steps]
+        messages += [boolean(at, nth == 1 or step >= 200) for at, step in steps if step % 5 == 0]
+        write_mcap(tmp_path / f"run_{nth}" / f"run_{nth}_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
+    asks = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    [found] = asked(memory, tmp_path, "find_matches", **asks)["sightings"]
+    assert found["first_seen"] == BEGIN / S + 40
+    assert found["robot"] == pytest.approx(
+        {"at": "first_seen", "x": 20.0, "y": 0.0, "z": 0.0, "yaw_deg": 0.0, "frame_id": "odom"}
+    )
+    table = asked(memory, tmp_path, "find_matches", **asks, by="day")
+    row = dict(zip(table["columns"][1:], table["all"], strict=True))
+    unrecorded = pause_s + 0.2 if pause_s > 1 else 0.0
+    assert row["recorded_s"] == pytest.approx(100 + pause_s - 0.2 - unrecorded, abs=0.06)
+    assert row["recorded_s"] - 1.0 <= row["topic_s"] <= row["recorded_s"]
