@@ -289,7 +289,8 @@ class _Slots:
     @cached_property
     def means(self) -> Vectors:
         """The mean position of each slot."""
-        origin = self.positions[0]
+        # Mostly the same in each part, so that sums are rounded alike.
+        origin = np.rint(self.positions[0])
         sums = np.add.reduceat(self.positions - origin, self.begins)
         means: Vectors = origin + sums / self.counts[:, None]
         return means
