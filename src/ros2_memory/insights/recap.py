@@ -384,9 +384,7 @@ def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted by retention"
 
 
-def _stops(
-    stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None
-) -> Iterator[Event]:
+def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None) -> Iterator[Event]:
     for (start, end, box), goes_on in stops:
         (x, y, _), frame = box.centre, ""
         point: tuple[float, float] | None = (x, y)

@@ -211,8 +211,10 @@ def test_the_last_moment_of_a_stop_is_no_stop_of_the_window_that_begins_there(
         memory,
         tmp_path,
         "compare",
-        **{"start": at + ended - 0.021, "end": at + ended + 5},
-        **{"with_start": at + 20, "with_end": at + 27},
+        start=at + ended - 0.021,
+        end=at + ended + 5,
+        with_start=at + 20,
+        with_end=at + 27,
     )
     assert reply["way"]["standstills"] == {"this": 0, "with": 1}
 
