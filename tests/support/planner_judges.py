@@ -367,7 +367,8 @@ def later(first: str, second: str) -> Judge:
 
     def judge(replies: Replies, asked: CallContext) -> None:
         for label, reply in zip((first, second), replies, strict=True):
-            _sighting(at(reply, "sightings", 0), _rows(asked, SEEN, sees(label))[-1], of_thing=True)
+            row = _rows(asked, SEEN, sees(label))[-1]
+            _sighting(at(reply, "sightings", 0), row, row[-1], of_thing=True)
 
     return judge
 
