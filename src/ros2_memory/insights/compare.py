@@ -150,7 +150,7 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
         "distance_m": known.totals.distance_m,
         "max_speed": known.max_speed,
         "stood_s": None if stood is None else unix_from_ns(stood),
-        "standstills": None if stood is None else float(len(drive.standstills)),
+        "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
 
 

@@ -155,7 +155,7 @@ def recap(
     reported, things, throughout = _topic_events(
         view, window, found, there, min_score=least, most=most_events
     )
-    events = [*_stops(drive, places), *_drops(drive), *reported]
+    events = [*_stops(drive.stops(end - start), places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, _why_nothing(view, begin, until))
         for begin, until in recording_gaps(view, TimeWindow(start, end))
@@ -384,8 +384,8 @@ def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted by retention"
 
 
-def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:
-    for (start, end, box), goes_on in drive.standstills:
+def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None) -> Iterator[Event]:
+    for (start, end, box), goes_on in stops:
         (x, y, _), frame = box.centre, ""
         point: tuple[float, float] | None = (x, y)
         if places is not None and places.frame_id != places.pose_frame:

@@ -246,7 +246,7 @@ class LabelledPlace:
     TIME("first_seen", "first"),
     TIME("last_seen", "last"),
     LOCAL("local", "first", "last"),
-    LASTED("duration_s", "first", "last", "skipped"),
+    LASTED("duration_s", "first", "until", "skipped"),
     AGO("ago_s", "last"),
     PLAIN("count", "messages").if_any,
     an_object(keys(PLAIN("at", "robot_at"), POSE("robot"), NAME("frame_id", "robot.frame_id")))(
@@ -265,6 +265,7 @@ class Sighting:
         topic: of the messages.
         first: log time of the first of them; of the earliest one read where `begun` is False.
         last: of the last.
+        until: of the next one, which says otherwise; as `last` where none does, and of a thing.
         messages: how many there are; 0 for a goal of an action.
         begun: whether the message before the first is known not to belong.
         robot: where the robot was at the first; at the last where that is the sighting of a thing,
@@ -274,13 +275,14 @@ class Sighting:
         value: the requested fields of the last message; None where none were, or it has none. Of a
             goal its id and its status.
         score: of the detection, if the message has that; the best of several.
-        skipped: how much of the time from the first to the last the clock skipped.
+        skipped: how much of the time from the first to `until` the clock skipped.
         robot_at_first: whether `robot` is of the first message.
     """
 
     topic: str
     first: Ns
     last: Ns
+    until: Ns
     messages: int
     begun: bool
     robot: Pose | None

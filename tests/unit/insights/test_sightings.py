@@ -297,6 +297,40 @@ def test_a_silence_ends_a_sighting(tmp_path: Path) -> None:
     assert seconds(memory, "cup", topic) == [(21.5, 21.5), (1, 11)]
 
 
+@each_way
+def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path, recalls: bool) -> None:
+    """Of a topic that states it every 5 s, over two bags, with a silence in the second one."""
+    busy, idle = [10, 15, 25, 30, 55, 65], [0, 5, 20, 60]
+    messages = [
+        text(BEGIN + at * S, "busy" if at in busy else "idle", topic="/mode")
+        for at in sorted(busy + idle)
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages[:4])
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[4:])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = with_store(memory, tmp_path)
+    state = {"topic": "/mode", "condition_type": "equals", "value": "busy"}
+    began = BEGIN / S
+
+    def lasted(**given: object) -> list[tuple[float, float, float]]:
+        reply = asked(memory, tmp_path, "find_matches", **state, **given)
+        return [
+            (each["first_seen"] - began, each["last_seen"] - began, each["duration_s"])
+            for each in reply["sightings"]
+        ]
+
+    # Over the bags' edge; up to a silence; and up to the newest message.
+    assert lasted() == [(65, 65, 0), (55, 55, 5), (25, 30, 5), (10, 15, 10)]
+    # To the end of the window, as far as that is known.
+    assert lasted(start=began + 10, end=began + 18) == [(10, 15, 8)]
+    assert lasted(end=began + 40) == [(25, 30, 5), (10, 15, 10)]
+    assert lasted(**{"while": state}) == [(65, 65, 0), (55, 55, 0), (25, 30, 5), (10, 15, 5)]
+    reply = asked(memory, tmp_path, "find_matches", **state, by="day")
+    seconds = reply["columns"].index("seconds")
+    assert reply["all"][seconds - 1] == 20
+
+
 def test_the_window_and_the_limit_bound_what_is_reported(tmp_path: Path) -> None:
     topic = detections(BEGIN, []).topic
     said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
