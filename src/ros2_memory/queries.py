@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -23,7 +22,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import Pose, Sample, TimeWindow
-from ros2_memory.core.regions import places_at
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -46,7 +45,12 @@ from ros2_memory.history.coverage import (
     recording_gaps,
     unix_text,
 )
-from ros2_memory.history.driven_path import body_by_transforms, driven_path, resolve_path_topic
+from ros2_memory.history.driven_path import (
+    driven_path,
+    newest_of_body,
+    resolve_path_topic,
+    robot_body,
+)
 from ros2_memory.history.no_data import (
     decode,
     describe_lack,
@@ -57,6 +61,9 @@ from ros2_memory.history.no_data import (
     resolve_pose_topic,
     resolve_topic,
     seconds,
+    topics_of_robot,
+    topics_with,
+    transform_topics,
     with_notes,
 )
 from ros2_memory.history.reverse_search import (
@@ -99,6 +106,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.driven_path import Body
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
@@ -175,25 +183,13 @@ def position(
     In the pose's own frame, or in `frame_id`. A topic of a satellite receiver gives degrees.
     """
     view, at, now = open_moment(memory, call, moment)
-    try:
-        name = resolve_pose_topic(view, topic, degrees=True)
-    except NoDataError as error:
-        by_transforms = None
-        if topic is None and error.reason is NoDataReason.TOPIC_NOT_RECORDED:
-            by_transforms = _position_of_body(view, at, now, frame_id)
-        if by_transforms is None:
-            raise
-        return by_transforms
+    name = resolve_path_topic(view, topic, degrees=True)
+    body = robot_body(view) if name in memory.limits.tf_topics else None
+    if body is not None:
+        return _position_of_body(view, body, (at, tolerance_s), now, frame_id)
     _require_kind(view, name, "position", "geodetic")
     found = _found_at(view, name, at, tolerance_s)
-    answer = _position_in(view, found, at, now, frame_id)
-    if topic is None and answer.geodetic is not None:
-        # Visits and paths are by transforms then, so this is, too.
-        with suppress(NoDataError):
-            by_transforms = _position_of_body(view, at, now, frame_id)
-            if by_transforms is not None:
-                return replace(by_transforms, geodetic=answer.geodetic)
-    return answer
+    return _position_in(view, found, at, now, frame_id)
 
 
 def _position_in(
@@ -227,25 +223,44 @@ def _position_in(
 
 
 def _position_of_body(
-    view: View, at: Ns, now: Ns | None, frame_id: str | None
-) -> results.Position | None:
-    """Returns where transforms have the robot's body; None where a topic has poses, or none moves.
+    view: View, body: Body, asked: tuple[Ns, float | None], now: Ns | None, frame_id: str | None
+) -> results.Position:
+    """Returns where transforms have the robot's body, and the latitude and longitude beside it.
 
     Raises:
-        NoDataError: no transform brackets the moment.
+        NoDataError: none places it at the moment that is asked, or within the tolerance before.
     """
-    body = body_by_transforms(view)
-    if body is None:
-        return None
-    parent = frame_id or body.parent
-    found = frame_history.transform_at(view, parent, body.child, at).transform
-    places = places_at(view.memory.limits.places, parent, *found.translation[:2])
-    view.notes.add(f"by transforms, of {body.child} in {parent}: no topic has the robot's poses")
-    note_unread(view, TimeWindow.around(at, TF_CACHE_NS))
-    pose = Pose(found.translation, found.rotation, parent, places)
-    age = None if now is None else now - at
-    topic = next(iter(view.memory.limits.tf_topics))
-    return results.Position(topic, at, pose, age, notes=view.notes.sentences())
+    limits, extractor = view.memory.limits, view.memory.extractor
+    window, tolerance = _within(view, *asked)
+    of_body = newest_of_body(view, body, window, frame_id)
+    if of_body is None:
+        raise _not_placed(view, body, asked[0], tolerance, frame_id)
+    found, pose = of_body
+    note_robots_near(view, found)
+    note_unread(view, TimeWindow(found.time, window.stop))
+    if limits.places:
+        pose = with_place(view, pose, found.time, found.bag.recording)
+    geodetic, fixes = None, topics_of_robot(view, "geodetic")
+    near = TimeWindow.around(found.time, ns_from_unix(limits.time_tolerance_s))
+    fix = view.stream.newest(fixes[0], near) if len(fixes) == 1 else None
+    if fix is not None and (message := view.bags.decode(fix)) is not None:
+        geodetic = extractor.geodetic(message, fix.record.channel.type)
+    topic, notes = found.record.channel.topic, view.notes.sentences()
+    return results.Position(topic, found.time, pose, _age(found, now), geodetic, notes=notes)
+
+
+def _not_placed(
+    view: View, body: Body, at: Ns, tolerance: Ns | None, frame_id: str | None
+) -> NoDataError:
+    """Returns the error for no transform that places the robot's body at a moment."""
+    try:
+        frame_history.transform_at(view, frame_id or body.parent, body.child, at)
+        error = no_data_at(view, tuple(transform_topics(view)), at, tolerance)
+    except NoDataError as none_then:
+        error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), none_then)
+    fixes = topics_with(view, "geodetic")
+    advice = f"; latitude and longitude are on {listed(fixes)}: give topic" if fixes else ""
+    return NoDataError(error.reason, error.detail + advice, error.notes)
 
 
 def velocity(
@@ -610,15 +625,10 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
         NoDataError: there is none within the tolerance.
     """
     limits = view.memory.limits
-    limit = limits.time_tolerance_s if tolerance_s is None else tolerance_s
-    tolerance: Ns | None = ns_argument("tolerance_s", limit)
-    start = at - (tolerance or 0) - START_SLACK_NS
-    if start <= MIN_NS:
-        start, tolerance = MIN_NS, None
-    stop = min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
-    found = view.stream.newest(topic, TimeWindow(start, stop))
+    window, tolerance = _within(view, at, tolerance_s)
+    found = view.stream.newest(topic, window)
     if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
-        found = view.stream.newest(topic, TimeWindow(MIN_NS, stop))
+        found = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
         if found is None:
             tolerance = None
         elif not limits.latching.holds(view.snapshot, found):
@@ -626,8 +636,18 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
     if found is None:
         raise no_data_at(view, (topic,), at, tolerance)
     note_robots_near(view, found)
-    note_unread(view, TimeWindow(found.time, stop))
+    note_unread(view, TimeWindow(found.time, window.stop))
     return found
+
+
+def _within(view: View, at: Ns, tolerance_s: float | None) -> tuple[TimeWindow, Ns | None]:
+    """Returns when a message is near enough before a moment, and the tolerance; None for any."""
+    limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
+    tolerance: Ns | None = ns_argument("tolerance_s", limit)
+    start = at - (tolerance or 0) - START_SLACK_NS
+    if start <= MIN_NS:
+        start, tolerance = MIN_NS, None
+    return TimeWindow(start, min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)), tolerance
 
 
 def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:

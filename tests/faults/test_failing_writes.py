@@ -56,7 +56,7 @@ def test_a_store_that_cannot_be_written_costs_no_answer_and_is_filled_later(
     assert store_of(filler).trouble is None
     assert filler.progress() == Progress(6, 6)
     assert told(memory, count=6) == right
-    assert_sound(store_file(tmp_path))
+    assert_sound(store_file(tmp_path), 6)
 
 
 @pytest.mark.parametrize("function", ["fsync", "open", "replace"])

@@ -58,7 +58,7 @@ def test_two_servers_share_a_directory_and_one_goes_on_without_the_other(tmp_pat
             assert each.events("tool_failed") == []
     path = store_file(bag_dir)
     assert stored(path) == sorted({f"rec/rec_{n}.mcap" for n in range(COUNT + 2)})
-    assert_sound(path)
+    assert_sound(path, COUNT + 2)
     with serving(bag_dir, tmp_path / "third") as third:
         until(partial(is_ready, third, COUNT + 2))
         assert third.ask_all(COUNT + 2) == right

@@ -147,12 +147,12 @@ def only(judge: judges.Judge) -> Judge:
     return lambda replies, asked: judge(replies[-1], asked)
 
 
-def _sighting(found: JsonValue, row: Sequence[Message], *, of_thing: bool) -> None:
+def _sighting(found: JsonValue, row: Sequence[Message], until: Message, *, of_thing: bool) -> None:
     """A row of messages as a sighting; of a thing from where it was seen last."""
     first, last = row[0], row[-1]
     one_of("first seen", number(found, "first_seen"), [first.log_time])
     one_of("last seen", number(found, "last_seen"), [last.log_time])
-    near("how long", number(found, "duration_s"), (last.log_time - first.log_time) / 1e9, SAME_S)
+    near("how long", number(found, "duration_s"), _unix(until) - _unix(first), SAME_S)
     near("how long ago", number(found, "ago_s"), _ago(last.log_time), SAME_S)
     same("count", number(found, "count"), len(row))
     same("robot at", text(found, "robot", "at"), "last_seen" if of_thing else "first_seen")
@@ -174,7 +174,11 @@ def sighting_of(
     def judge(replies: Replies, asked: CallContext) -> None:
         found = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
         same("topic", text(found, "topic"), stream.topic)
-        _sighting(found, _rows(asked, stream, holds)[nth], of_thing=stream is SEEN)
+        row, of_thing = _rows(asked, stream, holds)[nth], stream is SEEN
+        # A state lasts until a message says otherwise.
+        later = [each for each in _messages(asked, stream) if each.log_time > row[-1].log_time]
+        until = later[0] if later and not of_thing else row[-1]
+        _sighting(found, row, until, of_thing=of_thing)
         if place is not None:
             for axis, expected in zip("xyz", THINGS[place], strict=True):
                 near(f"{axis} of the {place}", number(found, "place", axis), expected, PLACE_M)
@@ -363,7 +367,8 @@ def later(first: str, second: str) -> Judge:
 
     def judge(replies: Replies, asked: CallContext) -> None:
         for label, reply in zip((first, second), replies, strict=True):
-            _sighting(at(reply, "sightings", 0), _rows(asked, SEEN, sees(label))[-1], of_thing=True)
+            row = _rows(asked, SEEN, sees(label))[-1]
+            _sighting(at(reply, "sightings", 0), row, row[-1], of_thing=True)
 
     return judge
 

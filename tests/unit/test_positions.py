@@ -339,6 +339,116 @@ def test_where_a_satellite_receiver_has_degrees_alone_the_place_is_by_transforms
     assert of_topic["x"] is None
 
 
+def moved(tenths: range) -> list[Msg]:
+    """The body driving at 1 m/s in the map, ten transforms a second, from 1 m on."""
+    return [
+        tf(
+            T0 + n * S // 10,
+            transform(T0 + n * S // 10, "map", "odom", (1.0, 0.0, 0.0)),
+            transform(T0 + n * S // 10, "odom", "base_link", (n / 10, 0.0, 0.0)),
+        )
+        for n in tenths
+    ]
+
+
+FIXES = [fix(T0 + n * S, n * 1e-5, 0.0) for n in range(60)]
+BODY_NOTE = "by transforms, of base_link in map: no topic has the robot's poses"
+
+
+@each_way
+@pytest.mark.parametrize("others", [[], FIXES, [*FIXES, *(replace(f, topic="/b") for f in FIXES)]])
+def test_a_position_by_transforms_is_that_of_the_newest_one(
+    tmp_path: Path, recalls: bool, others: list[Msg]
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(600)), *others])
+    for asked_s, known_s in ((20.04, 20.0), (20.54, 20.5), (59.96, 59.9)):
+        reply = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + asked_s)
+        assert (reply["timestamp"], reply["x"]) == pytest.approx((T0_S + known_s, 1 + known_s))
+        assert (reply["topic"], reply["frame_id"], reply["notes"]) == ("/tf", "map", [BODY_NOTE])
+        assert ("latitude" in reply) == (others == FIXES and known_s == 20.0)
+    given = {"timestamp": T0_S + 20.04, "frame_id": "odom"}
+    assert ask(tmp_path, recalls, "get_position_at", **given)["x"] == 20.0
+    before = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 60.5)
+    assert (before["reason"], "x" in before) == ("outside_range", False)
+    near = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 60.5, tolerance_s=1)
+    assert near["timestamp"] == pytest.approx(T0_S + 59.9)
+    limits = {"now": "latest"}
+    ago = ask(tmp_path, recalls, "get_position_seconds_ago", seconds_ago=9.96, limits=limits)
+    assert (ago["x"], ago["age_s"]) == pytest.approx((50.9, 10.0))
+
+
+@each_way
+def test_in_a_gap_of_transforms_no_position_is_known(tmp_path: Path, recalls: bool) -> None:
+    messages = [*moved(range(100)), *moved(range(400, 600)), *FIXES]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    for given in ({}, {"frame_id": "odom"}, {"topic": "/tf"}):
+        reply = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 25, **given)
+        assert (reply["error"], reply["reason"]) == ("no_data", "gap")
+        assert "no message of /tf within 10 s" in reply["detail"]
+        assert "latitude and longitude are on /fix" in reply["detail"]
+    reply = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 25, topic="/fix")
+    assert (reply["x"], reply["latitude"]) == (None, 48.1237067)
+
+
+def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", moved(range(0, 600, 10)))
+    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 20.5)
+    assert reply["reason"] == "between_messages"
+    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 20.5, tolerance_s=1)
+    assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
+
+
+@each_way
+def test_transforms_that_are_asked_for_answer_beside_poses(tmp_path: Path, recalls: bool) -> None:
+    poses = [odom(T0 + n * S // 10, -9.0, 0.0) for n in range(600)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(600)), *poses])
+    span = {"start": T0_S, "end": T0_S + 30}
+    given = {"timestamp": T0_S + 20}
+    assert ask(tmp_path, recalls, "get_position_at", **given)["x"] == -9.0
+    assert ask(tmp_path, recalls, "trajectory_summary", **span)["distance_m"] == 0.0
+    at = ask(tmp_path, recalls, "get_position_at", topic="/tf", **given)
+    way = ask(tmp_path, recalls, "trajectory_summary", topic="/tf", **span)
+    assert (at["x"], way["distance_m"]) == (21.0, 30.0)
+    assert at["notes"] == ["by transforms, of base_link in map"]
+
+
+@each_way
+@pytest.mark.parametrize("others", [[], FIXES, [pose_stamped(T0, 9.0, 9.0, "/goal_pose")]])
+def test_every_tool_that_places_the_robot_takes_its_transforms(
+    tmp_path: Path, recalls: bool, others: list[Msg]
+) -> None:
+    bumped = [boolean(T0 + n * S, n > 5) for n in range(60)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*moved(range(600)), *others, *bumped])
+    near = {"x": 11.0, "y": 0.0, "radius_m": 1.0}
+    span = {"start": T0_S, "end": T0_S + 59}
+    other = {"with_start": T0_S + 30, "with_end": T0_S + 59}
+    asked_for: list[tuple[str, dict[str, Any]]] = [
+        ("get_position_at", {"timestamp": T0_S + 20}),
+        ("visits", near),
+        ("visits", {**near, "by": "hour", **span}),
+        ("recap", span),
+        ("recap", {**span, "where": near}),
+        ("recap", {"around": T0_S + 6, "seconds_before": 3}),
+        ("trajectory_summary", span),
+        ("trajectory_summary", {**span, "by": "hour"}),
+        ("trajectory_summary", {**span, "by": "place"}),
+        ("trajectory_summary", {**span, "where": near}),
+        ("compare", {"start": T0_S, "end": T0_S + 29, **other}),
+        ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True, **span}),
+    ]
+    limits = {"places": (Place("door", "map", Circle(11.0, 0.0, 1.0)),)}
+    found = [ask(tmp_path, recalls, tool, **given, limits=limits) for tool, given in asked_for]
+    for reply, (tool, given) in zip(found, asked_for, strict=True):
+        assert BODY_NOTE in reply["notes"], (tool, given, reply)
+    position, visits, by_hour, _, there, before, way, metres, of_place, inside, apart, match = found
+    assert (position["x"], visits["total"], by_hour["all"][2]) == (21.0, 1, 1)
+    assert (there["distance_m"], inside["distance_m"]) == pytest.approx((2.0, 2.0), abs=0.1)
+    assert (before["robot"]["x"], match["sightings"][0]["robot"]["x"]) == (7.0, 7.0)
+    assert (way["distance_m"], metres["all"][1]) == pytest.approx((59.0, 59.0), abs=0.1)
+    assert of_place["rows"][0] == ["door", 2.0, 2.0]
+    assert (apart["frame_id"], apart["farthest_apart"]["this"]["away_m"]) == ("map", 30.0)
+
+
 @each_way
 def test_the_path_by_transforms_is_that_by_poses(tmp_path: Path, recalls: bool) -> None:
     """In the map, which drifts: a drive and a standstill at 10 Hz."""

@@ -68,6 +68,10 @@ class Elapsed:
         """Returns how much time passed from one moment to another."""
         return stop - start - self.skipped_between(start, stop)
 
+    def among(self, spans: Iterable[tuple[Ns, Ns]]) -> Ns:
+        """Returns how much time passed in spans, all together."""
+        return sum(self.between(start, stop) for start, stop in spans)
+
     def skipped_between(self, start: Ns, stop: Ns) -> Ns:
         """Returns how much of the time from one moment to another the clock skipped."""
         return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)

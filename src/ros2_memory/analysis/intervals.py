@@ -52,6 +52,19 @@ _FROM_START: Final = 1
 _TO_END: Final = 2
 
 
+def pieces_of(
+    starts: NDArray[np.int64], stops: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Returns when the pieces of spans, in order of their starts, begin and end.
+
+    A silence parts them.
+    """
+    reached = np.maximum.accumulate(stops)
+    new = starts[1:] - reached[:-1] > SILENCE_NS
+    begins, ends = np.append([True], new), np.append(new, [True])
+    return starts[begins[: len(starts)]], reached[ends[: len(starts)]]
+
+
 class VisibleInterval(NamedTuple):
     """An object in view: log times of the first and last message that contain it (inclusive).
 

@@ -102,6 +102,7 @@ class Filling:
         self._clock = clock
         self._limits = limits
         self._refused: dict[BagKey, Ns] = {}
+        self._trimmed: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
         self._merged: list[tuple[Ns, Ns]] = []
         self._whole_parts: list[tuple[list[int], list[BagFile]]] = []
@@ -222,8 +223,7 @@ class Filling:
             keys = self.store.beginning_before(before)
             if not self.store.delete([key.path for key in keys]):
                 break
-            now = self._clock.now()
-            self._refused |= dict.fromkeys(keys, now)
+            self._trimmed = {**self._trimmed, **dict.fromkeys(keys, self._clock.now())}
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.give_back()
 
@@ -319,7 +319,7 @@ class Filling:
         self._refused[self._key(bag)] = self._clock.now()
 
     def _is_refused(self, key: BagKey) -> bool:
-        since = self._refused.get(key)
+        since = self._refused.get(key, self._trimmed.get(key))
         return since is not None and abs(self._clock.now() - since) < RETRY_NS
 
     def _key(self, bag: BagFile) -> BagKey:

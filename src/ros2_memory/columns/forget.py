@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from contextlib import closing, suppress
+from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.blob import topics_in
@@ -75,22 +75,24 @@ def delete_catalogue(file: Path) -> None:
             for one in files_of(file):
                 one.unlink(missing_ok=True)
         for leftover in leftovers(file):
-            # One that is too damaged to be looked at was set aside for that.
-            with suppress(sqlite3.Error):
-                if not _is_catalogue(leftover):
-                    continue
-            leftover.unlink(missing_ok=True)
-    except (OSError, sqlite3.Error) as error:
+            if _is_catalogue(leftover):
+                leftover.unlink(missing_ok=True)
+    except (OSError, sqlite3.OperationalError) as error:
         reason = f"it may still contain deleted data ({error}); delete the file"
         raise BagError(str(file), f"{file.name} of an earlier version: {reason}") from error
 
 
 def _is_catalogue(file: Path) -> bool:
-    """Returns whether a database has the tables of a catalogue of digests."""
+    """Returns whether a database has the tables of a catalogue of digests, or is none any more."""
     address = f"{file.absolute().as_uri()}?mode=rw"
-    with closing(sqlite3.connect(address, uri=True, timeout=PATIENCE_S)) as base:
-        names = base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-        return _CATALOGUE_TABLES.issubset(name for (name,) in names)
+    try:
+        with closing(sqlite3.connect(address, uri=True, timeout=PATIENCE_S)) as base:
+            names = base.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
+            return _CATALOGUE_TABLES.issubset(name for (name,) in names)
+    except sqlite3.OperationalError:
+        raise
+    except sqlite3.DatabaseError:  # only catalogues had these names in these folders
+        return True
 
 
 def leftovers(file: Path) -> list[Path]:

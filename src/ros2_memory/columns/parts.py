@@ -60,7 +60,8 @@ class PackedPart:
     @cached_property
     def first_of(self) -> dict[bytes, str]:
         """By data, the path of the first column that has it: it is stored once."""
-        return {packed.data: path for path, packed in reversed([*self.columns.items()])}
+        paths = reversed([*self.columns.items()])
+        return {packed.data: path for path, packed in paths if packed.data}
 
     @property
     def size(self) -> int:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.columns.parts import BAG, LOG_TIME, PAYLOAD_HASH, PUBLISH_TIME
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.errors import BusyError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 
-class GoneError(QueryTimeoutError):
+class GoneError(BusyError):
     """Rows were deleted from the store while they were read."""
 
     def __init__(self) -> None:

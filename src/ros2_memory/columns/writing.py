@@ -203,7 +203,7 @@ def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -
             for path, packed in part.columns.items()
             # Numbers that are rounded to one take no bytes, but are no constant.
             if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
-            for same in [part.first_of[packed.data]]
+            for same in [part.first_of.get(packed.data, path)]
         ],
     )
     connection.executemany(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_right
+from itertools import islice
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -32,9 +34,10 @@ def without(spans: Iterable[tuple[Ns, Ns]], others: Sequence[tuple[Ns, Ns]]) -> 
     left: Spans = []
     for start, stop in spans:
         at = start
-        for begin, until in others:
-            if until <= at or begin >= stop:
-                continue
+        nth = bisect_right(others, start, key=itemgetter(1))
+        for begin, until in islice(others, nth, None):
+            if begin >= stop:
+                break
             if begin > at:
                 left.append((at, begin))
             at = until

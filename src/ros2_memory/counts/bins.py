@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import numpy as np
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.time_bins import TimeBins, TrueIntervals
     from ros2_memory.history.view import View
@@ -108,7 +110,12 @@ class BinnedWindow:
                 heard[-1] = (heard[-1][0], max(heard[-1][1], last))
             else:
                 heard.append((first, last))
-        self.add_lengths(column, "duration", heard)
+        self.add_lengths(column, "duration", without(heard, self.gaps))
+
+    def add_unknown(self, spans: Spans) -> None:
+        """Adds for how long the answer is not known, if there are such times."""
+        if spans:
+            self.add_lengths("unknown_s", "duration", spans)
 
     def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
         """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""

@@ -16,7 +16,6 @@ import numpy as np
 
 from ros2_memory.columns.numbers import extent, numbers
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.columns.units import GoneError, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.numbers import FieldNumbers
+    from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
@@ -147,8 +147,6 @@ class PieceNumbers:
                 self._view, self._topic, window, newest_first=True, reached=self._reached
             ):
                 self._waiting.append(rows)
-        except GoneError:
-            raise
         except QueryTimeoutError:
             if not self._parts:
                 raise
@@ -280,8 +278,6 @@ class PieceNumbers:
         if key not in self._settled:
             try:
                 found = self._read_extreme(field, sign, extreme)
-            except GoneError:
-                raise
             except QueryTimeoutError:
                 found = None
                 self._view.notes.add(

@@ -20,7 +20,6 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events
 from ros2_memory.columns.truth import ColumnCondition
-from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.counts.bins import BinnedWindow
 from ros2_memory.counts.time_bins import TrueIntervals
@@ -83,7 +82,7 @@ def count_matches(
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)
     note_robots_on(view, topics, binned.counted)
-    held, since = None, None
+    held, since, unknown = None, None, []
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
     alone = where is None and during is None and len(topics) == 1
@@ -93,8 +92,10 @@ def count_matches(
         scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
         held = TrueIntervals.of([(first, last, True) for first, last in spans])
+        unknown = scope.unknown
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
+    binned.add_unknown(unknown)
     binned.add_held(held)
     return binned.answer()
 
@@ -141,8 +142,6 @@ def _events(
 
     try:
         parts.extend(events_back(view, topic, window, may_match=may_match, reached=reached))
-    except GoneError:
-        raise
     except QueryTimeoutError:
         if not parts:
             raise

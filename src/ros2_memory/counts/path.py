@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.counts.bins import BinnedWindow
-from ros2_memory.history.driven_path import way_in
-from ros2_memory.history.no_data import no_data_between, resolve_pose_topic
+from ros2_memory.history.driven_path import resolve_path_topic, way_in
+from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 
@@ -35,7 +35,7 @@ def count_path(
         QueryTimeoutError: the call's time runs out before any result.
     """
     view, asked = open_span(memory, call, span)
-    name = resolve_pose_topic(view, topic)
+    name = resolve_path_topic(view, topic)
     binned = BinnedWindow(view, asked, by, (name,))
     way, since = way_in(view, name, binned.counted)
     if way is None:

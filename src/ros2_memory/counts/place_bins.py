@@ -12,10 +12,9 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.time_bins import TimeBins
-from ros2_memory.history.driven_path import pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import places_in, track_in
+from ros2_memory.places.region_visits import placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.where import places_setting
 
@@ -40,7 +39,7 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
         NoDataError: there are no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    topic = resolve_pose_topic(view)
+    topic = resolve_path_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, None)
     places = places_in(view, view.memory.limits.places, placement, window)
     if not places:
@@ -54,9 +53,7 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
         [(each.start, each.stop + 1) for each in robot_inside(own, place.region, window)]
         for place, own in places
     ]
-    begins = np.flatnonzero(track.begins)
-    ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
-    known = list(zip(track.times[begins].tolist(), (track.times[ends] + 1).tolist(), strict=True))
+    known = placed_times(track, [])
     cuts = {at for spans in (*inside, known) for span in spans for at in span}
     within = sorted(at for at in cuts if window.start < at < window.stop)
     edges = np.array([window.start, *within, window.stop], np.int64)

@@ -8,12 +8,12 @@ import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
-from ros2_memory.history.driven_path import pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.coverage import unknown_times
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import places_in, track_in
+from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
@@ -43,7 +43,7 @@ def count_visits(
 ) -> Bins:
     """Returns entries, exits and minutes in a place for each bin; of no place, of all named ones.
 
-    `placed_s` is for how long it was known where the robot was.
+    `placed_s` is for how long it was known where the robot was, `unknown_s` for how long not.
 
     Raises:
         InvalidArgumentsError: the place is invalid, the frame is another one, there are too many
@@ -58,17 +58,16 @@ def count_visits(
     window = search_window(TimeRange(start_s, end_s), wall)
     view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
-    topic = resolve_pose_topic(view)
-    note_robots(view, topic, asked)
+    topic = resolve_path_topic(view)
+    mixed = note_robots(view, topic, asked)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame
     placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,))
     track = track_in(view, placement.frame_id, binned.window)
-    begins = np.flatnonzero(track.begins)
-    ends = np.append(begins[1:], len(track.times))[: len(begins)] - 1
-    known = list(zip(track.times[begins].tolist(), track.times[ends].tolist(), strict=True))
+    known = placed_times(track, mixed)
     binned.add_lengths("placed_s", "duration", known)
+    binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
     if place is not None:
         stayed = robot_inside(track, place.region, binned.window)
         if not stayed and asked_frame is None:

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
 from ros2_memory.bag_dir.state_files import (
@@ -499,3 +500,20 @@ def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tup
     for start, end in view.snapshot.gaps:
         if start < last and first < end:
             yield max(start, asked.start), min(end, asked.stop)
+
+
+def unknown_times(view: View, window: TimeWindow, known: Spans, what: str) -> Spans:
+    """Returns the recorded times of a window in which something is not known, in order.
+
+    `known` are the times in which it is: between these, and at the ends of recordings, up to
+    `SILENCE_NS` may pass. A note says if `what` is not known at any time.
+    """
+    start, end = window.asked()
+    first, last = recorded_reach(view.snapshot, window) or (0, 0)
+    around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
+    left = without([around], united([*known, *recording_gaps(view)]))
+    cut = [(max(begin, start), min(stop, end)) for begin, stop in left if stop - begin > SILENCE_NS]
+    found = [(begin, stop) for begin, stop in cut if begin < stop]
+    if found and not any(begin <= end and start <= stop for begin, stop in known):
+        view.notes.add(f"{what} is not known at any time of the window")
+    return found

@@ -17,7 +17,6 @@ from ros2_memory.analysis.motion.trajectory import (
 )
 from ros2_memory.analysis.poses import NO_POSES
 from ros2_memory.columns.motion import PATHS
-from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -32,33 +31,36 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
     resolve_pose_topic,
-    topics_that_show_poses,
-    topics_with,
+    transform_topics,
     undecodable,
     with_notes,
 )
 from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, poses_of_bag, slices_back
 from ros2_memory.history.robots import beside_path
 from ros2_memory.history.transforms import (
+    clock_of,
+    decoded_transforms,
     edges,
     graph_of,
     moving_in,
     sessions_of,
     static_transforms,
+    transform_at,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
+    from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.analysis.transform_tree import FrameGraph
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
 _BODIES: Final = ("base_footprint", "base_link")
-_NO_POSES: Final = "no topic has the robot's poses"
 _MOST_BAGS_OF_BODY: Final = 128
 """Bags of which transforms are read for a path."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
@@ -152,8 +154,6 @@ def _slices_in(
             since = start
             if made.poses or made.invalid:
                 found.append(made)
-    except GoneError:
-        raise
     except QueryTimeoutError:
         if not found:
             raise
@@ -270,7 +270,7 @@ def pose_frame(view: View, topic: str) -> str:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
-    body = body_by_transforms(view) if topic in view.memory.limits.tf_topics else None
+    body = robot_body(view) if topic in view.memory.limits.tf_topics else None
     if body is not None:
         return body.parent
     failure: UndecodableError | None = None
@@ -303,9 +303,11 @@ class Body(NamedTuple):
 def robot_body(view: View) -> Body | None:
     """Returns the robot's body by its transforms; None where none of them moves.
 
-    By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
-    in the root of its frames.
+    None for a lake, too, which has no transforms of any moment. By its name (`base_footprint`,
+    `base_link`), else what moves in the root itself; in the map, or in the root of its frames.
     """
+    if view.memory.stated is not None:
+        return None
     known = edges(view)
     parents = {each.child: each.parent for each in known}
     moving = [each.child for each in known if not each.static]
@@ -333,29 +335,56 @@ def _rank(frame: str) -> int:
 
 
 def body_by_transforms(view: View) -> Body | None:
-    """Returns the robot's body where transforms alone show it; None where a topic has its poses.
-
-    None for a lake, too, which has no transforms of any moment.
-    """
-    if view.memory.stated is not None:
-        return None
-    if topics_with(view, "position") or topics_that_show_poses(view):
-        return None
-    return robot_body(view)
+    """Returns the robot's body where transforms alone show it; None where a topic has its poses."""
+    return None if view.memory.stated is not None or view.has_poses else robot_body(view)
 
 
-def resolve_path_topic(view: View, name: str | None = None) -> str:
-    """Returns the topic of the robot's path: that of its poses, else with a note of transforms.
+def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = False) -> str:
+    """Returns the topic of the robot's places: that of its poses, else with a note of transforms.
+
+    With `degrees` that of a satellite receiver, where there is nothing else.
 
     Raises:
         NoDataError: as for `resolve_pose_topic`.
     """
-    topics = view.memory.limits.tf_topics
-    body = body_by_transforms(view) if name is None or name in topics else None
+    topics = transform_topics(view)
+    body, why = None, ""
+    if name is None:
+        body, why = body_by_transforms(view), ": no topic has the robot's poses"
+    elif name in topics:
+        body = robot_body(view)
     if body is None:
-        return resolve_pose_topic(view, name)
-    view.notes.add(f"by transforms, of {body.child} in {body.parent}: {_NO_POSES}")
-    return next(each for each in topics if each in view.snapshot.timeline.topics())
+        return resolve_pose_topic(view, name, degrees=degrees)
+    view.notes.add(f"by transforms, of {body.child} in {body.parent}{why}")
+    return name or topics[0]
+
+
+def newest_of_body(
+    view: View,
+    body: Body,
+    window: TimeWindow,
+    frame_id: str | None = None,
+    recording: Path | None = None,
+) -> tuple[StoredMessage, Pose] | None:
+    """Returns the newest transform in a window that places the robot's body, with its pose.
+
+    In the map or the root of its frames, or in `frame_id`. Where the session of a `recording` has
+    transforms, it is one of these.
+    """
+    parent, topics, sessions = frame_id or body.parent, transform_topics(view), sessions_of(view)
+    own = None if recording is None else sessions.of(recording)
+    if own and not sessions.recordings_of(own, tuple(topics)):
+        own = None
+    for found in view.stream.messages(topics, window, newest_first=True):
+        for each in decoded_transforms(view, found):
+            if each.child.lstrip("/") != body.child or (own and not sessions.has(own, found)):
+                continue
+            moment = each.stamp if clock_of(view, [each]) == "stamp" else each.log_time
+            by = found.bag.recording
+            with suppress(NoDataError):  # as in `poses_of_body`
+                there = transform_at(view, parent, body.child, moment, by, explains=False).transform
+                return found, Pose(there.translation, there.rotation, parent)
+    return None
 
 
 def poses_of_body(
@@ -370,16 +399,14 @@ def poses_of_body(
         InvalidArgumentsError: there are too many bags for that.
         QueryTimeoutError: the call's time runs out.
     """
-    body = body_by_transforms(view)
+    body = robot_body(view)
     if body is None:
         return []
-    recorded = view.snapshot.timeline.topics()
-    topics = [each for each in view.memory.limits.tf_topics if each in recorded]
-    bags = view.stream.overlapping_bags(topics, window)
+    bags = view.stream.overlapping_bags(transform_topics(view), window)
     if len(bags) > _MOST_BAGS_OF_BODY:
         raise InvalidArgumentsError(
-            f"{_NO_POSES}, and by transforms a path is read from {_MOST_BAGS_OF_BODY} bags at "
-            f"most: these are {len(bags)}; ask about a shorter window"
+            f"by transforms, a path is read from {_MOST_BAGS_OF_BODY} bags at most: these are "
+            f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
     sessions = sessions_of(view)

@@ -11,7 +11,7 @@ import numpy as np
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
@@ -177,6 +177,7 @@ class Runs(NamedTuple):
         firsts: log time of the first match of each.
         lasts: of the last.
         counts: how many matches.
+        ends: of the next message of the block that is none; `MAX_NS` without one.
         goes_back: whether an earlier match may belong to the first run.
         goes_on: whether a later match may belong to the last run.
         is_blank: whether it has neither a match nor a message that surely is none.
@@ -185,6 +186,7 @@ class Runs(NamedTuple):
     firsts: IntArray
     lasts: IntArray
     counts: IntArray
+    ends: IntArray
     goes_back: bool
     goes_on: bool
     is_blank: bool
@@ -205,14 +207,17 @@ def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
     blank = not rows.size and int(ends[-1]) == 0
     if not rows.size:
         none = np.empty(0, np.int64)
-        return Runs(none, none, none, goes_back=False, goes_on=False, is_blank=blank)
+        return Runs(none, none, none, none, goes_back=False, goes_on=False, is_blank=blank)
     new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
     starts = np.flatnonzero(new)
     stops = np.r_[starts[1:], rows.size]
+    others = np.flatnonzero(met == NOT_MET)
+    after = np.searchsorted(others, rows[stops - 1])
     return Runs(
         times[rows[starts]],
         times[rows[stops - 1]],
         stops - starts,
+        np.append(times[others], MAX_NS)[after],
         goes_back=not apart and int(ends[rows[0]]) == 0,
         goes_on=not apart and ends[rows[-1]] == ends[-1],
         is_blank=False,

@@ -6,6 +6,7 @@ import math
 import re
 from contextlib import suppress
 from difflib import get_close_matches
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
@@ -83,15 +84,26 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     is_recorded = configured in view.snapshot.timeline.topics()
     if configured != _DEFAULT_POSES or is_recorded or view.memory.stated is not None:
         return None
-    found = _topics_of_robot(view, what)
+    found = topics_of_robot(view, what)
     if not found and degrees:
-        found = _topics_of_robot(view, "geodetic")
+        found = topics_of_robot(view, "geodetic")
     return found[0] if len(found) == 1 else None
 
 
-def _topics_of_robot(view: View, what: str) -> list[str]:
+def topics_of_robot(view: View, what: str) -> list[str]:
+    """Returns the names of `topics_with`, without goals and points that somebody clicked."""
     names = dict.fromkeys(each.partition(" ")[0] for each in topics_with(view, what))
     return [each for each in names if not _OF_OTHERS.search(each)]
+
+
+def has_poses(view: View) -> bool:
+    """Whether a topic has the robot's poses; `View.has_poses` remembers it."""
+    extractor = view.memory.extractor
+    # Asked first, and cheap: of other topics it takes longer to know.
+    for type_name in view.snapshot.timeline.types_of(view.memory.limits.pose_topic):
+        if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
+            return True
+    return bool(topics_of_robot(view, "position") or topics_that_show_poses(view))
 
 
 def resolve_pose_topic(
@@ -162,7 +174,7 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
             f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
             "returns speeds from them, by topic"
         )
-    if moving := _transform_topics(view):
+    if moving := transform_topics(view):
         return (
             f", nor another with {those}; transforms are on {listed(moving)}: get_position_at "
             "and trajectory_summary answer by them, get_transform_at returns the pose of one frame "
@@ -197,7 +209,7 @@ def topics_that_show_poses(view: View) -> list[str]:
     return shown
 
 
-def _transform_topics(view: View) -> list[str]:
+def transform_topics(view: View) -> list[str]:
     """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
     recorded = view.snapshot.timeline.topics()
     return [topic for topic in view.memory.limits.tf_topics if topic in recorded]
@@ -208,12 +220,13 @@ def topics_with(view: View, what: str) -> list[str]:
 
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
-    kinds_of = view.memory.extractor.kinds_of
+    kinds_of, types = view.memory.extractor.kinds_of, view.snapshot.timeline.types
+    carriers = {each for each in set(chain(*types.values())) if what in kinds_of(each)}
     return [
         f"{topic} ({type_name})"
-        for topic in view.snapshot.timeline.topics()
-        for type_name in sorted(view.snapshot.timeline.types_of(topic))
-        if what in kinds_of(type_name)
+        for topic, names in types.items()
+        for type_name in names
+        if type_name in carriers
     ]
 
 

@@ -8,7 +8,7 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import combinations, islice
+from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS
+from ros2_memory.core.spans import COPY_HORIZON_NS, united
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.index.timeline import Timeline
@@ -313,14 +314,19 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
         )
 
 
-def note_robots(view: View, topic: str, window: TimeWindow) -> None:
-    """Notes the recordings that hold messages of their own on a topic at the same time."""
-    names = _names(recordings_beside(view, topic, window))
+def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
+    """Notes the recordings that hold messages of their own on a topic at the same time.
+
+    Returns these times, without those that a clock made which was set back.
+    """
+    found = recordings_beside(view, topic, window)
+    names = _names(found)
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
             f"from several robots, and the answer does not separate them: {listed(names)}"
         )
+    return united((each.span.start, each.span.stop) for each in found if not each.by_clock)
 
 
 def _names(found: Sequence[Beside]) -> list[str]:
@@ -359,10 +365,10 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     return found
 
 
-def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> None:
+def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
     """Does as `note_robots` for the first few of some topics."""
-    for topic in topics[:_MAX_TOPICS]:
-        note_robots(view, topic, window)
+    every = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
+    return united(chain.from_iterable(every))
 
 
 def note_robots_near(view: View, found: StoredMessage) -> None:

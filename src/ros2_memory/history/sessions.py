@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.transform_tree import FrameEdge
     from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -54,6 +55,7 @@ class Sessions:
         chosen: for a session with one that may lend to it and two frames, whose transforms hold.
         statics: the static transforms of sessions, as far as they are known.
         linked: frames that are known to be connected in a session, or in some.
+        edges: every parent and child pair of all, once that is asked.
     """
 
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
@@ -73,6 +75,7 @@ class Sessions:
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
         self.linked: set[tuple[tuple[str, str], Session | None]] = set()
+        self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
         self._recordings: dict[tuple[Session, tuple[str, ...]], dict[Path, tuple[Ns, Ns]]] = {}

@@ -179,7 +179,7 @@ def _transform_in(
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
         graph = graph_of(view, static, moving)
-        return FoundTransform(graph.lookup(*frames, at), _clock(view, moving))
+        return FoundTransform(graph.lookup(*frames, at), clock_of(view, moving))
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
@@ -209,10 +209,11 @@ def graph_of(
     view: View, static: Sequence[StampedTransform], moving: Sequence[StampedTransform]
 ) -> FrameGraph:
     """Returns the transforms as a graph, in the clock of `data.tf_clock`."""
-    return FrameGraph([*static, *moving], _clock(view, moving))
+    return FrameGraph([*static, *moving], clock_of(view, moving))
 
 
-def _clock(view: View, moving: Sequence[StampedTransform]) -> TfClock:
+def clock_of(view: View, moving: Sequence[StampedTransform]) -> TfClock:
+    """Returns the clock of `data.tf_clock`, or the one that moving transforms agree with."""
     configured = view.memory.limits.tf_clock
     return agreeing_clock(moving) if configured == "auto" else configured
 
@@ -337,13 +338,16 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     A pair that was published in both directions appears once, as moving. A pair with an unnamed
     frame is invalid in tf2, and is left out with a note.
     """
-    limits = view.memory.limits
+    limits, sessions = view.memory.limits, sessions_of(view)
+    if sessions.edges is not None:
+        return sessions.edges
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
     pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
     named = [each for each in sorted(pairs.items()) if _is_edge(each[0])]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
-    return tuple(FrameEdge(parent, child, is_static) for (parent, child), is_static in named)
+    sessions.edges = tuple(FrameEdge(*pair, is_static) for pair, is_static in named)
+    return sessions.edges
 
 
 def _pairs(view: View, topics: Iterable[str], among: Session | None = None) -> set[Pair]:

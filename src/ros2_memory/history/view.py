@@ -31,7 +31,7 @@ from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
-from ros2_memory.history.no_data import only_pose_topic, require_bags
+from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
 from ros2_memory.history.scan import copies, scan
 from ros2_memory.messages.to_json import evenly
 
@@ -86,6 +86,11 @@ class View:
         See `only_pose_topic`; it need not be recorded.
         """
         return only_pose_topic(self) or self.memory.limits.pose_topic
+
+    @cached_property
+    def has_poses(self) -> bool:
+        """Whether a topic has the robot's poses; else transforms may place it."""
+        return has_poses(self)
 
     def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
         """Returns how many messages the window holds, and `at_most` of them, evenly spaced.

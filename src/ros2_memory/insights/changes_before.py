@@ -31,11 +31,11 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotShipp
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.view import ns_argument, open_view
 from ros2_memory.insights.goals import GOAL_WORDS, action_of
 from ros2_memory.insights.topic_events import events_in, events_of_messages, toggled
-from ros2_memory.places.pose_frames import placed, with_place
+from ros2_memory.places.pose_frames import newest_pose, placed, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
@@ -385,15 +385,12 @@ def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float
     """
     window = TimeWindow(max(at - _POSE_NS, MIN_NS), at + 1)
     try:
-        found = view.stream.newest(resolve_pose_topic(view), window)
+        found, pose = newest_pose(view, resolve_path_topic(view), window) or (None, None)
     except (InvalidArgumentsError, NoDataError):
         return None, None
-    message = None if found is None else view.bags.decode(found)
-    if found is None or message is None:
+    if found is None:
         return None, None
-    type_name = found.record.channel.type
-    pose = view.memory.extractor.pose(message, type_name)
-    twist = view.memory.extractor.twist(message, type_name)
+    twist = view.memory.extractor.twist(view.bags.decode(found), found.record.channel.type)
     speed_mps = None if twist is None else math.hypot(*twist.linear)
     if pose is None:
         return None, speed_mps

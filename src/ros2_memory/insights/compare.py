@@ -14,15 +14,14 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
-from ros2_memory.history.driven_path import length_notes, pose_frame
-from ros2_memory.history.no_data import resolve_pose_topic
+from ros2_memory.history.driven_path import length_notes, pose_frame, resolve_path_topic
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, track_in
+from ros2_memory.places.region_visits import place_visits, places_in, track_in
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import parse_where, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
@@ -151,13 +150,13 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
         "distance_m": known.totals.distance_m,
         "max_speed": known.max_speed,
         "stood_s": None if stood is None else unix_from_ns(stood),
-        "standstills": None if stood is None else float(len(drive.standstills)),
+        "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
 
 
 def _placement(view: View) -> MapPlacement | None:
     try:
-        topic = resolve_pose_topic(view)
+        topic = resolve_path_topic(view)
         return map_placement(view, pose_frame(view, topic), topic)
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None
@@ -222,7 +221,7 @@ def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther |
 
 def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
     """Whether all poses of two windows are of one session, whose odometry goes on."""
-    topic, sessions = resolve_pose_topic(view), sessions_of(view)
+    topic, sessions = resolve_path_topic(view), sessions_of(view)
     found = {
         sessions.of(recording)
         for recording, span in view.snapshot.timeline.recordings(topic).items()
@@ -245,7 +244,8 @@ def _places(
     found: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            visited = place_visits(view, places, placement, window)
+            placed = places_in(view, places, placement, window)
+            visited = place_visits(view, placed, window, passed)
             durations = {each.place: each.duration for each in visited}
         else:
             inside = times_inside(view, where, placement.frame_id, window)

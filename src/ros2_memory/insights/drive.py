@@ -79,6 +79,15 @@ class Drive:
         known = None if self.path is None else self.path.trajectory
         return known if known is not None and known.is_known else None
 
+    def stops(self, length: Ns) -> tuple[tuple[Standstill, bool], ...]:
+        """Returns the standstills that a window of a length lists.
+
+        Those that fill it, or last half of the shortest one in it: so of windows that follow each
+        other one at least lists it, and none lists the last moment of one before it.
+        """
+        least = min(SHORTEST_NS // 2, length)
+        return tuple(each for each in self.standstills if each[0].end - each[0].start >= least)
+
     def stood(self, length: Ns) -> Ns | None:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
 

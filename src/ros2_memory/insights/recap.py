@@ -26,8 +26,8 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
 )
-from ros2_memory.history.driven_path import length_notes, way_in
-from ros2_memory.history.no_data import resolve_pose_topic, seconds
+from ros2_memory.history.driven_path import length_notes, resolve_path_topic, way_in
+from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
@@ -155,7 +155,7 @@ def recap(
     reported, things, throughout = _topic_events(
         view, window, found, there, min_score=least, most=most_events
     )
-    events = [*_stops(drive, places), *_drops(drive), *reported]
+    events = [*_stops(drive.stops(end - start), places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, _why_nothing(view, begin, until))
         for begin, until in recording_gaps(view, TimeWindow(start, end))
@@ -287,7 +287,7 @@ def _with_way_there(
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
     driven = None
     if drive.path is not None:
-        way, _ = way_in(view, resolve_pose_topic(view), window)
+        way, _ = way_in(view, resolve_path_topic(view), window)
         driven = totals_inside(way.line, there.spans) if way is not None and way.poses else None
     return replace(
         answer,
@@ -384,8 +384,8 @@ def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted by retention"
 
 
-def _stops(drive: Drive, places: RobotPlaces | None) -> Iterator[Event]:
-    for (start, end, box), goes_on in drive.standstills:
+def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None) -> Iterator[Event]:
+    for (start, end, box), goes_on in stops:
         (x, y, _), frame = box.centre, ""
         point: tuple[float, float] | None = (x, y)
         if places is not None and places.frame_id != places.pose_frame:

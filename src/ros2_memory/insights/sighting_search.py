@@ -9,6 +9,8 @@ import heapq
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import MAX_NS
@@ -33,6 +35,7 @@ class Run:
         first: log time of the first match.
         last: of the last one.
         messages: how many there are.
+        until: of the next message, which is no match; None where that is not known.
         begun: whether what came before the first match is known.
     """
 
@@ -40,6 +43,7 @@ class Run:
     first: Ns
     last: Ns
     messages: int
+    until: Ns | None
     begun: bool = True
 
 
@@ -76,17 +80,18 @@ class _OfTopic:
     def add(self, block: Block) -> None:
         """Adds the next older block."""
         if not block.has_match and not self._is_open:
+            self._begins = MAX_NS
             return
         tested = block.tested()
         if not tested.times.size:
             return
         runs = runs_of(tested, SILENCE_NS, apart=self._apart)
-        is_near = self._begins - int(tested.times[-1]) <= SILENCE_NS
-        self._begins = int(tested.times[0])
+        after, self._begins = self._begins, int(tested.times[0])
+        is_near = after - int(tested.times[-1]) <= SILENCE_NS
         if runs.is_blank:
             self._is_open = self._is_open and is_near
             return
-        found = self._listed(runs)
+        found = self._listed(runs, after)
         if self._is_open and is_near and runs.goes_on:
             newer, older = self.runs.pop(), found.pop(0)
             messages = newer.messages + older.messages
@@ -100,10 +105,14 @@ class _OfTopic:
             return self.runs
         return [*self.runs[:-1], replace(self.runs[-1], begun=False)]
 
-    def _listed(self, runs: Runs) -> list[Run]:
-        """Returns the runs of a block, the newest first."""
+    def _listed(self, runs: Runs, after: Ns) -> list[Run]:
+        """Returns the runs of a block, the newest first; `after` is when the next block begins."""
+        ends = np.minimum(runs.ends, after).tolist()
         rows = zip(runs.firsts.tolist(), runs.lasts.tolist(), runs.counts.tolist(), strict=True)
-        return [Run(self._topic, *row) for row in rows][::-1]
+        return [
+            Run(self._topic, *row, until=None if end == MAX_NS else end)
+            for row, end in zip(rows, ends, strict=True)
+        ][::-1]
 
 
 def find_runs(

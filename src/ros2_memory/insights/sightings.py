@@ -30,6 +30,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.counts.tested import tested
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
+from ros2_memory.history.driven_path import body_by_transforms, resolve_path_topic
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -38,14 +39,14 @@ from ros2_memory.history.reverse_search import (
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.transforms import connects, newest_in_session, transform_at
+from ros2_memory.history.transforms import connects, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import placed, with_place
+from ros2_memory.places.pose_frames import newest_pose, placed, with_place
 from ros2_memory.places.scope import Scope
 from ros2_memory.results import LabelledPlace, Sighting, Sightings
 
@@ -62,7 +63,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
     from ros2_memory.insights.goals import GoalRun
-    from ros2_memory.insights.sighting_search import Found
+    from ros2_memory.insights.sighting_search import Found, Run
     from ros2_memory.messages.detections import Detection
     from ros2_memory.places.scope import WhileCondition
 
@@ -87,6 +88,8 @@ class _Matches:
         first: log time of the earliest match so far.
         reach: log time of the earliest message so far, also of one that cannot be decoded.
         begun: whether what came before the earliest match is known.
+        until: log time of the next message, which does not match or count; None where that is not
+            known.
     """
 
     topic: str
@@ -96,6 +99,7 @@ class _Matches:
     reach: Ns
     messages: int = 1
     begun: bool = False
+    until: Ns | None = None
 
 
 def find_matches(
@@ -163,25 +167,22 @@ def find_matches(
         if call.wants(matches.last) and (newest := _newest(view, matches)) is not None
     ]
     found = tuple(
-        replace(
-            _sighting(view, condition, matches, newest, frame_id),
-            skipped=elapsed.skipped_between(matches.first, matches.last),
-        )
+        _sighting(view, condition, matches, newest, scope=scope, frame_id=frame_id)
         for matches, newest in wanted
     )
     total = None if collected.cut else collected.count
     if goals is not None:
         total = len(goals)
         found = tuple(
-            replace(
-                _goal_sighting(view, each, frame_id),
-                skipped=elapsed.skipped_between(each.first, each.last),
-            )
+            _goal_sighting(view, each, frame_id)
             for each in (goals[::-1] if oldest_first else goals)[:limit]
             if call.wants(each.last)
         )
     elif fields:
         found = _with_fields(view, found, [newest for _, newest in wanted], fields)
+    found = tuple(
+        replace(each, skipped=elapsed.skipped_between(each.first, each.until)) for each in found
+    )
     is_nothing = not (collected.selected or goals)
     note_robots_on(view, matching_topics(view, topic), searched)
     note_unread(view, searched, nothing=is_nothing, search=True)
@@ -206,6 +207,7 @@ def find_matches(
         start=start,
         end=end,
         now=now,
+        unknown=elapsed.among(scope.unknown),
         notes=view.notes.sentences(),
     )
 
@@ -231,13 +233,13 @@ def read_sightings(
         runs = find_runs(view, search, scope.window, is_log, enough=None)
         if runs.is_over:
             view.bags.finish_within(_LEFT_TO_SAY_S)
-        spans = [(run.first, run.last) for run in reversed(runs.runs)]
+        spans = [(run.first, _until(view, run, scope)) for run in reversed(runs.runs)]
         return spans, spans[0][0] if runs.is_over else None
     found = _Sightings(MAX_COUNTED, is_log, oldest_first=True)
     _collect(view, ReverseSearch(view, pattern, condition), scope, found)
     if found.count > MAX_COUNTED:
         view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
-    spans = [(each.first, each.last) for each in found.selected]
+    spans = [(each.first, _until(view, each, scope)) for each in found.selected]
     return spans, spans[0][0] if found.cut and spans else None
 
 
@@ -259,6 +261,7 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
             _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
             # Only topics that can begin or end a sighting are read: there may be thousands.
             relevant = sorted({*topics, *found.open_topics()})
+            found.newer.clear()
             for each in tested(view, search, relevant, part):
                 before = each.time
                 found.end_silent(each.time)
@@ -269,6 +272,7 @@ def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings)
                     found.skip(each)
                 else:
                     found.end(each.topic)
+                    found.newer[each.topic] = each.time
                 if found.enough:
                     _stop(search, found)
                     return
@@ -320,6 +324,8 @@ class _Sightings:
     Attributes:
         count: how many sightings there are so far.
         cut: whether the search ended before all was searched, or might have.
+        newer: log time of the earliest message of each topic so far that does not count, in the
+            part that is searched.
     """
 
     def __init__(self, limit: int, is_log: Callable[[str], bool], *, oldest_first: bool) -> None:
@@ -330,13 +336,15 @@ class _Sightings:
         self._open: OrderedDict[str, _Matches] = OrderedDict()  # least recently matched first
         self.count = 0
         self.cut = False
+        self.newer: dict[str, Ns] = {}
 
     def add(self, found: Tested) -> None:
         """Adds the next older match; call `end_silent` with its time before."""
         topic, time = found.topic, found.time
         matches = self._open.get(topic)
         if matches is None:
-            matches = _Matches(topic, time, found.message, time, time)
+            until = self.newer.get(topic)
+            matches = _Matches(topic, time, found.message, time, time, until=until)
             self._open[topic] = matches
             self._kept.append(matches)
             self.count += 1
@@ -352,7 +360,9 @@ class _Sightings:
         self.cut = found.searched_to is not None
         self.count = len(found.runs)
         self._kept.extend(
-            _Matches(run.topic, run.last, None, run.first, run.first, run.messages, run.begun)
+            _Matches(
+                run.topic, run.last, None, run.first, run.first, run.messages, run.begun, run.until
+            )
             for run in found.runs
         )
         if found.is_over:
@@ -433,11 +443,29 @@ def _newest(view: View, matches: _Matches) -> StoredMessage | None:
     return view.stream.first([matches.topic], at, newest_first=True)
 
 
+def _until(view: View, matches: _Matches | Run, scope: Scope) -> Ns:
+    """Returns until when a state lasted: to the message that says otherwise, or the window's end.
+
+    To its last match where a silence, or the end of a scope, is next; so does a log entry.
+    """
+    last, until = matches.last, matches.until
+    if view.snapshot.timeline.is_log(matches.topic):
+        return last
+    if until is None:
+        after = TimeWindow(last + 1, last + SILENCE_NS + 1)
+        found = view.stream.first([matches.topic], after)
+        until = last if found is None else found.time
+    until = max(last, min(until, scope.window.asked()[1]))
+    return until if until - last <= SILENCE_NS and scope.holds_at(until) else last
+
+
 def _sighting(
     view: View,
     condition: Condition,
     matches: _Matches,
     newest: StoredMessage,
+    *,
+    scope: Scope,
     frame_id: str | None,
 ) -> Sighting:
     """Returns the result, with where the robot was and, at the newest match, the thing.
@@ -449,11 +477,12 @@ def _sighting(
     thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
     robot_at_first = thing is None and matches.begun
     at = matches.first if robot_at_first else newest.time
-    robot = _robot(view, at, newest.bag.recording, frame_id)
+    robot = _robot(view, at, _recording_at(view, newest, at), frame_id)
     return Sighting(
         topic=matches.topic,
         first=matches.first,
         last=matches.last,
+        until=_until(view, matches, scope) if thing is None else matches.last,
         messages=matches.messages,
         begun=matches.begun,
         robot=robot,
@@ -473,6 +502,7 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
         topic=goal.topic,
         first=goal.first,
         last=goal.last,
+        until=goal.last,
         messages=0,
         begun=goal.accepted is not None,
         robot=None if newest is None else _robot(view, newest.time, newest.bag.recording, frame_id),
@@ -518,15 +548,20 @@ def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | 
     is in this recording, has poses, it is one of these.
     """
     window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
-    found = newest_in_session(view, view.pose_topic, window, recording)
-    message = None if found is None else view.bags.decode(found)
-    if found is None or message is None:
-        return None
-    pose = view.memory.extractor.pose(message, found.record.channel.type)
-    if pose is None or not all(map(math.isfinite, pose.position)):
+    topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
+    found, pose = newest_pose(view, topic, window, recording) or (None, None)
+    if found is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     there = placed(view, pose, found.time, found.bag.recording, frame_id)
     return with_place(view, there, found.time, found.bag.recording)
+
+
+def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
+    """Returns the recording of a sighting's message at a time: its last may be of a later one."""
+    topic, own = newest.record.channel.topic, newest.bag.recording
+    bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
+    every = {each.bag.recording for each in bags}
+    return own if own in every else min(every, default=own)
 
 
 def _spot_of(

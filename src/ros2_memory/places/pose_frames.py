@@ -17,7 +17,8 @@ from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import abbreviate, counted
-from ros2_memory.history.transforms import connects, transform_at
+from ros2_memory.history.driven_path import newest_of_body, robot_body
+from ros2_memory.history.transforms import connects, newest_in_session, transform_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import BagSpan
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
 
 
@@ -45,6 +46,27 @@ def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) ->
         None if turn is None else multiply(found.rotation, turn),
         frame_id,
     )
+
+
+def newest_pose(
+    view: View, topic: str, window: TimeWindow, recording: Path | None = None
+) -> tuple[StoredMessage, Pose | None] | None:
+    """Returns the newest message of the topic that places the robot in a window, with its pose.
+
+    Where the session of a `recording` has the topic, it is one of its messages. None where there is
+    no message, or it cannot be decoded.
+    """
+    body = robot_body(view) if topic in view.memory.limits.tf_topics else None
+    if body is not None:
+        return newest_of_body(view, body, window, recording=recording)
+    if recording is None:
+        found = view.stream.newest(topic, window)
+    else:
+        found = newest_in_session(view, topic, window, recording)
+    message = None if found is None else view.bags.decode(found)
+    if found is None or message is None:
+        return None
+    return found, view.memory.extractor.pose(message, found.record.channel.type)
 
 
 def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:

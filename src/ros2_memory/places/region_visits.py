@@ -18,6 +18,7 @@ from ros2_memory.analysis.motion.robot_track import STRETCH_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
+from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
@@ -32,12 +33,15 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.regions import Place, Region
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.view import View
     from ros2_memory.places.map_placement import MapPlacement
     from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
 
 
+WHEREABOUTS: Final = "where the robot was"
+"""What is not known without poses, for sentences."""
 _CLOSE_NS: Final[Ns] = 60 * NS_PER_S
 _MOST_JOINED: Final = 50
 
@@ -58,7 +62,7 @@ class RegionVisits(NamedTuple):
     @property
     def duration(self) -> Ns:
         """How long they were in all, as the track has them."""
-        return sum(self.elapsed.between(one.start, one.stop) for one, _ in self.all)
+        return self.elapsed.among((one.start, one.stop) for one, _ in self.all)
 
 
 def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
@@ -81,6 +85,12 @@ def _joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     if joined.left_out:
         view.notes.add(f"poses that no transform places in {frame_id} are left out")
     return joined
+
+
+def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
+    """Returns when it is known where the robot was: not at `mixed` times, which several have."""
+    starts, stops = track.pieces
+    return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
 
 
 def make_tracks(view: View, window: TimeWindow) -> None:
@@ -294,15 +304,14 @@ def places_in(
 
 
 def place_visits(
-    view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
+    view: View, places: Sequence[tuple[Place, RobotTrack]], window: TimeWindow, elapsed: Elapsed
 ) -> tuple[PlaceVisits, ...]:
-    """Returns how often, and for how long, the robot was in each named place.
+    """Returns how often, and for how long, the robot was in each of `places_in`.
 
     Those in which it was longest come first.
     """
-    elapsed = elapsed_in(view, window)
     found: list[PlaceVisits] = []
-    for place, track in places_in(view, places, placement, window):
+    for place, track in places:
         inside = robot_inside(track, place.region, window)
         tracks = RobotTracks(view, place.frame_id)
         every = [(one, track) for one in inside]

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import Edge, Frames, joined_edges, static_at
-from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS
+from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     STRETCH_NS,
     RobotTrack,
@@ -155,8 +155,9 @@ class RobotTracks:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for _, part in found)
         one, *others = _by_robot(found)
-        tracks = tuple(joined_track(parts) for parts in others)
-        return JoinedTrack(joined_track(one), since, left_out, tracks)
+        fastest = view.memory.limits.max_plausible_speed_mps
+        tracks = tuple(joined_track(parts, fastest) for parts in others)
+        return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
     def make(self, window: TimeWindow) -> None:
         """Makes the tracks that follow from parts alone, of those in a window and beside it.
@@ -501,8 +502,7 @@ def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
             others.append(beside)
         times = np.concatenate([part.times for part in own])
         times.sort()
-        new = np.diff(times) > SILENCE_NS
-        starts, stops = times[np.append([True], new)], times[np.append(new, [True])]
+        starts, stops = pieces_of(times, times)
         placed.append(_Pieces(starts, stops, int(starts[0]), int(stops[-1])))
     return [kept, *others]
 

@@ -6,18 +6,28 @@ from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ros2_memory.analysis.intervals import SILENCE_NS
+import numpy as np
+
+from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.spans import united, without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
+from ros2_memory.history.robots import note_robots, note_robots_on
+from ros2_memory.history.scan import scan
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.where import note_other_frame, parse_where, times_inside
+from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, track_in
+from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.where import note_other_frame, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.view import View
     from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.places.where import Where
@@ -38,6 +48,7 @@ class Scope:
 
     Attributes:
         window: that is searched.
+        unknown: the recorded times of it in which it is not known whether matches count.
 
     Raises:
         InvalidArgumentsError: `where` is no place, or nothing can meet the other condition.
@@ -52,12 +63,19 @@ class Scope:
         during: WhileCondition | None = None,
     ) -> None:
         self.window = window
+        self.unknown: Spans = []
         self._inside: list[tuple[Ns, Ns]] | None = None
         if where is not None:
-            region = parse_where(view.memory.limits, where)
-            inside = times_in_region(view, region, window)
+            track, inside = _in_region(view, parse_where(view.memory.limits, where), window)
             self._inside = [(each.start, each.stop) for each in inside]
-        self._states = None if during is None else _States(view, during)
+            known = placed_times(track, note_robots(view, resolve_path_topic(view), window))
+            self.unknown = unknown_times(view, window, known, WHEREABOUTS)
+        self._states: _States | None = None
+        if during is not None:
+            self._states = _States(view, during)
+            known = self._states.known_in(window)
+            unknown = unknown_times(view, window, known, f"what {during.topic} said")
+            self.unknown = united([*self.unknown, *unknown])
 
     @property
     def compared_frames(self) -> tuple[str, ...]:
@@ -95,7 +113,7 @@ class Scope:
         return self._states is None or self._states.holds_at(time)
 
 
-def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
+def times_in_region(view: View, where: Where, window: TimeWindow) -> Sequence[Inside]:
     """Returns when the robot was in a region, in order: one in the map, unless it names a frame.
 
     Raises:
@@ -103,13 +121,19 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside
         NoDataError: no pose is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
+    return _in_region(view, where, window)[1]
+
+
+def _in_region(view: View, where: Where, window: TimeWindow) -> tuple[RobotTrack, Sequence[Inside]]:
+    """Returns the robot's track, and when it was in a region."""
     topic = resolve_path_topic(view)
     placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
-    found = times_inside(view, where, placement.frame_id, window)
+    track = track_in(view, where.frame_id or placement.frame_id, window)
+    found = robot_inside(track, where.region, window)
     if not found:
         ask = f'ask it with frame_id "{placement.frame_id}"'
         note_other_frame(view, where, placement, window, ask)
-    return found
+    return track, found
 
 
 class _States:
@@ -147,6 +171,16 @@ class _States:
         """The note on the frames in which the condition compared positions, if it did."""
         return compared_frames(self._view, self._search.topics, self._condition)
 
+    def known_in(self, window: TimeWindow) -> Spans:
+        """Returns when the topics said something: without silences, unless that holds on."""
+        topics, timeline = self._search.topics, self._view.snapshot.timeline
+        if self._holds_on:
+            begins = [span[0] for topic in topics for span in timeline.recordings(topic).values()]
+            known = [(min(begins, default=MAX_NS), MAX_NS)]
+        else:
+            known = _heard(self._view, topics, window.widened(SILENCE_NS))
+        return without(known, note_robots_on(self._view, topics, window))
+
     def holds_at(self, time: Ns) -> bool:
         """Returns whether the newest message then met the condition; False without one."""
         if not self._known.contains(time):
@@ -175,3 +209,25 @@ class _States:
                 self._times.append(each.time)
                 self._values.append(met)
         self._known = TimeWindow(start, stop)
+
+
+def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
+    """Returns when topics had messages, without silences of more than `SILENCE_NS`.
+
+    Of a bag that holds a topic for no longer, its first and its last message say enough.
+    """
+    spans = [(np.empty(0, np.int64), np.empty(0, np.int64))]
+    for topic in topics:
+        within: list[tuple[Ns, Ns]] = []
+        for segment in view.snapshot.timeline.segments_in(window):
+            firsts, lasts = segment.bounds(topic)
+            is_long = lasts - firsts > SILENCE_NS
+            spans.append((firsts[~is_long], lasts[~is_long]))
+            within += zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
+        if within:
+            every = scan(view, topic, window, columns=False, within=united(within))
+            spans += [pieces_of(rows.times, rows.times) for rows in every]
+    starts, stops = (np.concatenate(some) for some in zip(*spans, strict=True))
+    order = np.argsort(starts, kind="stable")
+    starts, stops = pieces_of(starts[order], stops[order])
+    return list(zip(starts.tolist(), (stops + 1).tolist(), strict=True))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import (
@@ -18,8 +19,9 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
-from ros2_memory.history.coverage import note_unread, unix_text
+from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import (
     driven_path,
     pose_frame,
@@ -28,16 +30,29 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
+from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, region_visits, shown_visits
+from ros2_memory.places.region_visits import (
+    WHEREABOUTS,
+    place_visits,
+    placed_times,
+    places_in,
+    region_visits,
+    shown_visits,
+)
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import View
+    from ros2_memory.places.region_visits import RegionVisits
 
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
@@ -74,15 +89,18 @@ def visits(
     view = open_view(memory, call, min(window.stop, wall))
     require_recorded(view, window)
     topic = resolve_path_topic(view)
-    note_robots(view, topic, window)
+    mixed = note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
     own_frame = pose_frame(view, topic)
     placement = map_placement(view, own_frame, topic, asked)
     now = memory.now(wall, view.snapshot.latest)
     if place is None:
-        found = place_visits(view, memory.limits.places, placement, window)
-        note_unread(view, window, nothing=not any(each.duration for each in found))
+        placed = places_in(view, memory.limits.places, placement, window)
+        elapsed = elapsed_in(view, window)
+        places = place_visits(view, placed, window, elapsed)
+        tracks = {each.frame_id: track for each, track in placed}.values()
+        note_unread(view, window, nothing=not any(each.duration for each in places))
         return Visits(
             frame_id=placement.frame_id,
             x=None,
@@ -90,16 +108,18 @@ def visits(
             radius_m=None,
             visits=(),
             more=False,
-            total=sum(each.entries for each in found),
+            total=sum(each.entries for each in places),
             now=now,
-            places=found,
+            places=places,
+            unknown=_unknown(view, window, tracks, mixed, elapsed),
             notes=view.notes.sentences(),
         )
     known = _by_track(view, topic, placement.frame_id, place, (window, now, limit))
+    found = known.found
     known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
-    if not known.total and asked is None:
+    if not found.all and asked is None:
         note_other_frame(view, place, placement, window, f'ask with frame_id "{own_frame}"')
     _note_doubts(view, known, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
@@ -109,29 +129,28 @@ def visits(
         y=None if circle is None else circle.y,
         radius_m=None if circle is None else circle.radius_m,
         visits=known.shown,
-        more=known.total > len(known.shown),
-        total=known.total,
+        more=len(found.all) > len(known.shown),
+        total=len(found.all),
         now=now,
-        duration=known.duration,
+        duration=found.duration,
         entries=known.entries,
         exits=known.exits,
-        all_counted=known.is_all,
+        all_counted=found.is_all,
         where=place.name,
+        unknown=_unknown(view, window, [found.track], mixed, found.elapsed),
         reaches_now=known.newest is not None,
         notes=view.notes.sentences(),
     )
 
 
 class _Known(NamedTuple):
-    """The visits to show, and the number and duration of all."""
+    """The visits to show, and all of them."""
 
     shown: tuple[Visit, ...]
-    total: int
-    duration: Ns
+    found: RegionVisits
     newest: Ns | None
     entries: int
     exits: int
-    is_all: bool
 
 
 def asked_place(
@@ -174,9 +193,15 @@ def _by_track(
     current = newest if _is_current(view, newest, now) else None
     shown, found = shown_visits(found, window, limit, place, current)
     entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
-    return _Known(
-        shown, len(found.all), found.duration, newest, entries, exits, is_all=found.is_all
-    )
+    return _Known(shown, found, newest, entries, exits)
+
+
+def _unknown(
+    view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans, elapsed: Elapsed
+) -> Ns:
+    """Returns for how long it is not known where the robot was, by a track for each frame."""
+    every = (unknown_times(view, window, placed_times(one, mixed), WHEREABOUTS) for one in tracks)
+    return elapsed.among(united(chain.from_iterable(every)))
 
 
 def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow) -> Ns | None:

@@ -307,9 +307,17 @@ class PlaceVisits:
     PLAIN("entries").if_known.merged("added"),
     PLAIN("exits").if_known.merged("added"),
     MINUTES("minutes", "duration").merged("added"),
+    SECONDS("unknown_s").if_any.merged("added"),
     PLAIN("more").if_any,
     span=("oldest", "now"),
-    where=("is_of_places", keys(NAME("frame_id"), OBJECTS("places").along("last_exit"))),
+    where=(
+        "is_of_places",
+        keys(
+            NAME("frame_id"),
+            OBJECTS("places").along("last_exit"),
+            SECONDS("unknown_s").if_any.merged("added"),
+        ),
+    ),
 )
 class Visits(AnswerWithNotes):
     """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
@@ -323,6 +331,7 @@ class Visits(AnswerWithNotes):
         entries: in how many of them the robot was seen to enter; None where that is not known.
         exits: likewise, to leave.
         places: of every named place, where none was asked for; then there are no visits.
+        unknown: for how long something was recorded, and it is not known where the robot was.
         reaches_now: whether the window reaches the newest pose.
     """
 
@@ -340,6 +349,7 @@ class Visits(AnswerWithNotes):
     all_counted: bool = True
     where: str | None = None
     places: tuple[PlaceVisits, ...] | None = None
+    unknown: Ns = 0
     reaches_now: bool = True
 
     @property

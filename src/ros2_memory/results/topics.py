@@ -246,7 +246,7 @@ class LabelledPlace:
     TIME("first_seen", "first"),
     TIME("last_seen", "last"),
     LOCAL("local", "first", "last"),
-    LASTED("duration_s", "first", "last", "skipped"),
+    LASTED("duration_s", "first", "until", "skipped"),
     AGO("ago_s", "last"),
     PLAIN("count", "messages").if_any,
     an_object(keys(PLAIN("at", "robot_at"), POSE("robot"), NAME("frame_id", "robot.frame_id")))(
@@ -265,6 +265,7 @@ class Sighting:
         topic: of the messages.
         first: log time of the first of them; of the earliest one read where `begun` is False.
         last: of the last.
+        until: of the next one, which says otherwise; as `last` where none does, and of a thing.
         messages: how many there are; 0 for a goal of an action.
         begun: whether the message before the first is known not to belong.
         robot: where the robot was at the first; at the last where that is the sighting of a thing,
@@ -274,13 +275,14 @@ class Sighting:
         value: the requested fields of the last message; None where none were, or it has none. Of a
             goal its id and its status.
         score: of the detection, if the message has that; the best of several.
-        skipped: how much of the time from the first to the last the clock skipped.
+        skipped: how much of the time from the first to `until` the clock skipped.
         robot_at_first: whether `robot` is of the first message.
     """
 
     topic: str
     first: Ns
     last: Ns
+    until: Ns
     messages: int
     begun: bool
     robot: Pose | None
@@ -305,6 +307,7 @@ class Sighting:
 @result(
     OBJECTS("sightings").along("last_seen"),
     TOTAL("total", "counted").merged("added"),
+    SECONDS("unknown_s").if_any.merged("added"),
     TIME("searched_from", "start").merged("earliest"),
     TIME("searched_to", "end").merged("newest"),
     LOCAL("local", "start", "end"),
@@ -314,7 +317,8 @@ class Sighting:
 class Sightings(AnswerWithNotes):
     """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
 
-    `total` is how many there are; None if the search ended before it had counted all.
+    `total` is how many there are; None if the search ended before it had counted all. `unknown` is
+    for how long something was recorded, and it is not known whether matches count.
     """
 
     sightings: tuple[Sighting, ...]
@@ -323,6 +327,7 @@ class Sightings(AnswerWithNotes):
     start: Ns | None
     end: Ns | None
     now: Ns
+    unknown: Ns = 0
 
     @property
     def oldest(self) -> Ns | None:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import structlog
 
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     BusyError,
     EpisodicError,
@@ -284,7 +285,10 @@ class Dispatcher:
         """Runs the query and renders its answer, in a worker thread."""
 
         def answer() -> Reply:
-            found = question(self._memory, call)
+            try:
+                found = question(self._memory, call)
+            except GoneError:  # the store has changed since, and is looked at anew
+                found = question(self._memory, call)
             return self._replies.answer(found, from_active=call.used_active)
 
         return self._asked(answer, wait)

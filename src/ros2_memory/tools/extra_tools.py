@@ -32,10 +32,10 @@ _SIGHTINGS = ToolDeclaration(
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
     'succeeded. while: {{"topic": "/is_docked", "condition_type": '
-    '"equals", "value": false}} counts only while another topic meets a condition. '
+    '"equals", "value": false}} counts only while another topic meets that. '
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
-    "position (at when), place: of the thing, score}}], total}}.",
+    "position (at when), place: of the thing, score}}], total, unknown_s}}.",
     MatchesArguments,
     find_matches,
     blocking=True,
@@ -62,9 +62,10 @@ _STATUS = ToolDeclaration(
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits to a place"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} if transforms lead there, else that of {pose_topic}; without a place, "
-    "for every named one. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
-    "closest_m, ago_s}}], total, minutes}} or {{places: [{{place, minutes, entries}}]}}.",
+    "{map_frame} if transforms lead there, else {pose_topic}'s; without a place, "
+    "all named ones. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
+    "closest_m, ago_s}}], total, minutes, unknown_s}} or "
+    "{{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,
     visits,
     blocking=True,

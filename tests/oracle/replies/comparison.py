@@ -157,6 +157,18 @@ def _was_null(recorded: Any, got: Any) -> bool:
     return recorded is None
 
 
+def _tells_unknown_time(recorded: Any, got: Any) -> bool:
+    """Whether a key, a column or notes on unknown time are all that is new."""
+    if not isinstance(got, list):
+        return bool(recorded == "(absent)")
+    known = recorded if isinstance(recorded, list) else []
+    new = ("unknown_s", "is not known at any time of the window", "as from several robots")
+    added = [each for each in got if each not in known]
+    return all(each in got for each in known) and all(
+        any(words in each for words in new) for each in added
+    )
+
+
 _MOVING_MAPS: Final = ("moving_map", "robot_day_*", "drifting_map_*", "noisy_robot", "home_*")
 _NOISY: Final = (*_MOVING_MAPS, "mobrob_odom_mcap", "rerun_sensors_mcap")
 _UNKNOWN_TIME: Final = ("silent_odometry", "two_at_once", "two_robots_*")
@@ -218,6 +230,17 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         )
         for world in _UNKNOWN_TIME
         for name in ("where", "while")
+    ),
+    *(
+        KnownWrong(
+            "*",
+            f"tool {name}",
+            path,
+            "for how long the answer is not known is not reported",
+            only=_tells_unknown_time,
+        )
+        for name in ("visits", "find_matches")
+        for path in ("*unknown_s", "/columns", "/notes")
     ),
     KnownWrong(
         "*",

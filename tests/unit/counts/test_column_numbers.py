@@ -181,7 +181,7 @@ def test_what_is_damaged_since_it_was_stored_is_told_as_its_column_says(tmp_path
 def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched(
     tmp_path: Path,
 ) -> None:
-    """Each six minutes begin with a sighting of 50 s, and so does what was searched."""
+    """Each six minutes begin with a sighting of a minute, and so does what was searched."""
     messages = [battery(BEGIN + n * 10 * S, 0.9 if n % 36 < 6 else 0.1) for n in range(1040)]
     write(tmp_path, messages, split=60)
     memory = memory_of(tmp_path, limits=LATEST)
@@ -207,9 +207,9 @@ def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched
             assert {name for name, _ in answer.rows} == by_hour.keys()
             for nth, some in enumerate([*(by_hour[name] for name, _ in answer.rows), counted]):
                 assert cells(answer, "count")[nth] == len(some)
-                assert cells(answer, "seconds")[nth] == len(some) * 50 * S
+                assert cells(answer, "seconds")[nth] == len(some) * 60 * S
                 assert cells(answer, "first")[nth] == min(some)
-                assert cells(answer, "last")[nth] == max(some) + 50 * S
+                assert cells(answer, "last")[nth] == max(some) + 60 * S
             if since > BEGIN:
                 assert answer.notes[0].startswith(f"only what is after {since / S:.6f} is counted")
             sinces.add(since)

@@ -188,6 +188,37 @@ def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
         assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
 
 
+def test_the_last_moment_of_a_stop_is_no_stop_of_the_window_that_begins_there(
+    tmp_path: Path,
+) -> None:
+    [(began, ended), _] = _drive(
+        tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5), (4.0, 0.0), (20.0, 0.5)]
+    )
+    memory = memory_of(tmp_path)
+
+    def stops(begin: float, end: float) -> list[float]:
+        reply = asked(memory, tmp_path, "recap", start=BEGIN / S + begin, end=BEGIN / S + end)
+        return [each["duration_s"] for each in reply["events"]]
+
+    assert stops(ended - 0.021, ended + 5) == []
+    assert stops(began - 5, began + 1) == []
+    # In one of two windows it is, wherever they meet, and in one that it fills.
+    assert stops(ended - 5, ended + 5) == [pytest.approx(5.0, abs=0.03)]
+    assert stops(20, 24) == [pytest.approx(2.0, abs=0.03)] == stops(24, 30)
+    assert stops(began + 4, began + 4.5) == [0.5]
+    at = BEGIN / S
+    reply = asked(
+        memory,
+        tmp_path,
+        "compare",
+        start=at + ended - 0.021,
+        end=at + ended + 5,
+        with_start=at + 20,
+        with_end=at + 27,
+    )
+    assert reply["way"]["standstills"] == {"this": 0, "with": 1}
+
+
 def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
     tmp_path: Path,
 ) -> None:

@@ -297,6 +297,40 @@ def test_a_silence_ends_a_sighting(tmp_path: Path) -> None:
     assert seconds(memory, "cup", topic) == [(21.5, 21.5), (1, 11)]
 
 
+@each_way
+def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path, recalls: bool) -> None:
+    """Of a topic that states it every 5 s, over two bags, with a silence in the second one."""
+    busy, idle = [10, 15, 25, 30, 55, 65], [0, 5, 20, 60]
+    messages = [
+        text(BEGIN + at * S, "busy" if at in busy else "idle", topic="/mode")
+        for at in sorted(busy + idle)
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages[:4])
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[4:])
+    memory = memory_of(tmp_path)
+    if recalls:
+        memory = with_store(memory, tmp_path)
+    state = {"topic": "/mode", "condition_type": "equals", "value": "busy"}
+    began = BEGIN / S
+
+    def lasted(**given: object) -> list[tuple[float, float, float]]:
+        reply = asked(memory, tmp_path, "find_matches", **state, **given)
+        return [
+            (each["first_seen"] - began, each["last_seen"] - began, each["duration_s"])
+            for each in reply["sightings"]
+        ]
+
+    # Over the bags' edge; up to a silence; and up to the newest message.
+    assert lasted() == [(65, 65, 0), (55, 55, 5), (25, 30, 5), (10, 15, 10)]
+    # To the end of the window, as far as that is known.
+    assert lasted(start=began + 10, end=began + 18) == [(10, 15, 8)]
+    assert lasted(end=began + 40) == [(25, 30, 5), (10, 15, 10)]
+    assert lasted(**{"while": state}) == [(65, 65, 0), (55, 55, 0), (25, 30, 5), (10, 15, 5)]
+    reply = asked(memory, tmp_path, "find_matches", **state, by="day")
+    seconds = reply["columns"].index("seconds")
+    assert reply["all"][seconds - 1] == 20
+
+
 def test_the_window_and_the_limit_bound_what_is_reported(tmp_path: Path) -> None:
     topic = detections(BEGIN, []).topic
     said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
@@ -657,3 +691,30 @@ def test_the_robot_is_where_it_was_when_something_began(tmp_path: Path) -> None:
     [found] = asked(memory_of(tmp_path), tmp_path, "find_matches", **given)["sightings"]
     assert found["first_seen"] == BEGIN / S + 5
     assert (found["robot"]["at"], found["robot"]["x"]) == ("first_seen", 5.0)
+
+
+@each_way
+@pytest.mark.parametrize("pause_s", [0.05, 2.0, 8.0])
+def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
+    tmp_path: Path, pause_s: float, recalls: bool
+) -> None:
+    """The bumper is pressed from 40 s on, the recorder is started again at 50 s."""
+    for nth in range(2):
+        begin = BEGIN + round(nth * (50 + pause_s) * S)
+        steps = [(begin + step * S // 5, step) for step in range(250)]
+        messages = [odom(at, step * 0.1, float(nth)) for at, step in steps]
+        messages += [boolean(at, nth == 1 or step >= 200) for at, step in steps if step % 5 == 0]
+        write_mcap(tmp_path / f"run_{nth}" / f"run_{nth}_0.mcap", messages)
+    memory = memory_of(tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
+    asks = {"topic": "/bumper", "condition_type": "equals", "value": True}
+    [found] = asked(memory, tmp_path, "find_matches", **asks)["sightings"]
+    assert found["first_seen"] == BEGIN / S + 40
+    assert found["robot"] == pytest.approx(
+        {"at": "first_seen", "x": 20.0, "y": 0.0, "z": 0.0, "yaw_deg": 0.0, "frame_id": "odom"}
+    )
+    table = asked(memory, tmp_path, "find_matches", **asks, by="day")
+    row = dict(zip(table["columns"][1:], table["all"], strict=True))
+    unrecorded = pause_s + 0.2 if pause_s > 1 else 0.0
+    assert row["recorded_s"] == pytest.approx(100 + pause_s - 0.2 - unrecorded, abs=0.06)
+    assert row["recorded_s"] - 1.0 <= row["topic_s"] <= row["recorded_s"]

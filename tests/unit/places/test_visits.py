@@ -26,7 +26,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.places.visits import visits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
@@ -543,3 +543,20 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
         [(inside[0], inside[-1])],
         [(inside[0], None)],
     )
+
+
+@each_way
+@pytest.mark.parametrize(("fastest_mps", "driven_m", "visited"), [(10.0, 1.4, 1), (5.0, 0.0, 0)])
+def test_what_is_a_jump_for_the_path_is_one_for_visits(
+    tmp_path: Path, recalls: bool, fastest_mps: float, driven_m: float, visited: int
+) -> None:
+    """The robot stands, and is 1.4 m farther after 0.2 s: at 7 m/s it passes what lies between."""
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", line((5, 0.0), (0.2, 7.0), (5, 0.0)))
+    memory = memory_of(tmp_path, limits=QuerySettings(max_plausible_speed_mps=fastest_mps))
+    memory = with_store(memory, tmp_path) if recalls else memory
+    span = {"start": BEGIN // S, "end": BEGIN // S + 12}
+    way = asked(memory, tmp_path, "trajectory_summary", **span)
+    assert way["distance_m"] == pytest.approx(driven_m)
+    between = {"x": 0.7, "y": 0.0, "radius_m": 0.3, "by": "hour"}
+    counted = asked(memory, tmp_path, "visits", **between, **span)
+    assert dict(zip(counted["columns"][1:], counted["all"], strict=True))["entries"] == visited

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 from pathlib import Path
@@ -13,6 +14,7 @@ from mcp.types import TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import results
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -227,6 +229,23 @@ async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
         result = await client.call_tool("slow", {})
         assert result.is_error
         assert sent(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
+
+
+@pytest.mark.parametrize(("losses", "answer"), [(1, "value"), (2, "error")])
+async def test_a_question_whose_columns_were_deleted_meanwhile_is_asked_again(
+    losses: int, answer: str
+) -> None:
+    asked = itertools.count()
+
+    def ask(_call: Call) -> Answer:
+        if next(asked) < losses:
+            raise GoneError
+        return value(1)
+
+    async with Client(served(tool("ask", ask))) as client:
+        reply = sent(await client.call_tool("ask", {}))
+    assert answer in reply
+    assert reply.get("error") in {None, "busy"}
 
 
 async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:

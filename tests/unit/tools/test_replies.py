@@ -290,7 +290,7 @@ def test_a_hundred_poses_stay_below_6_000_characters() -> None:
 
 
 def sighted(first: int, last: int, now: int) -> results.Sightings:
-    seen = results.Sighting("/a", first, last, 3, True, None, None)
+    seen = results.Sighting("/a", first, last, last, 3, True, None, None)
     return results.Sightings((seen,), more=False, total=1, start=first, end=now, now=now)
 
 

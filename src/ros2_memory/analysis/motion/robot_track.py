@@ -35,7 +35,6 @@ STRETCH_NS: Final[Ns] = 10 * NS_PER_S
 _SLOT_NS: Final[Ns] = NS_PER_S // 5
 """Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
 
-_FASTEST_MPS: Final = 5.0
 _JUMP_NS: Final[Ns] = 2 * NS_PER_S
 """A step that is faster, and not longer than this, is a jump."""
 _MAX_M: Final = 1e6
@@ -58,6 +57,7 @@ class RobotTrack:
         heading: about Z (rad), continuous from vertex to vertex; NaN where it is not known.
         begins: whether a piece begins at the vertex: the robot was not seen between it and the one
             before for longer than `SILENCE_NS`.
+        fastest_mps: the highest plausible speed; what is faster is a jump.
     """
 
     times: Times
@@ -65,6 +65,7 @@ class RobotTrack:
     y: Floats
     heading: Floats
     begins: Mask
+    fastest_mps: float = math.inf
 
     @property
     def pieces(self) -> tuple[Times, Times]:
@@ -139,7 +140,7 @@ def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
     return joined_track([track_part(times, x, y, heading)])
 
 
-def joined_track(parts: Sequence[TrackPart]) -> RobotTrack:
+def joined_track(parts: Sequence[TrackPart], fastest_mps: float = math.inf) -> RobotTrack:
     """Returns the track by the poses of several tables; of two of one time the first counts."""
     if not parts:
         return empty_track()
@@ -160,7 +161,7 @@ def joined_track(parts: Sequence[TrackPart]) -> RobotTrack:
     whole = whole.some(_vertices(whole, keeps=whole.settled))
     heading = np.where(whole.known, whole.turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
-    return RobotTrack(whole.times, whole.x, whole.y, heading, begins)
+    return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
 def _continuous(turns: Times, settled: Mask) -> Times:
@@ -210,7 +211,7 @@ def _vertices(part: TrackPart, keeps: Mask) -> NDArray[np.intp]:
 def jumps(track: RobotTrack) -> Mask:
     """Returns after which vertices the robot jumped to the next one: nobody drives as fast."""
     lasted = np.diff(track.times)
-    far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > _FASTEST_MPS * lasted
+    far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > track.fastest_mps * lasted
     jumped = far & (lasted > 0) & (lasted <= _JUMP_NS) & ~track.begins[1:]
     return np.append(jumped, [False])[: len(track.times)]
 
@@ -235,4 +236,4 @@ def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
         np.interp(moments - since, times - since, column) if len(at) else column[:0]
         for column in (track.x, track.y, track.heading)
     )
-    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_))
+    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_), track.fastest_mps)

@@ -5,13 +5,15 @@ grow with time. It begins with the first pose at that place and ends with the la
 
 Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out.
 Consecutive slots are linked where their means are no farther apart than a drift of `DRIFT_MPS` or
-the noise of their own poses explains, and linked slots form a chain. The ends of a chain are then
-found pose by pose: a slot that is clearly inside gives the place and its noise, and poses are
-followed outwards, through the last slot of the chain and the one beyond, until one is elsewhere.
-Slow motion that noise hides from two slots shows in blocks of `BLOCK_NS`: a block whose means
-spread farther than drift and noise explain is motion, and splits the chain. So are still blocks
-that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A standstill that drifts out of
-`LARGEST_M` in a longer time ends there, and the next one begins.
+the noise of their own poses explains, and linked slots form a chain, whose first and last slot may
+be half motion and are left out. Slow motion that noise hides from two slots shows in blocks of
+`BLOCK_NS`: a block whose means spread farther than drift and noise explain is motion, and splits
+the chain. So are still blocks that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A
+standstill that drifts out of `LARGEST_M` in a longer time ends there, and the next one begins.
+
+The ends of still blocks in a row are found pose by pose: some slots just inside give the place and
+its noise, and poses are followed outwards until one is elsewhere. The last one before that is
+clearly there is the end: between the two, noise hides that the robot moves.
 
 All of this depends only on poses a few slots around, and slots and blocks are counted from the
 epoch. So the `Blocks` of stretches of time, each made of its poses and of those `BESIDE_NS` beside
@@ -53,8 +55,8 @@ SILENCE_NS: Final[Ns] = 5 * NS_PER_S // 2
 """Between poses farther apart nothing is known: a standstill ends there."""
 SLOT_NS: Final[Ns] = 2 * NS_PER_S // 5
 BLOCK_NS: Final[Ns] = 5 * SLOT_NS
-BESIDE_NS: Final[Ns] = 4 * NS_PER_S
-"""Poses so far beside a stretch of time decide what its blocks are: a silence and two slots."""
+BESIDE_NS: Final[Ns] = 6 * NS_PER_S
+"""Poses so far beside a stretch of time decide what its blocks are: those of the block beside."""
 CREEP_NS: Final[Ns] = 15 * BLOCK_NS
 """A robot that moves farther than `LARGEST_M` in this time creeps; a slower one drifts."""
 CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
@@ -68,6 +70,14 @@ CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
 _NOISE_FACTOR: Final = 5.5
 _NEAREST_M: Final = 0.0003
 """Poses without noise are at one place if they are no farther apart than this."""
+_ELSEWHERE: Final = 3.0
+"""Poses so many standard deviations from a place are elsewhere."""
+_CLEARLY: Final = 2.0
+"""Those that are so many nearer are clearly there."""
+_PLACE_SLOTS: Final = 4
+"""Slots that give the place at an end of a standstill."""
+_OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
+"""Slots beyond, in which the robot may still be there."""
 PER_METRE: Final = 10_000
 """Means of positions are rounded: nothing depends on the order in which they are added up."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
@@ -122,9 +132,9 @@ class Blocks:
         noises: the highest standard deviation (m) of a slot's mean that noise of poses explains.
         lows: x, y, z (m) of the lower corner of the box around the slots' means, as rows.
         highs: of the upper corner.
-        starts: where a chain begins in the block, the log time of the first pose at that place;
+        starts: of the first of still blocks in a row, the log time of the first pose at that place;
             else `MIN_NS`.
-        ends: where a chain ends in it, of the last one; else `MIN_NS`.
+        ends: of the last of them, of the last pose there; else `MIN_NS`.
     """
 
     numbers: Ints
@@ -215,48 +225,50 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Bl
     is_last = np.r_[False, links] & ~np.r_[links, False]
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(is_last)
     edges = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    # Of one that goes on beyond the stretch it is not known here.
     is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
-    is_long |= (slots.firsts[firsts] < start) | (slots.lasts[lasts] >= stop)
     if goes_on:
         is_long |= (edges[0] == 0) | (edges[1] == len(slots) - 1)
-    starts = np.full(len(slots), MIN_NS)
-    ends = np.full(len(slots), MIN_NS)
     among = np.zeros(len(slots), np.bool_)
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
-        among[first : last + 1] = True
-        if start <= slots.firsts[first] < stop:
-            starts[first] = slots.begin_of(first)
-        if start <= slots.firsts[last] < stop:
-            ends[last] = slots.end_of(last)
+        among[first + 1 : last] = True
+    found = _blocks(slots, np.flatnonzero(among), np.cumsum(is_first))
     if goes_on:
-        starts[starts == slots.times[0]] = MIN_NS
-        ends[ends == slots.times[-1]] = MIN_NS
-    among &= (slots.firsts >= start) & (slots.firsts < stop)
-    return _blocks(slots, np.flatnonzero(among), np.cumsum(is_first), starts, ends)
+        found.starts[found.starts == slots.times[0]] = MIN_NS
+        found.ends[found.ends == slots.times[-1]] = MIN_NS
+    inside = (found.firsts >= start) & (found.firsts < stop)
+    return Blocks(*(getattr(found, each.name)[inside] for each in fields(Blocks)))
 
 
-def _blocks(slots: _Slots, among: Ints, chains: Ints, starts: Ints, ends: Ints) -> Blocks:
+def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:
+    if not among.size:
+        return NO_BLOCKS
     numbers = slots.numbers[among] * SLOT_NS // BLOCK_NS
     is_new = np.ones(among.size, np.bool_)
     is_new[1:] = (np.diff(numbers) != 0) | (np.diff(chains[among]) != 0)
     begins = np.flatnonzero(is_new)
-    stops = np.r_[begins[1:], among.size]
-    if not begins.size:
-        return NO_BLOCKS
+    firsts, lasts = among[begins], among[np.r_[begins[1:], among.size] - 1]
     means = np.rint(slots.means[among] * PER_METRE) / PER_METRE
     noises = slots.noises[among] / np.sqrt(slots.counts[among])
-    return Blocks(
+    found = Blocks(
         numbers[begins],
-        slots.firsts[among[begins]],
-        slots.lasts[among[stops - 1]],
+        slots.firsts[firsts],
+        slots.lasts[lasts],
         # As they are stored.
         np.maximum.reduceat(noises, begins).astype(np.float32).astype(np.float64),
         np.minimum.reduceat(means, begins),
         np.maximum.reduceat(means, begins),
-        starts[among[begins]],
-        ends[among[stops - 1]],
+        np.full(begins.size, MIN_NS),
+        np.full(begins.size, MIN_NS),
     )
+    chain = chains[firsts]
+    for begin, stop in zip(*_runs(found.are_still(), chain), strict=True):
+        is_inside = begin > 0 and stop < chain.size and chain[begin - 1] == chain[stop]
+        if is_inside and found.lasts[stop - 1] - found.firsts[begin] < SHORTEST_NS:
+            continue  # noise hides slow motion for as long
+        first, last = int(firsts[begin]), int(lasts[stop - 1])
+        found.starts[begin] = slots.edge(first, last, -1)
+        found.ends[stop - 1] = slots.edge(last, first, 1)
+    return found
 
 
 class _Slots:
@@ -277,7 +289,8 @@ class _Slots:
     @cached_property
     def means(self) -> Vectors:
         """The mean position of each slot."""
-        origin = self.positions[0]
+        # Mostly the same in each part, so that sums are rounded alike.
+        origin = np.rint(self.positions[0])
         sums = np.add.reduceat(self.positions - origin, self.begins)
         means: Vectors = origin + sums / self.counts[:, None]
         return means
@@ -315,31 +328,31 @@ class _Slots:
         linked: Marks = follows & (apart_m <= allowed_m)
         return linked
 
-    def begin_of(self, first: int) -> Ns:
-        """Returns when a standstill begins whose chain begins with a slot."""
-        inside, before = first + 1, first - 1
-        is_near = before >= 0 and self.firsts[first] - self.lasts[before] <= SILENCE_NS
-        begin, stop = self.begins[before if is_near else first], self.stops[inside]
-        there = self._there(inside, begin, stop)[::-1]
-        many = there.size if there.all() else int(there.argmin())
-        return int(self.times[stop - many])
+    def edge(self, at: int, other: int, step: int) -> Ns:
+        """Returns when a standstill ends (`step` 1), or begins (-1), by its still slots there.
 
-    def end_of(self, last: int) -> Ns:
-        """Returns when a standstill ends whose chain ends with a slot."""
-        inside, after = last - 1, last + 1
-        is_near = after < len(self) and self.firsts[after] - self.lasts[last] <= SILENCE_NS
-        begin, stop = self.begins[inside], self.stops[after if is_near else last]
-        there = self._there(inside, begin, stop)
-        many = there.size if there.all() else int(there.argmin())
-        return int(self.times[begin + many - 1])
-
-    def _there(self, inside: int, begin: int, stop: int) -> Marks:
-        """Returns which of some poses are at the place of a slot."""
-        own = self.positions[self.begins[inside] : self.stops[inside]]
-        farthest = float(_lengths(own - self.means[inside]).max())
-        reach = max(_NEAREST_M, 4.5 * float(self.noises[inside]), 1.5 * farthest)
-        there: Marks = _lengths(self.positions[begin:stop] - self.means[inside]) <= reach
-        return there
+        Args:
+            at: the outermost one.
+            other: that at its other end.
+            step: see above.
+        """
+        low, high = sorted((at, at - step * min(_PLACE_SLOTS - 1, abs(at - other))))
+        own = self.positions[self.begins[low] : self.stops[high]]
+        place = own.mean(axis=0)
+        bends, begins, stops = self._bends
+        [noise] = _noises(bends, begins[low : low + 1], stops[high : high + 1]).tolist()
+        reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(own - place).max()))
+        far = np.searchsorted(self.numbers, self.numbers[at] + step * _OUTWARDS, side="left")
+        low, high = sorted((at, int(far)))
+        rows = np.arange(self.begins[low], self.stops[min(high, len(self) - 1)])[::step]
+        away = _lengths(self.positions[rows] - place)
+        # None is there beyond a silence.
+        away[1:][np.abs(np.diff(self.times[rows])) > SILENCE_NS] = np.inf
+        elsewhere = np.flatnonzero(away > reach)
+        if not elsewhere.size:
+            return int(self.times[rows[-1]])
+        there = np.flatnonzero(away[: elsewhere[0]] <= reach - _CLEARLY * noise)
+        return int(self.times[rows[there[-1] if there.size else 0]])
 
 
 def _lengths(vectors: Vectors) -> Floats:
@@ -378,18 +391,15 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     still = blocks.are_still()
     moves = _creeping(blocks, chain, still) | ~still
     found: list[Standstill] = []
-    not_before, newest = MIN_NS, 0
     runs = _runs(~moves, chain)
     for begin, stop, box in zip(*runs, _boxes(blocks, *runs), strict=True):
-        if chain[begin] != newest:
-            # The ends of chains are followed into each other's slots.
-            newest, not_before = chain[begin], found[-1].end if found else MIN_NS
         start, end = int(blocks.firsts[begin]), int(blocks.lasts[stop - 1])
         if blocks.starts[begin] != MIN_NS:
             start = int(blocks.starts[begin])
         if blocks.ends[stop - 1] != MIN_NS:
             end = int(blocks.ends[stop - 1])
-        start = max(start, not_before)
+        # Ends are followed into each other's slots.
+        start = max(start, found[-1].end if found else MIN_NS)
         if end - start < SHORTEST_NS:
             continue
         if box.diagonal <= LARGEST_M:

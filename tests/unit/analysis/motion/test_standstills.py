@@ -110,6 +110,18 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     assert len(long) <= len(found) <= len(possible)
 
 
+@pytest.mark.parametrize("hz", [20, 50])
+@pytest.mark.parametrize(("noise", "speed"), [(0.003, 0.1), (0.01, 0.3), (0.02, 1.0)])
+def test_noise_moves_the_ends_of_a_standstill_by_less_than_a_second(
+    hz: int, noise: float, speed: float
+) -> None:
+    for phase in range(16):
+        legs = [(8.0, speed), (7.3, 0.0), (8.0, speed)]
+        made = world(legs, hz=hz, begin=100 + phase / 8, noise=noise)
+        [found] = spans(standstills_of(made.poses))
+        assert found == pytest.approx(made.standing[0], abs=0.8)
+
+
 @settings(max_examples=examples(150), deadline=None)
 @given(st.one_of(worlds(), worlds(noise=0.01)), SLICES)
 def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
