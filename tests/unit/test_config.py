@@ -82,6 +82,7 @@ class TestDefaults:
                 "max_reply_chars": 24000,
                 "tools": "all",
                 "write_tools": False,
+                "page": True,
                 "keep_questions": 0,
                 "metrics": False,
                 "traces": False,
@@ -158,6 +159,7 @@ class TestEnvironment:
             ("MEMORY_BAG_DIR", "/data/my 'bags', [1]", "recording", "bag_dir", None),
             ("MCP_TRANSPORT", "sse", "server", "transport", "sse"),
             ("MCP_TRANSPORT", "http", "server", "transport", "http"),
+            ("MCP_TRANSPORT", "streamable_http", "server", "transport", "http"),
             ("MCP_HOST", "0.0.0.0", "server", "host", "0.0.0.0"),  # noqa: S104
             ("MCP_PORT", "9300", "server", "port", 9300),
         ],
@@ -334,6 +336,7 @@ class TestPresets:
         ("preset", "storage", "recorder", "transport", "now"),
         [
             ("robot", MCAP, ROS2BAG, "sse", "wall"),
+            ("spec", MCAP, ROS2BAG, "sse", "wall"),
             ("robot_live", MCAP, ROS2BAG, "sse", "wall"),
             ("query_only", ROSBAG2, NONE, "stdio", "wall"),
             ("replay", ROSBAG2, NONE, "stdio", "latest"),
@@ -355,12 +358,17 @@ class TestPresets:
         assert shipped == {
             "robot",
             "robot_live",
+            "spec",
             "query_only",
             "replay",
             "fleet",
             "lake",
             "local",
         }
+
+    def test_spec_offers_what_the_specification_has_and_no_more(self) -> None:
+        server = load_settings((), {"MEMORY_DEPLOYMENT": "spec"}).server
+        assert (server.tools, server.page, server.write_tools) == ("spec", False, False)
 
     def test_robot_live_is_robot_that_answers_from_the_split_being_written(self) -> None:
         robot, live = (

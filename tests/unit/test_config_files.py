@@ -27,6 +27,19 @@ class TestConfigFolder:
     def test_is_the_checkouts_without_a_variable(self) -> None:
         assert config_dir({}) == ROOT / "config"
 
+    def test_files_in_the_working_directory_win_over_those_that_are_shipped(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        own = tmp_path / "config"
+        own.mkdir()
+        (own / "topics.yaml").write_text("topics: [/odom]\n")
+        monkeypatch.chdir(tmp_path)
+        settings = load_settings((), {})
+        assert settings.recording.topics_file == own / "topics.yaml"
+        assert settings.reader.schemas_file == ROOT / "config" / "message_schemas.yaml"
+        chosen = load_settings((), {"MEMORY_CONFIG_DIR": str(ROOT / "config")})
+        assert chosen.recording.topics_file == ROOT / "config" / "topics.yaml"
+
     def test_may_be_relative(self, own_config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(own_config.parent)
         edit(own_config / "config.yaml", "name: episodic", "name: mine")
