@@ -13,7 +13,6 @@ import yaml
 
 from ros2_memory.bootstrap import build_memory, instantiated, reading_of
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
-from ros2_memory.config import RayNode
 from ros2_memory.core.errors import BagError, ConfigError
 
 if TYPE_CHECKING:
@@ -88,7 +87,7 @@ def _secrets_of(path: Path) -> dict[str, str]:
     return {str(name): str(value) for name, value in found.items()}
 
 
-def open_lake(settings: Settings, node: DuckdbNode | RayNode) -> Lake:
+def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     """Returns the lake with an engine of the settings, open until this process ends.
 
     Raises:
@@ -108,19 +107,16 @@ def open_lake(settings: Settings, node: DuckdbNode | RayNode) -> Lake:
     return Lake(catalog, engine, location.namespace, location.translated)
 
 
-def engine_of(node: DuckdbNode | RayNode) -> LakeEngine:
+def engine_of(node: DuckdbNode) -> LakeEngine:
     """Returns the engine of the settings.
 
     Raises:
         ConfigError: its extra is missing, or it cannot be built.
     """
-    option, needed, extra = (
-        ("ray", "daft", "ray") if isinstance(node, RayNode) else ("duckdb", "duckdb", "lake")
-    )
-    if find_spec(needed) is None:
+    if find_spec("duckdb") is None:
         raise ConfigError(
-            f"lake: {option} needs the optional part of this package (no {needed}): "
-            f"pip install '.[{extra}]'"
+            "lake: duckdb needs the optional part of this package (no duckdb): "
+            "pip install '.[lake]'"
         )
     from ros2_memory.lake.engines.base import LakeEngine
 

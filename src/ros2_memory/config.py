@@ -431,14 +431,6 @@ class DuckdbNode(AdapterNode):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
-class RayNode(AdapterNode):
-    """`lake=ray`: Daft on a Ray cluster."""
-
-    target: Literal["ros2_memory.lake.engines.ray_engine.RayEngine"] = Field(alias="_target_")
-    address: Annotated[Text, AfterValidator(_without_password)] | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class LakeSettings:
     """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
 
@@ -446,7 +438,7 @@ class LakeSettings:
     Secrets are in a file of their own, or where the store's own client looks for them (AWS_*).
     """
 
-    engine: Annotated[DuckdbNode | RayNode, Field(discriminator="target")] | None
+    engine: DuckdbNode | None
     warehouse: Annotated[Text, AfterValidator(_without_password)] | None
     catalog: Literal["sql", "rest"]
     uri: Annotated[Text, AfterValidator(_without_password)] | None
@@ -604,7 +596,7 @@ class Settings:
 
 _NODES: Final = {
     get_args(get_type_hints(node)["target"])[0]: node
-    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode, DuckdbNode, RayNode)
+    for node in (McapNode, Rosbag2Node, Ros2BagNode, NullRecorderNode, DuckdbNode)
 }
 """The class of an adapter's section by its `_target_`."""
 

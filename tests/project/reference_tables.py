@@ -17,7 +17,7 @@ import yaml
 from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
-from ros2_memory.config import DuckdbNode, RayNode, Ros2BagNode, Rosbag2Node, Settings
+from ros2_memory.config import DuckdbNode, Ros2BagNode, Rosbag2Node, Settings
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.tools.arguments import TIME_KINDS
@@ -44,7 +44,6 @@ LEVELS: Final = {
 }
 OPTIONS: Final[Mapping[str, tuple[str, str, type]]] = {
     "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
-    "lake/ray.yaml": ("lake", "engine", RayNode),
     "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),
     "storage/rosbag2.yaml": ("storage", "", Rosbag2Node),
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from importlib.metadata import distribution, version
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,12 +14,9 @@ from tests.project.licences import UnknownLicenceError, closure, permitted, said
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text())
 RUNTIME = [Requirement(line) for line in PROJECT["project"]["dependencies"]]
-ELSEWHERE = frozenset() if find_spec("daft") else frozenset({"ray"})
-"""Extras that no environment of development needs: a cluster's engine of hundreds of megabytes."""
 EXTRAS = {
     extra: [Requirement(line) for line in lines]
     for extra, lines in PROJECT["project"]["optional-dependencies"].items()
-    if extra not in ELSEWHERE
 }
 PERMISSIVE = frozenset(
     {
@@ -50,8 +46,6 @@ UNCHANGED = {
 READ_BY_HAND = {
     # Its LICENSE file: any licence that the Open Source Initiative approved, at one's choice.
     "apsw": "any-OSI",
-    # Its metadata says nothing; its LICENSE file is Apache-2.0.
-    "daft": "",
 }
 
 

@@ -27,7 +27,7 @@ def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
 @pytest.mark.parametrize(
     ("value", "output"),
     [
-        ({"x": 1.5, "y": 2, "z": 0.0}, "x 1.5, y 2"),
+        ({"x": 1.5, "y": 2, "z": 0.0}, "x 1.5, y 2, z 0"),
         ({"x": 1.5, "y": 2, "z": 0.4, "yaw_deg": 90.0}, "x 1.5, y 2, z 0.4, yaw_deg 90"),
         ({"x": 1.5, "y": 2, "frame_id": "map"}, "x 1.5, y 2 (map)"),
         ({"x": 0, "y": 0, "z": 0, "w": 1}, "x 0, y 0, z 0, w 1"),

@@ -164,9 +164,13 @@ def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
 
 def test_tools_of_the_specification_alone_require_a_time() -> None:
     alone = build_tools(QuerySettings(), additions=False)
-    required = {tool.name: tool.schema.get("required", []) for tool in alone}
-    for name in ("get_topic_at_time", "get_position_at", "get_velocity_at", "get_transform_at"):
-        assert "timestamp" in required[name]
+    names = {"get_topic_at_time", "get_position_at", "get_velocity_at", "get_transform_at"}
+    asked = [tool for tool in alone if tool.name in names]
+    assert len(asked) == 4
+    for tool in asked:
+        required = tool.schema["required"]
+        assert isinstance(required, list)
+        assert "timestamp" in required
 
 
 def test_additions_and_what_writes_can_be_left_out() -> None:

@@ -50,7 +50,7 @@ class LakeEngine(ABC):
     def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
         """Returns the rows of one select.
 
-        Its subset is what DuckDB and Daft both take: no `WITH` and no `UNION`; joins, `IN`,
+        Its subset is what most engines take: no `WITH` and no `UNION`; joins, `IN`,
         `GROUP BY` with count, sum, min and max, `LIMIT`, `ORDER BY`, or `DISTINCT` without it. The
         tables it names are those given; a column that a file lacks is null there, and a table may
         have no file at all. `$name` is the parameter of that name, whose text is never SQL; of a

@@ -224,6 +224,11 @@ class LakeReader(BagReader):
         return known
 
     def _read(self, bag: BagFile, here: LakeBag, topic: str) -> Sequence[Record] | Tracks:
+        own = self._index.pose_topic
+        # The track has the robot in the map. Messages of one of these topics alone place nothing.
+        if topic == own or topic in self._tf_topics:
+            rows = self._rows_of_day("poses", _POSES, "time_ns", here, own)
+            return Tracks(bag, own, rows, self._map_frame)
         if self._index.has_messages(topic):
             whole = [message(topic, row) for row in self._rows(_MESSAGES, "messages", here, topic)]
             if whole:
@@ -232,10 +237,6 @@ class LakeReader(BagReader):
             rows, packed = self._sightings(here, topic)
             empty = None if packed is None else unpacked_empty(packed)
             return detections(bag, topic, rows, empty)
-        if topic == self._index.pose_topic or topic in self._tf_topics:
-            own = self._index.pose_topic
-            rows = self._rows_of_day("poses", _POSES, "time_ns", here, own)
-            return Tracks(bag, own, rows, self._map_frame)
         if topic in self._static_topics:
             return ()
         [summary, *_] = bag.summary.of(topic)
