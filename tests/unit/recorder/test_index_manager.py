@@ -289,6 +289,16 @@ def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_
     assert _names(yard.scan_after().bags) == ["rec_0.mcap", "rec_1.mcap"]
 
 
+def test_a_missing_bag_directory_is_warned_of_once(tmp_path: Path) -> None:
+    yard = Yard(tmp_path / "bags")
+    with capture_logs() as logged:
+        yard.index.refresh()
+        yard.index.refresh()
+    warned = [each for each in logged if each["log_level"] == "warning"]
+    assert [each["event"] for each in warned] == ["bag_directory_not_read"]
+    assert "does not exist" in warned[0]["reason"]
+
+
 def test_a_bag_directory_that_is_missing_is_a_problem_until_it_appears(tmp_path: Path) -> None:
     yard = Yard(tmp_path / "bags")
     snapshot = yard.index.snapshot()
