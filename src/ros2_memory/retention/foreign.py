@@ -72,6 +72,7 @@ class ForeignBags:
         return Foreign(foreign, bag_bytes, bag_bytes + beside)
 
     def _is_own(self, folder: str, recording: frozenset[str]) -> bool:
+        """Whether a directory is the recorder's; bags of others may lie in it all the same."""
         name = self._own.name_of(folder)
         if name in recording or is_kept_apart(name):
             return True
