@@ -340,20 +340,6 @@ def claim(own: OwnRecordings) -> None:
     own.claim(custom_data)
 
 
-def supposed_own(bag_dir: Path) -> OwnRecordings:
-    """Returns a bag directory's own recordings; without a list, those that `claim` would add.
-
-    Raises:
-        OSError: the list cannot be read, or the bag directory cannot be listed.
-    """
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.storage.mcap.embedded import custom_data
-
-    own = OwnRecordings(bag_dir)
-    own.suppose(custom_data)
-    return own
-
-
 class SharedParts(NamedTuple):
     """What memories of the same settings can share, with its caches: the reader and the decoder."""
 

@@ -14,6 +14,7 @@ from mcap.writer import Writer
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
+from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_saved_moment
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
@@ -243,6 +244,14 @@ def in_moments(bag_dir: Path) -> list[str]:
         path.relative_to(bag_dir / "moments").as_posix()
         for path in sorted((bag_dir / "moments").rglob("*.mcap"))
     ]
+
+
+def made_moment(folder: Path) -> Path:
+    """Makes the folder of a saved moment, as the recorder does."""
+    folder.mkdir(parents=True)
+    request = SaveRequest(number="0" * 32, label="here", start=T0, end=T0 + S, asked=NOW)
+    write_saved_moment(folder, SavedMoment(request, pending=False))
+    return folder
 
 
 def told_of(bag_dir: Path) -> dict[str, Any]:

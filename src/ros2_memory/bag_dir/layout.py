@@ -131,6 +131,18 @@ def has_own_name(name: str) -> bool:
     return _RECORDING_NAME.fullmatch(name) is not None
 
 
+def split_name(recording: str, number: int) -> str:
+    """Returns how `ros2 bag record` names a split of a recording."""
+    return f"{recording.rpartition('/')[2]}_{number}.mcap"
+
+
+def split_number(recording: str, file: str) -> int | None:
+    """Returns the number of a file that is named as a split of a recording; None of others."""
+    digits = file.removesuffix(".mcap").rpartition("_")[2]
+    number = int(digits) if digits.isdecimal() else -1
+    return number if file == split_name(recording, number) else None
+
+
 def named_start(recording: str) -> Ns | None:
     """Returns when a recording of this program began, by its name; None for any other name."""
     named = _RECORDING_NAME.fullmatch(recording)

@@ -1,15 +1,16 @@
-"""Which recordings in a bag directory its recorder made: `.episodic/recordings.jsonl`.
+"""Which recordings and bags in a bag directory are its recorder's: `.episodic/recordings.jsonl`.
 
 Only those are ever deleted. The file has one JSON object a line:
 
     {"bag_dir_id": "5f0c..."}                                       random, of this bag directory
     {"recording": "rec_A"}                                          before its child is started
-    {"recording": "rec_A", "inode": 7, "generation": 9}             the child made the directory
-    {"recording": "old/run1", "inode": 8, "adopted": true}          `ros2-memory adopt`, or an
-                                                                    upgrade from before the list
+    {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
+    {"recording": "rec_A", "inode": 7, ..., "splits": 60, "ended": true}
+    {"recording": "old/run1", "inode": 8, "adopted": true, "bags": ["x.db3"]}   `ros2-memory adopt`
 
 The last line of a recording counts. A directory is the recorder's own while it lies under its name
-and is the very directory that was listed (see `directories.Identity`).
+and is the very directory that was listed (see `directories.Identity`). A bag in it is the
+recorder's own by its name, see `ListRow.holds`.
 
 Lines are appended and flushed, so a power cut leaves at most a part of the last line, which readers
 ignore and the next writer ends. Writers take turns by `flock`. Once most lines are of recordings
@@ -24,8 +25,9 @@ import stat
 import threading
 import time
 import uuid
+from bisect import bisect_left
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -38,15 +40,33 @@ from ros2_memory.bag_dir.durable_write import (
     is_open_file,
     write_durably,
 )
-from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Int64, JsonLog
-from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
-from ros2_memory.core.directories import Identity, identity_of
+from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog
+from ros2_memory.bag_dir.layout import (
+    CARRY_FILE,
+    CARRY_FOLDER,
+    COMPRESSED,
+    LIST_FILE,
+    MOMENTS_FOLDER,
+    bag_kind,
+    has_own_name,
+    split_name,
+    split_number,
+)
+from ros2_memory.bag_dir.moment_file import read_saved_moment
+from ros2_memory.core.directories import Identity, identity_of, known_identity
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import (
+        Callable,
+        Collection,
+        Container,
+        Iterable,
+        Iterator,
+        Mapping,
+        Sequence,
+    )
     from typing import TypeAlias
 
     CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
@@ -76,13 +96,40 @@ def _checked_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListRow:
-    """One line of the list: the id of the bag directory, or a recording."""
+    """One line of the list: the id of the bag directory, or a recording.
+
+    `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
+    and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
+    directory, sorted; None: all that lie there.
+    """
 
     bag_dir_id: Annotated[str, Field(pattern=r"^[0-9a-f]{8,64}$")] = ""
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
     inode: Int64 | None = None
     generation: Int64 | None = None
     adopted: StrictBool = False
+    bags: tuple[str, ...] | None = None
+    splits: Count | None = None
+    ended: StrictBool = False
+
+    def holds(self, file: str) -> bool:
+        """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
+        name = file.removesuffix(COMPRESSED)
+        if self.adopted and self.bags is None:
+            return True
+        bags = self.bags or ()
+        nth = bisect_left(bags, name)
+        if bags[nth : nth + 1] == (name,):
+            return True
+        number = split_number(self.recording, name)
+        return number is not None and (self.splits is None or number < self.splits)
+
+    def counted(self, files: Container[str]) -> int:
+        """Returns how many splits the recording has, where these files were seen."""
+        splits = self.splits or 0
+        while split_name(self.recording, splits) in files:
+            splits += 1
+        return splits
 
     @property
     def identity(self) -> Identity | None:
@@ -118,6 +165,7 @@ class OwnRecordings:
         self._lock = threading.RLock()
         self._list = _Content()
         self._stamp: tuple[int, ...] | None = None
+        self._unwritten: dict[str, ListRow] = {}
         self._max_lines = _SPARE_LINES
         self._reported_damaged = 0
 
@@ -142,10 +190,43 @@ class OwnRecordings:
             self._read()
             return self._list.entries.keys()
 
+    def owns_bag(self, path: Path) -> bool:
+        """Returns whether a bag file is the recorder's: see `judge`.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        with self._lock:
+            self._read()
+            folder = str(path.parent)
+            return self.judge(self.name_of(folder), known_identity(folder))(path.name)
+
+    def judge(self, folder: str, identity: Identity | None) -> Callable[[str], bool]:
+        """Returns what decides, by its name, whether a bag file in a directory is the recorder's.
+
+        Those are bags of recordings of the list, as last read, the carried messages, and what lies
+        in saved moments.
+
+        Args:
+            folder: the directory's name in the list.
+            identity: shows whether it is the one that was listed.
+        """
+        first, _, rest = folder.partition("/")
+        if folder == CARRY_FOLDER:
+            return lambda name: name == CARRY_FILE
+        if first == MOMENTS_FOLDER and rest:
+            moment = self._bag_dir / first / rest.partition("/")[0]
+            is_saved = read_saved_moment(moment) is not None
+            return lambda _: is_saved
+        row = self._list.entries.get(folder)
+        if row is None or not self.lists(folder, identity):
+            return lambda _: False
+        return row.holds
+
     def owns(self, directory: Path) -> bool:
         """Returns whether a directory is a recording of this bag directory's recorder.
 
-        One that must not be opened is left out.
+        Bags of others may lie in it all the same. One that must not be opened is left out.
 
         Raises:
             OSError: the list cannot be read.
@@ -189,27 +270,17 @@ class OwnRecordings:
         """The random id of this bag directory, which recordings carry; None before there is one."""
         return self._list.bag_dir_id or None
 
-    def suppose(self, custom_data: CustomDataOf) -> None:
-        """Assumes, where there is no list yet, the recordings that `claim` would adopt.
-
-        Raises:
-            OSError: the list cannot be read, or the bag directory cannot be listed.
-        """
-        with self._lock:
-            if not self._read():
-                self._list.add(_adopted(_find_former(self._bag_dir, custom_data)[0]))
-
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
 
     def claim(self, custom_data: CustomDataOf) -> None:
         """Brings the list up to date before anything is recorded.
 
-        Without a list it makes one, with the recordings of versions from before lists. Else it
-        drops entries of recordings that have gone, and completes those that a kill left without a
-        directory, if every file there that holds a byte carries what our child embeds, with the id
-        of this bag directory. What cannot be written is known all the same, so that space can be
-        freed on a full disk; the next recording writes it.
+        Without a list it makes one, and names what looks like recordings: nothing shows whether
+        they were restored or copied. Else it drops entries of recordings that have gone, completes
+        those that a kill left without a directory (see `_find_completed`), and counts the splits
+        of those that a kill ended. What cannot be written is known all the same, so that space can
+        be freed on a full disk; the next recording writes it.
 
         Raises:
             RecorderError: the list cannot be read, or the bag directory cannot be listed.
@@ -217,18 +288,20 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read()
-                former, left = ({}, {}) if exists else _find_former(self._bag_dir, custom_data)
+                left = [] if exists else _named_as_own(self._bag_dir)
             except OSError as error:
                 raise self._failure(error, "read") from error
-            completed = self._find_completed(custom_data)
-            self._list.add([*_adopted(former), *completed])
-            self._report_claim(former, left)
+            found = self._find_completed(custom_data)
+            self._list.add(found)
+            found += self._find_ended()
+            self._report_claim(left)
             gone = self._gone(self._list.entries)
-            if exists and self.bag_dir_id and not (completed or gone):
+            if exists and self.bag_dir_id and not (found or gone):
                 return
             try:
-                self._rewrite()
+                self._rewrite(found)
             except OSError as error:
+                self._know(found)
                 _log.error("recordings_not_listed", reason=str(self._failure(error)))
 
     def begin(self, name: str) -> None:
@@ -254,30 +327,72 @@ class OwnRecordings:
         self._add([_row_of(name, identity)])
         return True
 
+    def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
+        """Notes which splits the child of a recording has made, of the files that were seen.
+
+        Raises:
+            RecorderError: it cannot be written. It is known all the same, so that space can be
+                freed on a full disk, and is written with the next split.
+        """
+        with self._lock:
+            row = self._list.entries.get(name)
+            if row is None or row.identity is None or row.splits is None:
+                return
+            noted = replace(row, splits=row.counted(files), ended=ended)
+            try:
+                if noted == row and self._read():
+                    return
+                self._add([noted])
+            except OSError as error:
+                raise self._failure(error) from error
+            except RecorderError:
+                self._know([noted])
+                raise
+
     def adopt(self, identities: Mapping[str, Identity]) -> None:
-        """Lists directories that another program made, as the recorder's own from now on.
+        """Lists directories with the bags in them, as the recorder's own from now on.
 
         Raises:
             RecorderError: they cannot be listed.
         """
-        self._add(_adopted(dict(sorted(identities.items()))))
+        with self._lock:
+            self._add([self._adopted(*each) for each in sorted(identities.items())])
 
-    def _report_claim(self, former: Collection[str], left: Mapping[str, str]) -> None:
-        if former:
-            names = sorted(former)[:_MAX_NAMED]
-            _log.info("recordings_adopted", recordings=len(former), names=names)
+    def _adopted(self, name: str, identity: Identity) -> ListRow:
+        """Returns the line of a directory that is adopted, one of the list or another."""
+        row = self._list.entries.get(name)
+        if row is None or not self.lists(name, identity):
+            row = ListRow("", name, identity.inode, identity.generation)
+        with suppress(OSError):
+            names = {path.name for path in _bags_in(self._bag_dir / name)}
+            others = {each.removesuffix(COMPRESSED) for each in names if not row.holds(each)}
+            return replace(row, adopted=True, bags=(*sorted({*others, *(row.bags or ())}),))
+        return row
+
+    def _know(self, rows: Iterable[ListRow]) -> None:
+        """Counts rows as listed that cannot be written; the next one that is written takes them."""
+        self._unwritten.update({row.recording: row for row in rows})
+        self._list.add(self._unwritten.values())
+
+    def _report_claim(self, left: Sequence[str]) -> None:
         if left:
-            reasons = [f"{name}: {left[name]}" for name in sorted(left)[:_MAX_NAMED]]
+            names = left[:_MAX_NAMED]
             _log.warning(
-                "recordings_not_adopted", recordings=len(left), reasons=reasons, advice=_ADVICE
+                "recordings_not_adopted", recordings=len(left), names=names, advice=_ADVICE
             )
         for name, entry in self._list.entries.items():
             if entry.identity is None and (self._bag_dir / name).is_dir():
                 _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
 
     def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
-        """Returns the entries without a directory whose directory our child made after all."""
+        """Returns the entries without a directory whose directory our child made after all.
+
+        Every file there that holds a byte carries what our child embeds, with the id of this bag
+        directory; or, as with distributions that embed nothing, no file carries anything, and the
+        heartbeat names the recording.
+        """
         ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
+        named = read_heartbeat(self._bag_dir).recordings
         found: list[ListRow] = []
         for name, entry in self._list.entries.items():
             if entry.identity is not None:
@@ -286,10 +401,21 @@ class OwnRecordings:
                 identity = identity_of(self._bag_dir / name)
                 if identity is None:
                     continue
-                files = _files_with_data(self._bag_dir / name)
+                files = [path for path in _bags_in(self._bag_dir / name) if path.stat().st_size]
                 embedded = [custom_data(path) or {} for path in files]
-                if embedded and all(ours.items() <= data.items() for data in embedded):
+                is_ours = all(ours.items() <= data.items() for data in embedded)
+                if embedded and (is_ours or (name in named and not any(embedded))):
                     found.append(_row_of(name, identity))
+        return found
+
+    def _find_ended(self) -> list[ListRow]:
+        """Returns the recordings that a kill ended, with the splits that they have."""
+        found: list[ListRow] = []
+        for name, row in self._list.entries.items():
+            if row.identity is not None and row.splits is not None and not row.ended:
+                with suppress(OSError):
+                    files = {path.name for path in _bags_in(self._bag_dir / name)}
+                    found.append(replace(row, splits=row.counted(files), ended=True))
         return found
 
     def _gone(self, names: Iterable[str]) -> list[str]:
@@ -322,6 +448,7 @@ class OwnRecordings:
         rows = [line.row or ListRow() for line in lines]
         content = _Content(lines=len(lines))
         content.add(row for row in rows if row.recording and not row.bag_dir_id)
+        content.add(self._unwritten.values())
         content.bag_dir_id = next((each.bag_dir_id for each in rows[::-1] if each.bag_dir_id), "")
         self._list, self._stamp = content, stamp
         damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
@@ -332,17 +459,20 @@ class OwnRecordings:
 
     def _add(self, rows: Sequence[ListRow]) -> None:
         """Appends entries, or writes the whole list where there is none or most of it is gone."""
+        rows = [*self._unwritten.values(), *rows]
         try:
             with self._lock:
                 exists = self._read()
                 if not exists or self._list.lines > self._max_lines or self.bag_dir_id is None:
                     self._rewrite(rows)
+                    self._unwritten.clear()
                     return
                 with self._locked() as descriptor:
                     if descriptor is None:
                         raise FileNotFoundError("the list of recordings is missing")
                     append_lines(descriptor, LIST.text(rows))
                 self._list.add(rows)
+                self._unwritten.clear()
         except OSError as error:
             raise self._failure(error) from error
 
@@ -414,7 +544,11 @@ _NOT_CLAIMED: Final = (
     "its recorder was killed before it listed the directory that it made, and the files there do "
     "not contain the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
 )
-_ADVICE: Final = "they are kept until `ros2-memory adopt` takes them"
+_ADVICE: Final = (
+    "nothing lists them as made here: after an upgrade from a version without recordings.jsonl, a "
+    "restore or a copy, `ros2-memory adopt DIR` lets the recorder delete them; until then they are "
+    "kept, and no limit counts them"
+)
 
 
 def folders_with_bags(folder: Path) -> Iterator[Path]:
@@ -445,89 +579,27 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def _find_former(
-    bag_dir: Path, custom_data: CustomDataOf
-) -> tuple[dict[str, Identity], dict[str, str]]:
-    """Finds the recordings that a version from before the list made here, to be adopted once.
-
-    They lie in the bag directory itself, under a name that this program gives, and either
-    `recorder.json` or a `handover.json` names them, or every file of them that holds a byte carries
-    what our child embedded. A file that carries an id is of a version with the list: it was
-    restored or copied, or the list has gone. A file that cannot be read so far may carry one.
-
-    Returns:
-        The identities of those directories by name, and why others of such a name are not adopted.
+def _named_as_own(bag_dir: Path) -> list[str]:
+    """Returns the directories that are named like recordings of this program.
 
     Raises:
         OSError: the bag directory cannot be listed.
     """
-    folders = [
-        each
-        for each in sorted(bag_dir.iterdir())
-        if has_own_name(each.name) and not each.is_symlink() and each.is_dir()
-    ]
-    named = set(read_heartbeat(bag_dir).recordings)
-    for folder in folders:
-        handover = read_handover(folder).handover
-        named.update(name for name in (handover.previous, handover.next) if name)
-    found: dict[str, Identity] = {}
-    left: dict[str, str] = {}
-    for folder in folders:
-        try:
-            identity = identity_of(folder)
-            reason = _why_not_former(folder, custom_data, is_named=folder.name in named)
-        except OSError as error:
-            identity, reason = None, f"it cannot be read: {error.strerror or error}"
-        if reason is not None:
-            left[folder.name] = reason
-        elif identity is not None:
-            found[folder.name] = identity
-    return found, left
+    names = [each.name for each in bag_dir.iterdir() if each.is_dir() and not each.is_symlink()]
+    return sorted(filter(has_own_name, names))
 
 
-def _why_not_former(folder: Path, custom_data: CustomDataOf, *, is_named: bool) -> str | None:
-    """Returns why a directory is not of a version from before the list; None where it is.
+def _bags_in(folder: Path) -> list[Path]:
+    """Returns the bag files in a directory.
 
     Raises:
-        OSError: it cannot be listed, or a file cannot be read.
+        OSError: it cannot be listed.
     """
-    is_proven = is_named
-    for path in _files_with_data(folder):
-        embedded = custom_data(path)
-        if embedded is None:
-            return (
-                f"{path.name} cannot be read far enough to show which bag directory it belongs to"
-            )
-        if BAG_DIR_ID in embedded:
-            return f"{path.name} contains the id of a bag directory whose list is not here"
-        if embedded and dict(embedded) != {RECORDED_BY: PROGRAM}:
-            return f"{path.name} contains data that another program embedded"
-        if not (embedded or is_named):
-            return (
-                f"{path.name} does not carry {RECORDED_BY}={PROGRAM}, and no recorder.json or "
-                "handover.json names the recording"
-            )
-        is_proven = True
-    return None if is_proven else "all of its files are empty"
+    return sorted(path for path in folder.iterdir() if bag_kind(path.name))
 
 
-def _files_with_data(folder: Path) -> Iterator[Path]:
-    """Yields the bag files in a directory that hold a byte.
-
-    Raises:
-        OSError: the directory cannot be listed, or a file cannot be looked up.
-    """
-    for path in sorted(folder.iterdir()):
-        if bag_kind(path.name) and (path.is_symlink() or path.stat().st_size):
-            yield path
-
-
-def _row_of(name: str, identity: Identity, *, adopted: bool = False) -> ListRow:
-    return ListRow("", name, identity.inode, identity.generation, adopted)
-
-
-def _adopted(identities: Mapping[str, Identity]) -> list[ListRow]:
-    return [_row_of(name, identity, adopted=True) for name, identity in identities.items()]
+def _row_of(name: str, identity: Identity) -> ListRow:
+    return ListRow("", name, identity.inode, identity.generation, splits=0)
 
 
 def _give_to_owner(path: Path, bag_dir: Path) -> None:

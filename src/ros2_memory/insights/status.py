@@ -228,7 +228,7 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     if kept is None:
         return Budget(used, None, None, None)
     foreign = memory.foreign(snapshot)
-    folders = frozenset[str]() if foreign is None else foreign.folders
+    foreign_files = frozenset[str]() if foreign is None else foreign.files
     foreign_bytes = None if foreign is None else foreign.total_bytes
     used -= 0 if foreign is None else foreign.bag_bytes
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
@@ -239,7 +239,7 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
         for bag in reversed(snapshot.bags):
             if bag.end < latest - _GROWTH_NS:
                 break
-            if str(bag.recording) in folders:
+            if bag.file in foreign_files:
                 continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)

@@ -363,12 +363,16 @@ class Housekeeping(Housekeeper):
                 for name in filter(left_by_repair, names):
                     os.unlink(name, dir_fd=opened)
             for name in names:
-                if name.endswith(_MCAP) and not left_by_repair(name):
-                    self._repair(directory / name)
+                path = directory / name
+                if name.endswith(_MCAP) and not left_by_repair(name) and self._is_own(path):
+                    self._repair(path)
             # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
+
+    def _is_own(self, path: Path) -> bool:
+        return not self._keeps_foreign or self._own.owns_bag(path)
 
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
         """Repairs files that the index found unfinished and nothing writes; returns how many."""
@@ -404,7 +408,7 @@ class Housekeeping(Housekeeper):
         if self._links.is_saved(str(path)):
             return False
         if self._keeps_foreign:
-            return self._own.owns(path.parent)
+            return self._own.owns_bag(path)
         unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)
 

@@ -304,11 +304,13 @@ class RecordingSessions:
         return session
 
     def _list_own(self, session: RecordingSession) -> None:
-        """Lists the directory that the child made, as soon as it exists; a fault is retried."""
-        if session.is_listed:
-            return
+        """Lists the directory that the child made, and its splits; a fault is retried."""
         try:
-            session.is_listed = self._own.complete(session.name)
+            session.is_listed = session.is_listed or self._own.complete(session.name)
+            # Else another disk may lie there.
+            if session.is_listed and session.splits.exists:
+                has_ended = session.state is SessionState.ENDED
+                self._own.note(session.name, session.splits.seen, ended=has_ended)
         except RecorderError as error:
             self._events.fail_once("recording_not_listed", session.name, str(error))
         else:

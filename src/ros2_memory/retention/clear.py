@@ -23,7 +23,6 @@ from ros2_memory.bag_dir.layout import (
     OWN_FILES,
     RECORDING_FILES,
     bag_kind,
-    is_kept_apart,
 )
 from ros2_memory.core import directories
 from ros2_memory.core.directories import identity_at
@@ -31,6 +30,8 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterable
+
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -94,9 +95,7 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
             continue
         except OSError as error:
             cleared.add_fault(f"{path} cannot be deleted: {error.strerror}")
-    for path in reversed(emptied):
-        with suppress(OSError), directories.opened(root, path.parent) as above:
-            os.rmdir(path.name, dir_fd=above)
+    _remove_emptied(root, reversed(emptied), cleared)
     return cleared
 
 
@@ -149,32 +148,66 @@ def _clear_folder(
     in_moments = parts[:1] == (MOMENTS_FOLDER,) and len(parts) <= 2
     has_bags = in_moments or any(_is_bag(entry) for entry in entries)
     name = "/".join(parts)
-    is_own = own is None or is_kept_apart(name) or own.lists(name, identity_at(folder))
-    names = RECORDING_FILES if has_bags and is_own else frozenset()
+    holds = _any if own is None else own.judge(name, identity_at(folder))
+    bags = [entry for entry in entries if _is_bag(entry)]
+    going = [entry for entry in bags if holds(_bag_name(entry.name))]
+    names = RECORDING_FILES if bags and going == bags else frozenset()
     if not parts:
         names |= OWN_FILES
-    elif in_moments and len(parts) == 2:
-        names |= {MOMENT_FILE}
-    for entry in entries:
-        known = entry.name in names and entry.is_file(follow_symlinks=False)
-        if not known and not (is_own and _is_bag(entry)):
-            continue
-        try:
-            size = entry.stat(follow_symlinks=False).st_size
-            os.unlink(entry.name, dir_fd=folder)
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            cleared.add_fault(f"{path / entry.name} cannot be deleted: {error.strerror}")
-        else:
-            cleared.files += 1
-            cleared.bytes += size
+    for entry in going + [each for each in entries if _is_file_of(each, names)]:
+        _delete(folder, path, entry, cleared)
     below = [
         entry.name
         for entry in entries
         if not entry.name.startswith(".") and entry.is_dir(follow_symlinks=False)
     ]
     return has_bags, below
+
+
+def _is_file_of(entry: os.DirEntry[str], names: Collection[str]) -> bool:
+    return entry.name in names and entry.is_file(follow_symlinks=False)
+
+
+def _remove_emptied(root: Path, emptied: Iterable[Path], cleared: Cleared) -> None:
+    """Deletes directories that are empty, the deepest first."""
+    for path in emptied:
+        if path.parent == root / MOMENTS_FOLDER:
+            _clear_moment(root, path, cleared)
+        with suppress(OSError), directories.opened(root, path.parent) as above:
+            os.rmdir(path.name, dir_fd=above)
+
+
+def _clear_moment(root: Path, path: Path, cleared: Cleared) -> None:
+    """Deletes the file of a saved moment of which no bag is left."""
+    with suppress(OSError), directories.opened(root, path) as folder:
+        with os.scandir(folder) as listing:
+            entries = {entry.name: entry for entry in listing}
+        is_left = any(_is_bag(each) or each.is_dir() for each in entries.values())
+        if MOMENT_FILE in entries and not is_left:
+            _delete(folder, path, entries[MOMENT_FILE], cleared)
+
+
+def _delete(folder: int, path: Path, entry: os.DirEntry[str], cleared: Cleared) -> None:
+    """Deletes a file in an open directory, which has this path."""
+    try:
+        size = entry.stat(follow_symlinks=False).st_size
+        os.unlink(entry.name, dir_fd=folder)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        cleared.add_fault(f"{path / entry.name} cannot be deleted: {error.strerror}")
+    else:
+        cleared.files += 1
+        cleared.bytes += size
+
+
+def _any(_: str) -> bool:
+    return True
+
+
+def _bag_name(name: str) -> str:
+    """Returns the name of a bag; of a journal, that of its bag."""
+    return name.rpartition("-")[0] if is_journal(name) else name
 
 
 def _is_worthless(entry: os.DirEntry[str]) -> bool:

@@ -270,10 +270,7 @@ class Eraser:
         return reason
 
     def _may_change(self, path: Path) -> bool:
-        if self._own is None:
-            return True
-        name = self._own.name_of(path.parent)
-        return is_kept_apart(name) or self._own.owns(path.parent)
+        return self._own is None or self._own.owns_bag(path)
 
     def _holder(
         self, erasure: Erasure, topics: Sequence[str], paths: Sequence[Path], inode: Identity

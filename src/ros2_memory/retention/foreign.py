@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from ros2_memory.bag_dir.layout import is_kept_apart
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import known_identity
 from ros2_memory.retention.delete import size_of
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Callable, Collection
     from pathlib import Path
 
     from ros2_memory.index.snapshot import Snapshot
@@ -19,11 +19,10 @@ if TYPE_CHECKING:
 class Foreign(NamedTuple):
     """The bags that the recorder did not make, which retention neither counts nor deletes.
 
-    `folders` are the directories that they lie in. `bag_bytes` is the size of those that answer
-    queries, `total_bytes` that of all.
+    `files` are those that answer queries and `bag_bytes` their size; `total_bytes` is that of all.
     """
 
-    folders: frozenset[str]
+    files: frozenset[str]
     bag_bytes: int
     total_bytes: int
 
@@ -56,23 +55,29 @@ class ForeignBags:
         return known[1]
 
     def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
-        sizes: dict[str, int] = {}
-        for run in snapshot.timeline.segments:
-            for folder, tally in run.tallies.items():
-                sizes[folder] = sizes.get(folder, 0) + tally.size
-        asides = [
-            aside
-            for aside in (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-            if not aside.answers
-        ]
-        folders = {str(aside.path.parent) for aside in asides} | sizes.keys()
-        foreign = frozenset(each for each in folders if not self._is_own(each, recording))
-        bag_bytes = sum(size for folder, size in sizes.items() if folder in foreign)
-        beside = sum(size_of(each.path) for each in asides if str(each.path.parent) in foreign)
-        return Foreign(foreign, bag_bytes, bag_bytes + beside)
+        judges: dict[str, Callable[[str], bool]] = {}
 
-    def _is_own(self, folder: str, recording: frozenset[str]) -> bool:
-        name = self._own.name_of(folder)
-        if name in recording or is_kept_apart(name):
-            return True
-        return self._own.lists(name, known_identity(folder))
+        def is_foreign(file: str) -> bool:
+            folder, _, name = file.rpartition("/")
+            if folder not in judges:
+                judges[folder] = self._judge(folder, recording)
+            return not judges[folder](name)
+
+        segments = snapshot.timeline.segments
+        bags = {
+            bag.file: bag.size for each in segments for bag in each.bags if is_foreign(bag.file)
+        }
+        asides = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
+        beside = [each for each in asides if not each.answers and is_foreign(str(each.path))]
+        bag_bytes = sum(bags.values())
+        return Foreign(
+            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(each.path) for each in beside)
+        )
+
+    def _judge(self, folder: str, recording: frozenset[str]) -> Callable[[str], bool]:
+        """Returns what decides by its name whether a bag in a directory counts in the budget."""
+        name, identity = self._own.name_of(folder), known_identity(folder)
+        is_new = name in recording and not self._own.lists(name, identity)
+        if is_new or name.partition("/")[0] == MOMENTS_FOLDER:
+            return lambda _: True
+        return self._own.judge(name, identity)

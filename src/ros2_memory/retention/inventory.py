@@ -25,6 +25,7 @@ from ros2_memory.bag_dir.layout import (
     has_own_name,
     is_carried,
     other_form,
+    split_number,
 )
 from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -34,7 +35,7 @@ from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import TopicSummary
@@ -131,21 +132,22 @@ class Inventory:
         bags: list[StoredBag] = []
         others = state_bytes = self._own_bytes()
         occupied: set[str] = set()
+        mixed: set[str] = set()
         foreign: dict[tuple[int, int], int] = {}
         named = {str(self._root / name) for name in known.named}
-        owned: dict[str, bool] = {}
         if self._own is not None:
             self._own.names()
+        owned: dict[str, Callable[[str], bool]] = {}
         for deletable, bag in chain(self._changing(known), self._settled(known)):
             path = bag.path
             if path in deleted:
                 continue
-            own = owned.get(bag.recording)
-            if own is None:
-                own = owned[bag.recording] = self._is_own(bag.recording)
-            # A recording is listed as own some moments after its directory appears.
-            ours = own or bag.recording in named or is_carried(path)
-            if not ours and deletable is not Deletable.SAVED:
+            holds = owned.get(bag.recording)
+            if holds is None:
+                holds = owned[bag.recording] = self._judge(bag.recording)
+            own = holds(path[len(bag.recording) + 1 :])
+            if not (own or deletable is Deletable.SAVED or self._is_new(bag, named)):
+                mixed.add(bag.recording)
                 foreign.update((each.inode, each.size) for each in bag.files)
                 continue
             unnamed = deletable is Deletable.IF_UNNAMED and bag.recording not in named
@@ -156,6 +158,7 @@ class Inventory:
                 if self._counts(deletable, bag):
                     others += sum(file.size for file in bag.files)
         self._forget(known)
+        occupied |= mixed & {bag.recording for bag in bags}
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
         sidecars = {each: self._folder(each, known.now).size for each in emptied}
         occupied.update(bag.recording for bag in bags)
@@ -197,9 +200,18 @@ class Inventory:
                 rows[bag.file] = stored
             yield (Deletable.NO if bag.file.endswith(CARRY_FILE) else Deletable.YES), stored
 
-    def _is_own(self, recording: str) -> bool:
+    def _judge(self, recording: str) -> Callable[[str], bool]:
+        """Returns what decides by its name whether a bag in a directory may be deleted."""
         own = self._own
-        return own is None or own.lists(own.name_of(recording), known_identity(recording))
+        if own is None:
+            return lambda _: True
+        return own.judge(own.name_of(recording), known_identity(recording))
+
+    def _is_new(self, bag: StoredBag, named: Collection[str]) -> bool:
+        """Whether a bag that is not listed as own counts: it is listed moments after it appears."""
+        name = bag.path[len(bag.recording) + 1 :]
+        is_split = split_number(bag.recording, name) is not None
+        return is_carried(bag.path) or (is_split and bag.recording in named)
 
     def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""

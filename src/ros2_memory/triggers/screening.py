@@ -23,7 +23,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
-from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE, bag_kind, named_start
+from ros2_memory.bag_dir.layout import (
+    METADATA_FILE,
+    SCREENED_FILE,
+    bag_kind,
+    named_start,
+    split_number,
+)
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import (
     SCREENED,
@@ -418,6 +424,8 @@ class Screening:
             for each in self._reader.records(path, sorted(topics), TimeWindow.everything())
             if cut.takes(each.channel.topic, each.log_time, each.publish_time)
         )
+        if gone and split_number(ready.recording, path.name) is None:
+            raise BagError(str(path), "it is not named as a split of its recording")
         if gone:
             with path.open("rb") as old:
                 left = left_in(path.parent, self._reader, {path: gone})

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir import own_recordings
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
@@ -23,7 +25,7 @@ from ros2_memory.storage.mcap.embedded import custom_data
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples
-from tests.support.housekeepers import OURS, embedding, lines, own_all
+from tests.support.housekeepers import OURS, embedding, lines, made_moment, own_all
 from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:
@@ -318,7 +320,10 @@ class TestWhatAKillLeaves:
     def test_a_list_that_cannot_be_written_is_known_all_the_same(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
+        own = claimed(tmp_path)
+        own.begin(A)
+        assert own.bag_dir_id is not None
+        embedding(tmp_path / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": own.bag_dir_id})
         own = OwnRecordings(tmp_path)
 
         def full(*_: object) -> None:
@@ -329,10 +334,12 @@ class TestWhatAKillLeaves:
             own.claim(custom_data)
             assert events_named(logs, "recordings_not_listed")
             assert own.owns(tmp_path / A)
+            patch.setattr(own_recordings, "append_lines", full)
             with pytest.raises(RecorderError, match="No space left"):
                 own.begin(B)
         own.begin(B)
-        assert [each.get("recording") for each in lines(tmp_path)] == [None, A, B]
+        assert [each.get("recording") for each in lines(tmp_path)] == [None, A, A, B]
+        assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
 
 class TestCopies:
@@ -379,204 +386,172 @@ class TestCopies:
         assert custom_data(path) == OURS
 
 
-class TestVersionsBeforeTheList:
-    """Adopted once: by name, and by who names them or by what every file carries."""
+class TestWithoutAList:
+    """Whether bags are from before the list, restored or copied: nothing shows it."""
 
     def beat(self, bag_dir: Path, *names: str) -> None:
-        (bag_dir / "recorder.json").write_text(
-            json.dumps(
-                {
-                    "pid": 7,
-                    "updated": 1,
-                    "state": "stopped",
-                    "recordings": names,
-                    "since": 1,
-                    "bytes_written": 0,
-                    "subscribed": [],
-                    "silent": [],
-                    "last_error": None,
-                    "interval_s": 2.0,
-                }
-            )
-        )
+        beat = Heartbeat(7, 1, RecorderState.STOPPED, names, 1, 0, (), (), None, 2.0)
+        write_heartbeat(bag_dir, beat)
 
     def hand_over(self, bag_dir: Path, name: str, following: str) -> None:
-        (bag_dir / name / "handover.json").write_text(
-            json.dumps(
-                {"format": 1, "state": "counts", "clock": "publish", "next": following, "notes": []}
-            )
-        )
+        write_handover(bag_dir / name, Handover(next=following, counts_until=1))
+        write_handover(bag_dir / following, Handover(previous=name, counts_from=1))
 
-    def test_one_whose_every_file_carries_what_our_child_embeds(self, tmp_path: Path) -> None:
-        for number in range(3):
-            embedding(tmp_path / A / f"{A}_{number}.mcap", OURS)
-        (tmp_path / A / f"{A}_3.mcap").touch()
-        with structlog.testing.capture_logs() as logs:
-            assert claimed(tmp_path).owns(tmp_path / A)
-        [event] = events_named(logs, "recordings_adopted")
-        assert (event["recordings"], event["names"]) == (1, [A])
-        assert lines(tmp_path)[1]["adopted"] is True
-
-    def test_one_that_was_cut_short(self, tmp_path: Path) -> None:
-        path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        path.write_bytes(path.read_bytes()[:-300])
-        assert claimed(tmp_path).owns(tmp_path / A)
-
-    def test_one_that_the_heartbeat_names(self, tmp_path: Path) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", None)
-        self.beat(tmp_path, A, "session_mcap")
-        embedding(tmp_path / "session_mcap" / "s_0.mcap", None)
-        own = claimed(tmp_path)
-        assert own.owns(tmp_path / A)
-        assert not own.owns(tmp_path / "session_mcap")
-
-    def test_one_that_a_handover_names(self, tmp_path: Path) -> None:
-        for name in (A, B, C):
-            embedding(tmp_path / name / f"{name}_0.mcap", None)
-        self.hand_over(tmp_path, A, B)
-        own = claimed(tmp_path)
-        assert [own.owns(tmp_path / name) for name in (A, B, C)] == [False, True, False]
-
-    @pytest.mark.parametrize("embedded", [None, {}, {"recorded_by": "someone"}])
-    def test_one_of_which_a_single_file_is_anothers_is_foreign(
+    # Adopted at the start until 0.1: a folder that was restored without its list holds the same
+    # handover.json, recorder.json and custom data, and the budget deleted all of it.
+    @pytest.mark.parametrize("embedded", [None, {}, OURS, {**OURS, "bag_dir_id": "1" * 32}])
+    def test_recordings_are_foreign_and_the_start_says_so(
         self, tmp_path: Path, embedded: Mapping[str, str] | None
-    ) -> None:
-        for number in range(3):
-            embedding(tmp_path / A / f"{A}_{number}.mcap", OURS if number else embedded)
-        assert not claimed(tmp_path).owns(tmp_path / A)
-
-    def test_one_of_another_name_or_place_is_foreign(self, tmp_path: Path) -> None:
-        for folder in ("session_mcap", f"old/{A}"):
-            embedding(tmp_path / folder / "s_0.mcap", OURS)
-        (tmp_path / "elsewhere").mkdir()
-        (tmp_path / "bags").mkdir()
-        embedding(tmp_path / "elsewhere" / "s_0.mcap", OURS)
-        (tmp_path / B).symlink_to(tmp_path / "elsewhere")
-        assert not claimed(tmp_path).names()
-
-    def test_one_of_a_version_with_the_list_was_copied_here(self, tmp_path: Path) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": "1" * 32})
-        embedding(tmp_path / B / f"{B}_0.mcap", {**OURS, "bag_dir_id": "1" * 32})
-        self.hand_over(tmp_path, A, B)
-        assert not claimed(tmp_path).names()
-
-    @pytest.mark.parametrize("named_by", ["heartbeat", "handover"])
-    @pytest.mark.parametrize("damaged", [0, 1])
-    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
-    def test_a_copy_of_which_one_file_cannot_be_read_is_foreign(
-        self, tmp_path: Path, fault: str, damaged: int, named_by: str
-    ) -> None:
-        for number in range(3):
-            embedding(tmp_path / B / f"{B}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32})
-        if named_by == "heartbeat":
-            self.beat(tmp_path, B)
-        else:
-            (tmp_path / A).mkdir()
-            self.hand_over(tmp_path, A, B)
-        spoil(tmp_path / B / f"{B}_{damaged}.mcap", fault)
-        assert not claimed(tmp_path).owns(tmp_path / B)
-
-    @pytest.mark.parametrize("fault", ["cut", "zeroed", "flipped", "db3", "link", "compressed"])
-    @pytest.mark.parametrize("embedded", [None, OURS])
-    def test_one_that_is_named_and_cannot_be_read_is_foreign_and_told(
-        self, tmp_path: Path, fault: str, embedded: Mapping[str, str] | None
     ) -> None:
         for name in (A, B):
             embedding(tmp_path / name / f"{name}_0.mcap", embedded)
-            embedding(tmp_path / name / f"{name}_1.mcap", embedded)
-        self.beat(tmp_path, A, B)
-        spoil(tmp_path / A / f"{A}_1.mcap", fault)
+        embedding(tmp_path / "session_mcap" / "s_0.mcap", embedded)
+        self.beat(tmp_path, A)
+        self.hand_over(tmp_path, A, B)
         with structlog.testing.capture_logs() as logs:
             own = claimed(tmp_path)
-        assert [*own.names()] == [B]
+        assert not own.names()
         [event] = events_named(logs, "recordings_not_adopted")
-        assert (event["recordings"], event["log_level"]) == (1, "warning")
-        [reason] = event["reasons"]
-        assert reason.startswith(f"{A}: {A}_1.")
-        assert "cannot be read far enough" in reason
+        assert (event["log_level"], event["recordings"], event["names"]) == ("warning", 2, [A, B])
         assert "ros2-memory adopt" in event["advice"]
 
-    @pytest.mark.parametrize("embedded", [None, OURS])
-    def test_one_that_ends_in_a_torn_split_is_adopted_as_far_as_it_can_be_read(
-        self, tmp_path: Path, embedded: Mapping[str, str] | None
-    ) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", embedded)
-        torn = embedding(tmp_path / A / f"{A}_1.mcap", embedded)
-        (tmp_path / A / f"{A}_2.mcap").touch()
-        self.beat(tmp_path, A)
-        begins = torn.read_bytes().index(b"/chatter") - 100  # within the first chunk
-        torn.write_bytes(torn.read_bytes()[: begins + 150])
-        assert claimed(tmp_path).owns(tmp_path / A)
-
-    def test_a_named_one_that_carries_another_programs_name_is_foreign(
-        self, tmp_path: Path
-    ) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "someone"})
-        self.beat(tmp_path, A)
-        assert not claimed(tmp_path).owns(tmp_path / A)
-
-    @settings(max_examples=examples(60), deadline=None)
-    @given(
-        faults=st.lists(
-            st.tuples(
-                st.integers(0, 3), st.sampled_from(["cut", "zeroed", "db3", "gone", "empty"])
-            ),
-            max_size=4,
-            unique_by=lambda fault: fault[0],
-        )
-    )
-    def test_no_copy_that_carries_an_id_is_adopted_whatever_was_damaged(
-        self, tmp_path_factory: pytest.TempPathFactory, faults: list[tuple[int, str]]
-    ) -> None:
-        bag_dir = tmp_path_factory.mktemp("bags")
-        for number in range(4):
-            embedding(bag_dir / A / f"{A}_{number}.mcap", {**OURS, "bag_dir_id": "1" * 32}, size=2)
-        self.beat(bag_dir, A)
-        for number, fault in faults:
-            spoil(bag_dir / A / f"{A}_{number}.mcap", fault)
-        if any(path.stat().st_size for path in (bag_dir / A).iterdir()):
-            assert not claimed(bag_dir).owns(bag_dir / A)
-
-    @settings(max_examples=examples(300), deadline=None)
-    @given(at=st.integers(0, 10_000), bit=st.integers(0, 7))
-    def test_no_copy_of_a_single_file_is_adopted_whichever_bit_is_wrong(
-        self, tmp_path_factory: pytest.TempPathFactory, at: int, bit: int
-    ) -> None:
-        bag_dir = tmp_path_factory.mktemp("bags")
-        path = bag_dir / A / f"{A}_0.mcap"
-        embedding(path, {**OURS, "bag_dir_id": "1" * 32}, size=2)
-        self.beat(bag_dir, A)
-        data = bytearray(path.read_bytes())
-        data[at % (data.index(b"jazzy") + 5)] ^= 1 << bit
-        path.write_bytes(data)
-        assert not claimed(bag_dir).owns(bag_dir / A)
-
-    def test_it_happens_once(self, tmp_path: Path) -> None:
+    def test_adopted_ones_are_the_recorders(self, tmp_path: Path) -> None:
+        path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
         claimed(tmp_path)
-        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        assert not claimed(tmp_path).owns(tmp_path / A)
+        own_all(tmp_path)
+        own = claimed(tmp_path)
+        assert own.owns(tmp_path / A)
+        assert own.owns_bag(path)
 
-    def test_a_recording_that_cannot_be_looked_into_stops_nothing(self, tmp_path: Path) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        embedding(tmp_path / B / f"{B}_0.mcap", OURS)
+    def test_nothing_is_said_of_an_empty_folder(self, tmp_path: Path) -> None:
+        with structlog.testing.capture_logs() as logs:
+            claimed(tmp_path)
+        assert not events_named(logs, "recordings_not_adopted")
 
-        def failing(path: Path) -> dict[str, str] | None:
-            if path.parent.name == A:
-                raise OSError(5, "Input/output error")
-            return custom_data(path)
+    def test_what_is_being_recorded_stays_the_recorders(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(15)
+        (tmp_path / LIST_FILE).unlink()
+        world.run(0.5)
+        recording = world.recorders[0].directory
+        bags = [*recording.glob("*.mcap")]
+        own = claimed(tmp_path)
+        assert bags
+        assert all(map(own.owns_bag, bags))
+        world.supervisor.stop()
 
+
+class TestBags:
+    """Which files in a recording are the recorder's."""
+
+    def made(self, bag_dir: Path, name: str, splits: int) -> OwnRecordings:
+        """The list after a recording that was ended as it should."""
+        own = claimed(bag_dir)
+        own.begin(name)
+        files = [embedding(bag_dir / name / f"{name}_{n}.mcap", None) for n in range(splits)]
+        own.complete(name)
+        own.note(name, {path.name for path in files}, ended=True)
+        return claimed(bag_dir)
+
+    def test_those_that_its_child_made(self, tmp_path: Path) -> None:
+        own = self.made(tmp_path, A, 3)
+        assert all(own.owns_bag(tmp_path / A / f"{A}_{n}.mcap") for n in range(3))
+        assert own.owns_bag(tmp_path / A / f"{A}_0.mcap.zstd")
+
+    @pytest.mark.parametrize(
+        "name",
+        [f"{A}_3.mcap", f"{A}_77.mcap", f"{A}_00.mcap", f"{A}_0.db3", "x.mcap", f"{B}_0.mcap"],
+    )
+    def test_no_others(self, tmp_path: Path, name: str) -> None:
+        own = self.made(tmp_path, A, 3)
+        embedding(tmp_path / A / name, None)
+        assert not own.owns_bag(tmp_path / A / name)
+        assert not claimed(tmp_path).owns_bag(tmp_path / A / name)
+
+    def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
+        world = World(tmp_path, session_duration_s=40)
+        world.supervisor.start()
+        world.run(25)
+        foreign = embedding(world.recorders[0].directory / "x_0.mcap", None)
+        last = embedding(foreign.with_name(f"{foreign.parent.name}_99.mcap"), None)
+        world.run(40)
+        world.supervisor.stop()
         own = OwnRecordings(tmp_path)
-        own.claim(failing)
-        assert [*own.names()] == [B]
+        for each in world.recorders:
+            bags = [*each.directory.glob("*.mcap")]
+            assert {path for path in bags if not own.owns_bag(path)} == {foreign, last} & {*bags}
+            assert lines(tmp_path)[-1]["ended"] is True
 
-    def test_what_would_be_adopted_is_known_without_a_list_and_nothing_is_written(
+    def test_after_a_kill_the_next_start_counts_what_was_not_noted(self, tmp_path: Path) -> None:
+        own = claimed(tmp_path)
+        own.begin(A)
+        files = [embedding(tmp_path / A / f"{A}_{n}.mcap", None) for n in range(4)]
+        files[3].write_bytes(files[3].read_bytes()[:-300])
+        own.complete(A)
+        own.note(A, {files[0].name})
+        foreign = embedding(tmp_path / A / f"{A}_9.mcap", None)
+        own = claimed(tmp_path)
+        assert all(map(own.owns_bag, files))
+        assert Repairer(McapReader(), McapWriter()).repair(files[3])
+        assert own.owns_bag(files[3])
+        assert not own.owns_bag(foreign)
+        later = embedding(tmp_path / A / f"{A}_4.mcap", None)
+        assert not claimed(tmp_path).owns_bag(later)
+
+    def test_recordings_of_before_such_notes_hold_all_that_are_named_after_them(
         self, tmp_path: Path
     ) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        own = OwnRecordings(tmp_path)
-        own.suppose(custom_data)
-        assert own.owns(tmp_path / A)
-        assert not (tmp_path / ".episodic").exists()
+        path = embedding(tmp_path / A / f"{A}_12.mcap", None)
+        other = embedding(tmp_path / A / "x_0.mcap", None)
+        own = claimed(tmp_path)
+        identity = identity_of(tmp_path / A)
+        assert identity is not None
+        with (tmp_path / LIST_FILE).open("a") as stream:
+            line = {"recording": A, "inode": identity.inode, "generation": identity.generation}
+            stream.write(json.dumps(line) + "\n")
+        for _ in range(2):
+            assert own.owns_bag(path)
+            assert not own.owns_bag(other)
+            own = claimed(tmp_path)
+
+    def test_an_adopted_folder_holds_what_lay_there(self, tmp_path: Path) -> None:
+        path = embedding(tmp_path / "runs" / "x_0.mcap", None)
+        own = own_all(tmp_path)
+        later = embedding(tmp_path / "runs" / "y_0.mcap", None)
+        assert own.owns_bag(path)
+        assert not own.owns_bag(later)
+        own_all(tmp_path)
+        assert own.owns_bag(path)
+        assert own.owns_bag(later)
+
+    def test_a_folder_that_an_earlier_version_adopted_holds_everything(
+        self, tmp_path: Path
+    ) -> None:
+        path = embedding(tmp_path / "runs" / "x_0.mcap", None)
+        own_all(tmp_path)
+        text = (tmp_path / LIST_FILE).read_text().replace(', "bags": ["x_0.mcap"]', "")
+        (tmp_path / LIST_FILE).write_text(text)
+        assert OwnRecordings(tmp_path).owns_bag(path)
+
+    def test_carried_messages_and_moments(self, tmp_path: Path) -> None:
+        own = claimed(tmp_path)
+        made_moment(tmp_path / "moments" / "x")
+        assert own.owns_bag(tmp_path / "latched" / "carried.mcap")
+        assert own.owns_bag(tmp_path / "moments" / "x" / A / f"{A}_0.mcap")
+        assert not own.owns_bag(tmp_path / "latched" / "latched_0.mcap")
+        assert not own.owns_bag(tmp_path / "moments" / "y" / A / f"{A}_0.mcap")
+        assert not own.owns_bag(tmp_path / "loose.mcap")
+
+    @pytest.mark.parametrize("named", [True, False])
+    def test_where_children_embed_nothing_the_heartbeat_names_one_that_a_kill_left_unlisted(
+        self, tmp_path: Path, named: bool
+    ) -> None:
+        claimed(tmp_path).begin(A)
+        path = embedding(tmp_path / A / f"{A}_0.mcap", None)
+        beat = Heartbeat(7, 1, RecorderState.RECORDING, (A,) * named, 1, 0, (), (), None, 2.0)
+        write_heartbeat(tmp_path, beat)
+        assert claimed(tmp_path).owns_bag(path) is named
 
 
 class TestEmbedded:

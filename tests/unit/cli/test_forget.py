@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from ros2_memory import cli
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
@@ -23,7 +24,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import OURS, embedding, own_all
+from tests.support.housekeepers import OURS, embedding, made_moment, own_all
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -157,8 +158,8 @@ def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, capsys: Capture) -> 
 
 
 def test_a_bag_with_another_name_is_reported(bag_dir: Path, capsys: Capture) -> None:
-    (bag_dir / "moments" / "20231114T221320Z-x" / "rec_0").mkdir(parents=True)
-    kept = bag_dir / "moments" / "20231114T221320Z-x" / "rec_0" / "rec_1.mcap"
+    kept = made_moment(bag_dir / "moments" / "20231114T221320Z-x") / "rec_0" / "rec_1.mcap"
+    kept.parent.mkdir()
     kept.hardlink_to(bag_dir / "rec_0" / "rec_1.mcap")
     assert forget(20, 35, "--yes") == 1
     assert kept.is_file()
@@ -302,17 +303,34 @@ class TestForeignBags:
         assert forget(40, 100, "--yes", "retention.foreign=delete") == 0
         assert not (bag_dir / "session").exists()
 
-    def test_recordings_of_before_the_list_are_known_by_what_they_carry(
-        self, bag_dir: Path
+    def test_without_a_list_nothing_goes_before_it_is_adopted(
+        self, bag_dir: Path, capsys: Capture
     ) -> None:
+        # What a recorder embeds, a copy without its list embeds as well.
         shutil.rmtree(bag_dir / ".episodic")
         name = "rec_20231114T221320Z"
         path = embedding(bag_dir / name / f"{name}_0.mcap", OURS, start=T0 + 200 * NS_PER_S)
         left(path)
+        assert forget(190, 300, "--yes") == 1
+        assert path.exists()
+        assert f"`ros2-memory adopt {name}` first" in capsys.readouterr().out
+        assert cli.main(["adopt", name]) == 0
         assert forget(190, 300, "--yes") == 0
         assert not path.exists()
-        assert forget(0, 100, "--yes") == 1
-        assert len(bags(bag_dir)) == 4
+
+    @pytest.mark.parametrize(
+        "name", ["latched/latched_0.mcap", "moments/x/x_0.mcap", "rec_1/x.mcap"]
+    )
+    def test_bags_of_others_beside_the_recorders_stay(
+        self, bag_dir: Path, capsys: Capture, name: str
+    ) -> None:
+        path = left(write_mcap(bag_dir / name, [odom(T0 + 65 * NS_PER_S, 1.0, 0.0)]))
+        assert forget(40, 100, "--yes") == 1
+        assert path.exists()
+        assert not [*(bag_dir / "rec_1").glob("rec_*.mcap")]
+        assert f"stays: {name}: this recorder did not make it" in capsys.readouterr().out
+        assert forget(40, 100, "--yes", "--topic", "/odom") == 1
+        assert McapReader().summarize(path).count == 1
 
     def test_a_copy_without_its_list_of_which_one_file_is_damaged_is_kept(
         self, bag_dir: Path, capsys: Capture
@@ -346,6 +364,47 @@ class TestForeignBags:
         monkeypatch.setattr("typer.confirm", meanwhile)
         forget(40, 100)
         assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+
+
+class TestCopies:
+    """Two recordings overlapped: what both recorded counts once, and lies in two files."""
+
+    @pytest.fixture
+    def recordings(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """The second one's first split has copies alone, from 8 s to 9 s."""
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+        monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+        cut = T0 + 9 * NS_PER_S
+        for name, splits in {"rec_a": [(0, 5), (5, 10)], "rec_b": [(8, 9), (9, 15)]}.items():
+            for number, (first, last) in enumerate(splits):
+                times = range(T0 + first * NS_PER_S, T0 + last * NS_PER_S, NS_PER_S // 10)
+                messages = [odom(at, 1.0, 0.0) for at in times]
+                left(write_mcap(tmp_path / name / f"{name}_{number}.mcap", messages))
+        window = (T0 + 7 * NS_PER_S, T0 + 10 * NS_PER_S)
+        end, begin = Overlap(*window, ("rec_a_1.mcap",)), Overlap(*window, ("rec_b_0.mcap",))
+        write_handover(tmp_path / "rec_a", Handover(next="rec_b", counts_until=cut, end=end))
+        write_handover(tmp_path / "rec_b", Handover(previous="rec_a", counts_from=cut, begin=begin))
+        own_all(tmp_path)
+        return tmp_path
+
+    def test_bags_of_copies_alone_go_too(self, recordings: Path) -> None:
+        assert forget(-1, 100, "--yes") == 0
+        assert bags(recordings) == []
+
+    def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
+        self, recordings: Path, capsys: Capture
+    ) -> None:
+        # What counts of rec_a_1 ends at 9 s; its copies at 10 s.
+        assert forget(-1, 9.05, "--yes") == 1
+        assert bags(recordings) == ["rec_a_1.mcap", "rec_b_1.mcap"]
+        output = capsys.readouterr().out
+        assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in output
+
+    def test_a_bag_of_which_only_copies_reach_into_the_window_is_named(
+        self, recordings: Path, capsys: Capture
+    ) -> None:
+        assert forget(9.5, 20, "--yes") == 1
+        assert "stays: rec_a/rec_a_1.mcap" in capsys.readouterr().out
 
 
 class TestMetadata:

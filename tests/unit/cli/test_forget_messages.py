@@ -49,7 +49,7 @@ from tests.support.bags import (
     write_db3,
     write_mcap,
 )
-from tests.support.housekeepers import own_all
+from tests.support.housekeepers import made_moment, own_all
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -214,8 +214,9 @@ def test_nothing_of_it_is_left_anywhere(
 
 def test_hard_links_in_moments_follow(tmp_path: Path, bag_dir: Path) -> None:
     source = bag_dir / "rec_a" / "rec_a_1.mcap"
-    link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
-    link.parent.mkdir(parents=True)
+    moment = made_moment(bag_dir / "moments" / "20260101T000000Z-dance")
+    link = moment / "rec_a" / source.name
+    link.parent.mkdir()
     os.link(source, link)
     assert forget(0, 100, "--topic", CAMERA) == 0
     assert traces(tmp_path, SAID) == []
@@ -232,7 +233,8 @@ def test_a_moment_that_is_kept_meanwhile_follows(
     def slow_cut(self: McapWriter, *arguments: Any) -> Counter[str]:
         taken = cut(self, *arguments)
         if not link.exists():
-            link.parent.mkdir(parents=True)
+            made_moment(link.parents[1])
+            link.parent.mkdir()
             os.link(source, link)
         return taken
 
@@ -490,8 +492,9 @@ class TestInterruption:
         capsys: Capture,
     ) -> None:
         source = bag_dir / "rec_a" / "rec_a_1.mcap"
-        link = bag_dir / "moments" / "20260101T000000Z-dance" / "rec_a" / source.name
-        link.parent.mkdir(parents=True)
+        moment = made_moment(bag_dir / "moments" / "20260101T000000Z-dance")
+        link = moment / "rec_a" / source.name
+        link.parent.mkdir()
         os.link(source, link)
         indexed()
         others = [each for each in stored(bag_dir / "rec_a") if each[0] != CAMERA]

@@ -38,6 +38,7 @@ from tests.support.housekeepers import (
     keeper_of,
     kept,
     lines,
+    made_moment,
     own_all,
     recording,
     recording_now,
@@ -81,6 +82,8 @@ def mixed(tmp_path: Path) -> tuple[Path, list[Path], list[Path]]:
         "deep/er/run/run_0.mcap",
         f"deep/{A}/{A}_0.mcap",
         f"{A}/inside/x_0.mcap",
+        f"{A}/theirs_0.mcap",
+        "latched/latched_0.mcap",
         "rec_20260101T000000Z/rec_20260101T000000Z_0.mcap",
     )
     (tmp_path / "session_mcap" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
@@ -172,6 +175,22 @@ class TestRetention:
         house.apply()
         assert not (bags / A).exists()
 
+    def test_of_a_recording_that_was_noted_only_its_splits_go(self, tmp_path: Path) -> None:
+        own = OwnRecordings(tmp_path)
+        own.begin(A)
+        mine = recording(tmp_path, A, 0)
+        own.complete(A)
+        own.note(A, {path.name for path in mine}, ended=True)
+        others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
+        newest = recording(tmp_path, B, 3 * 3600)
+        with structlog.testing.capture_logs() as logs:
+            house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE).apply()
+        assert [path.exists() for path in mine] == [False] * 5 + [True]
+        assert all(path.exists() for path in (*others, *newest))
+        [reported] = [each for each in logs if each["event"] == "retention_applied"]
+        assert reported["foreign_bytes"] == sum(path.stat().st_size for path in (*others, *newest))
+        assert (tmp_path / A / "handover.json").exists()
+
     @settings(max_examples=examples(25), deadline=None)
     @given(
         ours=st.lists(st.booleans(), min_size=1, max_size=6),
@@ -260,10 +279,15 @@ class TestRepair:
         empty.touch()
         before = cut.read_bytes()
         house = keeper_of(tmp_path, keeps_foreign=True)
-        house.repair()
-        house.apply()
-        assert cut.read_bytes() == before
-        assert empty.exists()
+        for _ in range(2):
+            house.repair()
+            house.apply()
+            assert cut.read_bytes() == before
+            assert empty.exists()
+            # Nor where it lies in a recording of ours.
+            own = OwnRecordings(tmp_path)
+            own.begin(A)
+            own.complete(A)
         own_all(tmp_path)
         house.repair()
         assert cut.read_bytes() != before
@@ -286,6 +310,16 @@ class TestClearing:
         assert not (bag_dir / B).exists()
         clear_bags(bag_dir)
         assert not any(path.exists() for path in others)
+
+    def test_of_moments_those_go_that_were_saved(self, tmp_path: Path) -> None:
+        own = own_all(tmp_path)
+        made_moment(tmp_path / "moments" / "ours")
+        [saved] = foreign(tmp_path, f"moments/ours/{A}/{A}_0.mcap")
+        [other] = foreign(tmp_path, "moments/theirs/x_0.mcap")
+        clear_bags(tmp_path, own)
+        assert not saved.exists()
+        assert not (tmp_path / "moments" / "ours").exists()
+        assert other.exists()
 
 
 class TestReports:
@@ -314,9 +348,11 @@ class TestReports:
         before = memory_status(memory, Call()).budget.foreign
         own_all(bag_dir)
         after = memory_status(memory, Call()).budget.foreign
-        loose = (bag_dir / "loose.mcap").stat().st_size
-        assert (before, after) == (sum(path.stat().st_size for path in others), loose)
-        (bag_dir / "loose.mcap").unlink()
+        never = [bag_dir / "loose.mcap", bag_dir / "latched" / "latched_0.mcap"]
+        left = sum(path.stat().st_size for path in never)
+        assert (before, after) == (sum(path.stat().st_size for path in others), left)
+        for path in never:
+            path.unlink()
         memory.index.refresh()
         assert memory_status(memory, Call()).budget.foreign == 0
 
@@ -381,13 +417,11 @@ class TestAdopt:
         assert cli.main(["adopt", str(tmp_path)]) == 0
         assert [*OwnRecordings(tmp_path).names()] == ["a"]
 
-    def test_recordings_of_versions_before_the_list_are_not_forgotten_by_it(
-        self, tmp_path: Path
-    ) -> None:
+    def test_it_adopts_nothing_else_where_there_was_no_list(self, tmp_path: Path) -> None:
         embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "ros2-memory"})
         foreign(tmp_path, "session_mcap/s_0.mcap")
         assert cli.main(["adopt", "session_mcap"]) == 0
-        assert {*OwnRecordings(tmp_path).names()} == {A, "session_mcap"}
+        assert {*OwnRecordings(tmp_path).names()} == {"session_mcap"}
 
     @pytest.mark.parametrize("name", ["nowhere", "/", "..", "link"])
     def test_what_is_no_directory_of_bags_here_is_refused(

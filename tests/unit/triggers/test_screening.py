@@ -18,7 +18,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import rewriting
 from ros2_memory.storage.mcap.writer import McapWriter
-from tests.support.bags import McapLayout, odom
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.screened_bags import (
     LATCHED,
@@ -242,6 +242,19 @@ class TestFaults:
         assert bags.seconds() == halves(0, 9)
         assert f"{name}_1.mcap" in (bags.screening.problem() or "")
         assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
+
+    def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(
+        self, tmp_path: Path
+    ) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(0, value=False), mode(2, value=True), *words(0, 10)])
+        theirs = write_mcap(bags.bag_dir / name / "theirs_0.mcap", words(0, 10))
+        before = theirs.read_bytes()
+        bags.end()
+        assert theirs.read_bytes() == before
+        assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
+        assert f"{name}/theirs_0.mcap" in (bags.screening.problem() or "")
 
     def test_a_state_that_cannot_be_written_changes_nothing(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

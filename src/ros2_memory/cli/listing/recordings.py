@@ -8,7 +8,6 @@ import typer
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import supposed_own
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
@@ -125,7 +124,7 @@ def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
 def _own_recordings(root: Path) -> OwnRecordings | None:
     """Returns which recordings this program made; None where that cannot be known."""
     try:
-        return supposed_own(root)
+        return OwnRecordings(root)
     except (OSError, RecorderError):
         return None
 
@@ -135,4 +134,4 @@ def _maker(path: Path, bags: Sequence[BagFile], root: Path, own: OwnRecordings |
         return _MOMENT
     if own is None:
         return None
-    return _OWN if own.owns(bags[0].path.parent) else _OTHERS
+    return _OWN if own.owns_bag(bags[0].path) else _OTHERS

@@ -62,7 +62,7 @@ def adopt(
         if (name := own.name_of(path)) and not is_kept_apart(name)
     }
     _require_list(root, own)
-    new = {name: path for name, path in found.items() if not own.owns(path)}
+    new = {name: path for name, path in found.items() if not all(map(own.owns_bag, _bags_in(path)))}
     own.adopt({name: _identity(path) for name, path in new.items()})
     adopted = {name: _count_bags(path) for name, path in new.items()}
     already = len(found) - len(new)
@@ -147,5 +147,9 @@ def _identity(path: Path) -> Identity:
 
 def _count_bags(folder: Path) -> tuple[int, int]:
     """Returns the number of bag files in a directory, and their bytes."""
-    bags = [path for path in folder.iterdir() if bag_kind(path.name) and is_regular(path)]
+    bags = _bags_in(folder)
     return len(bags), sum(map(size_of, bags))
+
+
+def _bags_in(folder: Path) -> list[Path]:
+    return [path for path in folder.iterdir() if bag_kind(path.name) and is_regular(path)]

@@ -17,6 +17,7 @@ from typing import Annotated, Final
 
 import typer
 
+from ros2_memory.bag_dir.handover_file import Handover, read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
@@ -32,7 +33,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
-from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues, supposed_own
+from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
@@ -106,6 +107,8 @@ def forget(
 ) -> None:
     """Delete the closed bags that lie wholly inside a time window, after confirmation.
 
+    All messages in a file count, also copies that another recording has.
+
     With --topic or --where, forget removes messages from the bags instead, and every other message
     stays as it is. If it is interrupted, the next `forget` finishes the work and says so.
 
@@ -131,7 +134,7 @@ def forget(
         if taking.take(wanted, lines, ask=not yes) or interrupted:
             raise typer.Exit(EXIT_NEGATIVE)
         return
-    plan = plan_deletion(settings, memory.index.snapshot(), window)
+    plan = plan_deletion(settings, memory.index.snapshot(), window, build_reader(settings))
     carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
     kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
     _print_kept(kept)
@@ -180,7 +183,7 @@ class _Taking:
         for bag in snapshot.bags:
             if bag.state is BagState.ACTIVE:
                 written[bag.path] = TimeWindow(bag.start, MAX_NS)
-        own = supposed_own(self._bag_dir) if settings.retention.foreign == "keep" else None
+        own = OwnRecordings(self._bag_dir) if settings.retention.foreign == "keep" else None
         self._carrier = Carrier(
             self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics
         )
@@ -335,13 +338,20 @@ class Plan:
     kept: tuple[str, ...]
 
 
-def plan_deletion(settings: Settings, snapshot: Snapshot, window: TimeWindow) -> Plan:
-    """Decides what is deleted of a window; reads no bag."""
+def plan_deletion(
+    settings: Settings, snapshot: Snapshot, window: TimeWindow, reader: BagReader
+) -> Plan:
+    """Decides what is deleted of a window; `reader` reads files as they are.
+
+    Only bags are read of which some messages do not count.
+    """
     bag_dir = settings.recording.bag_dir
-    own = supposed_own(bag_dir) if settings.retention.foreign == "keep" else None
+    own = OwnRecordings(bag_dir) if settings.retention.foreign == "keep" else None
     to_delete: list[BagFile] = []
     kept: list[str] = []
-    for bag in snapshot.timeline.overlapping(window):
+    for bag in _raw_bags(snapshot, reader):
+        if not window.overlaps(bag.start, bag.end):
+            continue
         reason = _reason_to_keep(bag, window, bag_dir, own)
         if reason is None:
             to_delete.append(bag)
@@ -356,6 +366,27 @@ def plan_deletion(settings: Settings, snapshot: Snapshot, window: TimeWindow) ->
     return Plan(bag_dir, own, tuple(to_delete), tuple(kept))
 
 
+def _raw_bags(snapshot: Snapshot, reader: BagReader) -> Iterator[BagFile]:
+    """Yields the bags with the times of all messages in them, also of those that do not count."""
+    handovers: dict[Path, Handover] = {}
+    for bag in snapshot.bags:
+        folder = bag.recording
+        if bag.sidecar_ns and folder not in handovers:
+            handovers[folder] = read_handover(folder).handover
+        if bag.sidecar_ns and handovers[folder].rule(bag.path.name) is not None:
+            with suppress(BagError):
+                summary = reader.summarize(bag.path)
+                yield bag._replace(start=summary.start, end=summary.end)
+                continue
+        yield bag
+    for path in snapshot.empty:
+        with suppress(BagError, OSError):
+            summary, status = reader.summarize(path), path.lstat()
+            if not summary.empty:
+                stamp = str(path), status.st_size, status.st_mtime_ns
+                yield BagFile(*stamp, BagState.CLOSED, summary, summary.start, summary.end)
+
+
 def _reason_to_keep(
     bag: BagFile, window: TimeWindow, bag_dir: Path, own: OwnRecordings | None
 ) -> str | None:
@@ -365,7 +396,7 @@ def _reason_to_keep(
         return "it reaches beyond the window"
     if not _may_delete(bag, own):
         folder = own.name_of(bag.path.parent) if own is not None else ""
-        if folder:
+        if folder and not is_kept_apart(folder):
             adopt = f"`ros2-memory adopt {folder}` first"
         else:
             adopt = (
@@ -383,8 +414,7 @@ def _reason_to_keep(
 
 def _may_delete(bag: BagFile, own: OwnRecordings | None) -> bool:
     """Returns whether the recorder made a bag, or keeps it (carried messages, saved moments)."""
-    folder = bag.path.parent
-    return own is None or is_kept_apart(own.name_of(folder)) or own.owns(folder)
+    return own is None or own.owns_bag(bag.path)
 
 
 def _name(path: Path, bag_dir: Path) -> str:
@@ -477,8 +507,8 @@ def _delete(
     counts, firsts = contents
     with spinner("deleting"), _recorder_locked_out(plan.bag_dir) as recorder:
         snapshot = memory.index.refresh()
-        present = {*snapshot.bags}
-        bags = [bag for bag in plan.to_delete if bag in present and _may_delete(bag, plan.own)]
+        present = {bag[:3] for bag in _raw_bags(snapshot, build_reader(settings))}
+        bags = [bag for bag in plan.to_delete if bag[:3] in present and _may_delete(bag, plan.own)]
         carried = None
         if recorder is None:
             paths = {bag.path for bag in bags}
