@@ -19,6 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.process.child import Child
+from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from ros2_memory.recorder.shortfall import Required
     from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S
@@ -146,6 +148,7 @@ class World:
         *,
         housekeeper: Housekeeper | None = None,
         expected: Sequence[str] = (),
+        required: Sequence[Required] = (),
         **orders: object,
     ) -> None:
         self.bag_dir = bag_dir
@@ -177,6 +180,8 @@ class World:
             free_bytes_of=lambda _directory: self.free,
             device=lambda _directory: self.device,
             expected=lambda: expected,
+            required=required,
+            reception=Reception(self.reader, run=lambda task: task()),
         )
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:

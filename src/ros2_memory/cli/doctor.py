@@ -57,7 +57,12 @@ from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import bags_with_remarks, nothing_here
+from ros2_memory.insights.status import (
+    bags_with_remarks,
+    nothing_here,
+    required_missing,
+    unrecorded,
+)
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.retention.policy import GB
@@ -77,6 +82,10 @@ _COPY_AGAIN: Final = "answers use the readable part; copy the bags again for the
 _NOTHING_MISSING: Final = "nothing is missing: what it states of itself is wrong, not its messages"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
 _NOT_REPAIRED: Final = "copy them again from their source, or delete them"
+_UNRECORDED: Final = (
+    "name the workspace of an unknown type in recorder.setup_files; compare the others with "
+    "`ros2 topic echo`"
+)
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 
@@ -426,15 +435,17 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
 
 
 def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
-    if heartbeat.silent:
+    for seen in required_missing(heartbeat):
+        yield _error("recorder", seen, "are their publishers running? compare recording.required")
+    for seen in unrecorded(heartbeat):
+        yield _warning("recorder", seen, _UNRECORDED)
+    if silent := sorted({*heartbeat.silent} - {*heartbeat.unheard, *heartbeat.fell_silent}):
         do = (
             "is their publisher running? If it runs as another user, the recorder receives it only "
             "over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the "
             "discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
         )
-        yield _warning(
-            "recorder", f"subscribed, but no messages from: {listed(heartbeat.silent)}", do
-        )
+        yield _warning("recorder", f"subscribed, but no messages from: {listed(silent)}", do)
     if heartbeat.age_held:
         do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
         yield _warning("recorder", heartbeat.age_held, do)
@@ -451,12 +462,21 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     elif heartbeat.held_back:
         do = "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it"
         yield _warning("recorder", heartbeat.held_back, do)
+    yield from _check_error(heartbeat)
+
+
+def _check_error(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.last_error:
-        seen = f"its last error: {heartbeat.last_error}"
+        at = heartbeat.last_error_at
+        when = "" if at is None else f" ({iso_local(at)})"
+        seen = f"its last error{when}: {heartbeat.last_error}"
         if heartbeat.restarts:
             times = counted(heartbeat.restarts, "time")
             seen = f"it restarted ros2 bag record {times}; {seen}"
-        yield _warning("recorder", seen, "see its log")
+        if heartbeat.recovered:
+            yield _ok("recorder", f"recording goes on since; {seen}")
+        else:
+            yield _warning("recorder", seen, "see its log")
 
 
 def check_ros(
@@ -515,16 +535,24 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
     elif not missing and not unoffered:
         seen = f"{entries} of {file}: all are in the newest hour of data, or latched"
         yield _ok("topics", seen)
+    unknown = live.unknown_types if live else ()
+    # ros2 bag record names one topic of each unknown type.
+    unseen = f"{_UNOFFERED}, or its type is unknown, too" if unknown else _UNOFFERED
     for entry, similar in missing.items():
         hint = f"is it {' or '.join(similar)}? " if similar else ""
-        why = f"; {_UNOFFERED}" if entry in unoffered else ""
+        why = f"; {unseen}" if entry in unoffered else ""
+        if of_unknown := [*filter(TopicSelection((entry,)).matches, unknown)]:
+            seen = f"{entry} is in {file}; ros2 bag record does not know the type of"
+            do = "name the workspace that defines it in recorder.setup_files"
+            yield _warning("topics", f"{seen} {listed(of_unknown)}", do)
+            continue
         seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
         do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
         yield _warning("topics", seen, f"{hint}{do}")
     for entry in unoffered:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
-            yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
+            yield _warning("topics", f"{entry} is in {file}; {unseen}", do)
 
 
 def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding:

@@ -164,6 +164,26 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
     if heartbeat.held_back is not None and heartbeat.is_live(wall):
         yield heartbeat.held_back
+    if heartbeat.is_live(wall):
+        yield from required_missing(heartbeat)
+        yield from unrecorded(heartbeat)
+
+
+def required_missing(heartbeat: Heartbeat) -> Iterator[str]:
+    """Yields which topics of `recording.required` are not recorded as required, if any."""
+    if heartbeat.required_missing:
+        yield f"required, and not recorded: {listed(heartbeat.required_missing)}"
+
+
+def unrecorded(heartbeat: Heartbeat) -> Iterator[str]:
+    """Yields the topics that are offered and not recorded, a sentence for each reason."""
+    if unknown := heartbeat.unknown_types:
+        yield f"not recorded, since ros2 bag record does not know the type: {listed(unknown)}"
+    if heartbeat.unheard:
+        advice = f"; {heartbeat.advice}" if heartbeat.advice else ""
+        yield f"offered for 30 s, and no message has come: {listed(heartbeat.unheard)}{advice}"
+    if heartbeat.fell_silent:
+        yield f"regular until now, and silent: {listed(heartbeat.fell_silent)}"
 
 
 def missing_data(view: View) -> Iterator[str]:

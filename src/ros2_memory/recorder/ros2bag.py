@@ -35,11 +35,12 @@ from ros2_memory.recorder.process.environment import (
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.recorder.reception.reception import Reception, newest_split
 from ros2_memory.recorder.sessions import Orders
+from ros2_memory.recorder.shortfall import Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.storage.base import BagReader
@@ -69,6 +70,8 @@ class Ros2BagRecorder(Recorder):
             recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
+        required: topics without which recording counts as failed: a name or a glob in `topic`, and
+            in `min_hz` the least messages a second.
         chunk_bytes: size of an MCAP chunk before compression.
         housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
@@ -89,6 +92,7 @@ class Ros2BagRecorder(Recorder):
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
         repeat_latched: Sequence[str],
+        required: Sequence[Mapping[str, str | float]] = (),
         chunk_bytes: int,
         housekeeper: Housekeeper | None = None,
         own: OwnRecordings | None = None,
@@ -127,9 +131,10 @@ class Ros2BagRecorder(Recorder):
             housekeeper or Housekeeper(),
             WallClock(),
             expected=lambda: self._topics.exact,
-            listed=lambda: self._topics.listed,
+            listed_topics=lambda: self._topics.listed,
             own=self._own,
             reception=self._reception,
+            required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
         )
 
     def check(self) -> None:

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
@@ -26,7 +28,8 @@ from ros2_memory.recorder.policies import (
     space_action,
 )
 from ros2_memory.recorder.reception.reception import Reception
-from ros2_memory.recorder.sessions import RecordingSessions
+from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
+from ros2_memory.recorder.shortfall import Required, Seen, TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
@@ -47,13 +50,13 @@ SCREENING_S: Final = 2.0
 """How often closed splits are looked for that are to be screened."""
 FAULT_S: Final = 60.0
 """How often a failing task, which every tick tries again, is reported."""
-SETTLE_S: Final = 5.0
-"""A recording this young writes its headers and latched messages, which do not end a silence."""
 RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
 HEARTBEAT_S: Final = 5.0
+TOPICS_S: Final = 1.0
+"""How often topics are looked for that are not recorded as they should be."""
 TYPES_S: Final = 15.0
 """By then a recording has subscribed to all topics of known types that are offered."""
 
@@ -71,9 +74,10 @@ class Supervisor:
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
         expected: gives the topics that are to be recorded by name.
-        listed: gives what the list of topics has.
+        listed_topics: gives what the list of topics has.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed.
+        required: the topics without which recording counts as failed.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -91,9 +95,10 @@ class Supervisor:
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
         expected: Callable[[], Sequence[str]] = tuple,
-        listed: Callable[[], tuple[str, ...]] = tuple,
+        listed_topics: Callable[[], tuple[str, ...]] = tuple,
         own: OwnRecordings | None = None,
         reception: Reception | None = None,
+        required: Sequence[Required] = (),
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -102,7 +107,7 @@ class Supervisor:
         self._free_bytes_of = free_bytes_of
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
-        self._events = EventLog()
+        self._events = EventLog(clock)
         self._reception = reception or Reception(reader)
         self._heartbeat = HeartbeatWriter(
             orders.bag_dir,
@@ -116,7 +121,8 @@ class Supervisor:
             usage=housekeeper.usage,
             expected=expected,
             reception=self._reception,
-            listed=listed,
+            listed=listed_topics,
+            advice=orders.advice,
         )
         self._sessions = RecordingSessions(
             orders,
@@ -128,6 +134,7 @@ class Supervisor:
             reception=self._reception,
             expected=expected,
         )
+        self._topics = TopicWatch(required)
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
@@ -213,6 +220,7 @@ class Supervisor:
             "restart": self._check_restart,
             "types": self._check_types,
             "offers": self._check_offers,
+            "topics": self._check_topics,
             "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
             "house": self._apply_retention,
@@ -229,10 +237,13 @@ class Supervisor:
 
     def _observe(self, now: ClockReading) -> None:
         if self._is_due("observe", OBSERVE_S, now):
-            self._splits_closed |= self._sessions.observe(now)
+            closed = self._sessions.observe(now)
+            self._splits_closed |= closed
             current = self._sessions.current
             if current is not None and current.splits.messages:
                 self._backoff.succeeded()
+                if closed:
+                    self._events.recorded()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -325,7 +336,11 @@ class Supervisor:
         current = self._sessions.current
         if current is None:
             return
-        silent = self._silence.is_silent(now.monotonic_s, current.splits.bytes_written)
+        silent = self._silence.is_silent(
+            now.monotonic_s,
+            current.splits.bytes_written,
+            offered=bool(current.subscribed - OWN_TOPICS),
+        )
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
         over = current.age_s(now) >= self._orders.session_duration_s
@@ -336,7 +351,7 @@ class Supervisor:
             return
         if silent:
             sentence = (
-                f"{current.name} has stopped growing: the robot is silent, or its messages do not "
+                f"{current.name} does not grow: the robot is silent, or its messages do not "
                 "arrive; the recording is closed"
             )
             self._events.warn("no_growth", sentence, recording=current.name)
@@ -392,7 +407,7 @@ class Supervisor:
         current = self._sessions.current
         if current is None or current.age_s(now) < WAITING_S or self._sessions.handover is not None:
             return
-        missing = frozenset(self._heartbeat.missing(self._sessions)) - current.of_unknown_type
+        missing = frozenset(self._heartbeat.missing(self._sessions))
         if new := missing - self._not_offered:
             self._events.remark(
                 "topic_not_offered",
@@ -409,6 +424,37 @@ class Supervisor:
                 topics=sorted(new),
             )
         self._heartbeat.gone = gone
+
+    def _check_topics(self, now: ClockReading) -> None:
+        """Looks for topics that are offered and not recorded, and for required ones."""
+        current = self._sessions.current
+        if current is None or not self._is_due("topics", TOPICS_S, now):
+            return
+        running, sessions = self._sessions.running, self._sessions
+        idle_s = max(0.0, now.monotonic_s - sessions.grew_s)
+        silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
+        found = self._topics.look(
+            Seen(
+                now_s=now.monotonic_s,
+                offered=frozenset[str]().union(*(each.subscribed for each in running)),
+                heard=sessions.heard,
+                unknown=frozenset[str]().union(*(each.of_unknown_type for each in running)),
+                known_s=sessions.closed_s if current.splits.bytes_written else now.monotonic_s,
+                silent=silent,
+                rates_hz=rates_hz,
+                settled=len(running) == 1 and current.age_s(now) >= TYPES_S,
+            )
+        )
+        before, self._heartbeat.shortfall = self._heartbeat.shortfall, found
+        if new := sorted({*found.unheard} - {*before.unheard}):
+            sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
+            self._events.remark("topics_unheard", sentence, topics=new)
+        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
+            sentence = f"regular until now, and silent: {listed(new)}"
+            self._events.remark("topics_stopped", sentence, topics=new)
+        if found.required_missing and not before.required_missing:
+            sentence = f"required, and not recorded: {listed(found.required_missing)}"
+            self._events.remark("required_missing", sentence)
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)

@@ -428,6 +428,37 @@ def test_a_topic_that_nobody_offers_and_restarts_are_reported(robot: Path, capsy
     assert "it restarted ros2 bag record 1 time; its last error" in wrong["recorder"][0]["seen"]
 
 
+def test_an_error_that_is_past_is_shown_with_its_time(robot: Path, capsys: Capture) -> None:
+    beat(robot, last_error="it died", last_error_at=time.time_ns(), recovered=True, restarts=1)
+    assert cli.main(["doctor"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "recording goes on since; it restarted ros2 bag record 1 time; its last error (20" in said
+    )
+
+
+def test_a_topic_of_an_unknown_type_is_offered_and_not_recorded(
+    robot: Path, capsys: Capture
+) -> None:
+    topics = robot.parent / "topics.yaml"
+    topics.write_text("topics: [/odom, /arm, /gone]\n")
+    beat(robot, missing=("/gone",), unknown_types=("/arm",))
+    code, wrong = examined(capsys)
+    assert code == 1
+    arm, gone = wrong["topics"]
+    assert arm["seen"].endswith("ros2 bag record does not know the type of /arm")
+    assert arm["do"].startswith("name the workspace")
+    assert gone["seen"].endswith("since the recorder started, or its type is unknown, too")
+
+
+def test_what_is_required_and_not_recorded_is_an_error(robot: Path, capsys: Capture) -> None:
+    beat(robot, required_missing=("/odom: 2 Hz, and 10 are required",), unheard=("/scan",))
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "/odom: 2 Hz, and 10 are required" in wrong["recorder"][0]["seen"]
+    assert "no message has come: /scan" in wrong["recorder"][1]["seen"]
+
+
 class TestExtras:
     def test_what_the_configuration_asks_for_must_be_installed(
         self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture

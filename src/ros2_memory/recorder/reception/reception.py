@@ -17,6 +17,7 @@ from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import counted, listed
+from ros2_memory.recorder.reception.arrivals import Arrivals
 from ros2_memory.recorder.reception.losses import LossCounter
 from ros2_memory.recorder.reception.measure import measure_split
 from ros2_memory.recorder.reception.profiles import (
@@ -88,6 +89,7 @@ class Reception:
         self._run = run or _in_thread()
         self._bag_dir = bag_dir
         self._losses = LossCounter()
+        self._arrivals = Arrivals()
         self._spans: dict[str, tuple[Ns, Ns]] = {}
         self._lock = threading.Lock()
         self._flows: dict[str, TopicFlow] = {}
@@ -147,6 +149,11 @@ class Reception:
         """Returns how many messages of each topic are known to be missing of the last hour."""
         with self._lock:
             return self._losses.in_last_hour(now)
+
+    def arrivals(self, idle: Ns) -> tuple[frozenset[str], Mapping[str, float]]:
+        """Returns the topics that have stopped, and the rates of all, see `Arrivals`."""
+        with self._lock:
+            return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
 
     def _report(self, losses: Sequence[Loss]) -> None:
         if not losses:
@@ -242,6 +249,8 @@ class Reception:
                 for name in [*self._spans][:-_PLANS_KEPT]:
                     del self._spans[name]
             self._losses.unclear(recording, split.unclear)
+            if recording:
+                self._arrivals.measured(split)
             # What an earlier run recorded was counted by that.
             losses = self._losses.measured(recording, split.progress) if recording else []
         self._report(losses)
