@@ -12,6 +12,8 @@ from collections.abc import Collection, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.errors import RecorderError
@@ -19,6 +21,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.process.child import Child
+from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
@@ -36,6 +39,7 @@ T0 = 1_795_150_800 * NS_PER_S
 PERIOD = NS_PER_S // 4
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 TOPICS = ("/bumper", "/door")
+ANY_TOPIC = ("/*", "/*/*", "/*/*/*")
 
 
 @dataclass
@@ -170,6 +174,10 @@ class World:
         }
         self.orders = Orders(**(plan | orders))  # type: ignore[arg-type]
         self.reader = McapReader()
+        self.topics_path = bag_dir.with_name(f"{bag_dir.name}.topics.yaml")
+        self.list_topics(*expected)
+        self.topics = TopicsFile(self.topics_path)
+        self.topics.load()
         self.supervisor = Supervisor(
             self.orders,
             self._start,
@@ -179,10 +187,14 @@ class World:
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,
             device=lambda _directory: self.device,
-            expected=lambda: expected,
+            topics=self.topics,
             required=required,
             reception=Reception(self.reader, run=lambda task: task()),
         )
+
+    def list_topics(self, *names: str) -> None:
+        """Writes the list of topics: these, and whatever else the recorders know."""
+        self.topics_path.write_text(yaml.safe_dump({"topics": [*names, *ANY_TOPIC]}))
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:
         self.named_at_start.append(self.heartbeat()["recordings"])

@@ -65,7 +65,8 @@ from ros2_memory.insights.status import (
 )
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.retention.policy import GB
+from ros2_memory.retention.inventory import state_bytes_in
+from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
 from ros2_memory.storage.base import BagReader, Closing
 
@@ -211,6 +212,9 @@ def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Findin
         yield _warning("bag_dir", seen, "run any `ros2-memory forget`: it finishes that first")
     if records:
         yield _check_disk(settings, bag_dir, foreign_bytes)
+        if (budget := settings.retention.max_total_gb) < SMALL_BUDGET_GB:
+            do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
+            yield _warning("disk", small_budget(budget), do)
 
 
 def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
@@ -241,7 +245,11 @@ def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Findin
     mount = next(each for each in (existing, *existing.parents) if os.path.ismount(each))
     limits = settings.retention
     free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
-    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used"
+    state = state_bytes_in(bag_dir) / GB
+    seen = (
+        f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used: "
+        f"bags {max(used - state, 0):.2g} GB, what is stored beside them {state:.2g} GB"
+    )
     if foreign_bytes:
         seen += (
             f"; bags that this recorder did not make take {foreign_bytes / GB:.2g} GB more, and "
@@ -452,6 +460,8 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.unshipped:
         do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
         yield _warning("recorder", heartbeat.unshipped, do)
+    if heartbeat.list_refused:
+        yield _error("recorder", heartbeat.list_refused, "correct the list of topics")
     if heartbeat.failing_rules:
         do = (
             "correct the rule in the file that recording.exclude_when names, and restart the "
@@ -515,19 +525,10 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
     live = heartbeat if heartbeat and heartbeat.is_live(now) else None
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching, heard)
-    if live and live.listed and {*live.listed} != {*selection.listed}:
-        yield _changed_list(file, selection, live)
-        return
     unoffered = live.missing if live else ()
-    others = _of_another_list(selection, live) if live else []
-    if others:
-        which = listed(others)
-        seen = f"the running recorder records or waits for {which}, not listed in {file}"
-        do = (
-            "give this command the recorder's settings (its environment and key=value arguments), "
-            "or restart the recorder if the list is newer"
-        )
-        yield _warning("topics", seen, do)
+    other = _other_list(file, selection, live) if live else None
+    if other is not None:
+        yield other
         return
     entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
@@ -555,6 +556,21 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
             yield _warning("topics", f"{entry} is in {file}; {unseen}", do)
 
 
+def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding | None:
+    """Returns the finding on a running recorder whose list is not this one; else None."""
+    if live.listed and {*live.listed} != {*selection.listed}:
+        return _changed_list(file, selection, live)
+    others = _of_another_list(selection, live)
+    if not others:
+        return None
+    seen = f"the running recorder records or waits for {listed(others)}, not listed in {file}"
+    do = (
+        "give this command the recorder's settings (its environment and key=value arguments); "
+        "a changed list is taken within seconds"
+    )
+    return _warning("topics", seen, do)
+
+
 def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding:
     """Returns the finding on a list that is not the one that the running recorder read."""
     added = sorted({*selection.listed} - {*live.listed})
@@ -565,12 +581,10 @@ def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Fin
         if each
     ]
     do = (
-        "restart the recorder, which reads the list when it starts (sudo systemctl restart "
-        "ros2-memory-recorder); if it has another list, give this command its settings"
+        "a changed list is taken within seconds; if the recorder has another file, give this "
+        "command its settings"
     )
-    return _warning(
-        "topics", f"the running recorder started with another list: {'; '.join(what)}", do
-    )
+    return _warning("topics", f"the running recorder has another list: {'; '.join(what)}", do)
 
 
 def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[str]:

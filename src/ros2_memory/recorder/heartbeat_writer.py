@@ -11,11 +11,12 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.shortfall import Shortfall
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.sessions import RecordingSessions
 
@@ -34,9 +35,8 @@ class HeartbeatWriter:
         unshipped: describes bags that were deleted though they were in no lake and had to be, or
             None.
         usage: gives what the budget counts, see `Housekeeper`.
-        expected: gives the topics that are to be recorded by name.
+        topics: the list of topics to record.
         reception: knows what was lost.
-        listed: gives what the list of topics has.
         advice: says what to do where publishers are subscribed to and not heard.
 
     Attributes:
@@ -53,12 +53,11 @@ class HeartbeatWriter:
         events: EventLog,
         *,
         age_held: Callable[[], str | None],
-        expected: Callable[[], Sequence[str]],
+        topics: TopicsFile,
         reception: Reception,
         held_back: Callable[[], str | None] = lambda: None,
         failing_rules: Callable[[], tuple[str, ...]] = tuple,
         unshipped: Callable[[], str | None] = lambda: None,
-        listed: Callable[[], tuple[str, ...]] = tuple,
         usage: Callable[[], tuple[int, int] | None] = lambda: None,
         advice: Callable[[], str] = str,
     ) -> None:
@@ -66,14 +65,13 @@ class HeartbeatWriter:
         self._held_back = held_back
         self._failing_rules = failing_rules
         self._unshipped = unshipped
-        self._listed = listed
         self._usage = usage
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
         self._events = events
         self._age_held = age_held
-        self._expected = expected
+        self._topics = topics
         self._reception = reception
         self.offered = set[str]()
         self.gone = frozenset[str]()
@@ -131,7 +129,8 @@ class HeartbeatWriter:
             held_back=self._held_back(),
             failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
-            listed=self._listed(),
+            listed=self._topics.selection.listed,
+            list_refused=self._topics.refused,
             process=process_of(os.getpid()),
             counted_bytes=None if usage is None else usage[0],
             state_bytes=0 if usage is None else usage[1],
@@ -150,7 +149,7 @@ class HeartbeatWriter:
             return ()
         unknown = (each.of_unknown_type for each in sessions.running)
         known = self.offered.union(self.shortfall.unknown_types, *unknown)
-        return tuple(sorted({*self._expected()} - known))
+        return tuple(sorted({*self._topics.selection.exact} - known))
 
     def _write(self, heartbeat: Heartbeat) -> None:
         self._written = _without_amounts(heartbeat)

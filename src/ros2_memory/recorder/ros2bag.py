@@ -32,7 +32,7 @@ from ros2_memory.recorder.process.environment import (
     find_ros2,
     robot_environment,
 )
-from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_split
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.shortfall import Required
@@ -76,6 +76,7 @@ class Ros2BagRecorder(Recorder):
         housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
+        needed: topics that the list must have, each with what needs it.
     """
 
     def __init__(
@@ -97,9 +98,9 @@ class Ros2BagRecorder(Recorder):
         housekeeper: Housekeeper | None = None,
         own: OwnRecordings | None = None,
         keep_open: Collection[int] = (),
+        needed: Mapping[str, str] | None = None,
     ) -> None:
         self._bag_dir = bag_dir.absolute()
-        self._topics_file = topics_file
         self._split_duration_s = split_duration_s
         self._use_sim_time = use_sim_time
         self._setup_files = tuple(setup_files)
@@ -108,7 +109,12 @@ class Ros2BagRecorder(Recorder):
         self._keep_open = tuple(keep_open)
         self._own = own or OwnRecordings(self._bag_dir)
         self._checked = False
-        self._topics = TopicSelection(())
+        by_setting = {
+            str(each["topic"]): "recording.required"
+            for each in required
+            if "*" not in str(each["topic"])
+        }
+        self._topics = TopicsFile(topics_file, {**by_setting, **(needed or {})})
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
         self._options: frozenset[str] = frozenset()
@@ -130,8 +136,7 @@ class Ros2BagRecorder(Recorder):
             reader,
             housekeeper or Housekeeper(),
             WallClock(),
-            expected=lambda: self._topics.exact,
-            listed_topics=lambda: self._topics.listed,
+            topics=self._topics,
             own=self._own,
             reception=self._reception,
             required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
@@ -139,14 +144,15 @@ class Ros2BagRecorder(Recorder):
 
     def check(self) -> None:
         """Makes the environment of `ros2` and reads its options from its help."""
-        self._topics = load_topics(self._topics_file)
+        self._topics.load()
         self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         self._ros2 = find_ros2(self._env, sourced=bool(self._setup_files))
         self._options = self._known_options()
-        if self._topics.services and SERVICES not in self._options:
+        services = self._topics.selection.services
+        if services and SERVICES not in self._options:
             _log.warning(
                 "services_not_recorded",
-                topics=list(self._topics.services),
+                topics=list(services),
                 reason="this ros2 bag record has no --services: Jazzy and later have it",
             )
         self._checked = True
@@ -204,7 +210,7 @@ class Ros2BagRecorder(Recorder):
         argv = record_argv(
             ros2=self._ros2,
             directory=directory,
-            topics=self._topics,
+            topics=self._topics.selection,
             split_duration_s=self._split_duration_s,
             qos_file=qos_file,
             storage_file=storage_file,

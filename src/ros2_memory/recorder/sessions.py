@@ -34,7 +34,7 @@ from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.session import SplitChanges
     from ros2_memory.storage.base import BagReader
@@ -82,7 +83,7 @@ class RecordingSessions:
         events: where everything is reported.
         own: the list of recordings that were made here.
         reception: measures closed splits, and receives the publishers that were refused.
-        expected: returns the topics that are to be recorded by their names.
+        topics: the list of topics to record.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -105,7 +106,7 @@ class RecordingSessions:
         *,
         own: OwnRecordings,
         reception: Reception,
-        expected: Callable[[], Sequence[str]] = tuple,
+        topics: TopicsFile,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -113,7 +114,7 @@ class RecordingSessions:
         self._announce = announce
         self._own = own
         self._reception = reception
-        self._expected = expected
+        self._topics = topics
         self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
@@ -165,7 +166,14 @@ class RecordingSessions:
             raise
         orders = self._orders
         plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)
-        self.handover = HandoverTransfer(old, new, plan, self._reader, simulated=orders.simulated)
+        self.handover = HandoverTransfer(
+            old,
+            new,
+            plan,
+            self._reader,
+            simulated=orders.simulated,
+            is_listed=self._topics.selection.matches,
+        )
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
@@ -209,7 +217,7 @@ class RecordingSessions:
         if splits.received - OWN_TOPICS:
             return True
         # Of what else it writes, some may be of nodes of its own user, as /rosout always is.
-        others = session.subscribed.union(self._expected()) - OWN_TOPICS
+        others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
         if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
             return False
         return bool(splits.messages or splits.bytes_written)

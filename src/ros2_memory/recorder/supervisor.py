@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.sessions import Orders
     from ros2_memory.storage.base import BagReader
 
@@ -55,6 +56,8 @@ RETENTION_S: Final = 10.0
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
 HEARTBEAT_S: Final = 5.0
+LIST_S: Final = 2.0
+"""How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
 """How often topics are looked for that are not recorded as they should be."""
 TYPES_S: Final = 15.0
@@ -73,8 +76,7 @@ class Supervisor:
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
-        expected: gives the topics that are to be recorded by name.
-        listed_topics: gives what the list of topics has.
+        topics: the list of topics to record.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed.
         required: the topics without which recording counts as failed.
@@ -94,8 +96,7 @@ class Supervisor:
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
-        expected: Callable[[], Sequence[str]] = tuple,
-        listed_topics: Callable[[], tuple[str, ...]] = tuple,
+        topics: TopicsFile,
         own: OwnRecordings | None = None,
         reception: Reception | None = None,
         required: Sequence[Required] = (),
@@ -119,9 +120,8 @@ class Supervisor:
             failing_rules=housekeeper.failing_rules,
             unshipped=housekeeper.unshipped,
             usage=housekeeper.usage,
-            expected=expected,
+            topics=topics,
             reception=self._reception,
-            listed=listed_topics,
             advice=orders.advice,
         )
         self._sessions = RecordingSessions(
@@ -132,15 +132,15 @@ class Supervisor:
             self._events,
             own=own or OwnRecordings(orders.bag_dir),
             reception=self._reception,
-            expected=expected,
+            topics=topics,
         )
-        self._topics = TopicWatch(required)
+        self._topics = topics
+        self._topic_watch = TopicWatch(required)
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
-        self._expected = expected
         self._unknown = frozenset[str]()
         self._not_offered = frozenset[str]()
         self._paused = False
@@ -216,6 +216,7 @@ class Supervisor:
             "deaths": self._check_exits,
             "space": self._check_space,
             "takeover": self._check_handover,
+            "list": self._check_list,
             "rotation": self._check_rotation,
             "restart": self._check_restart,
             "types": self._check_types,
@@ -356,17 +357,35 @@ class Supervisor:
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over
-        self._rotate_now = False
         try:
             self._sessions.begin_handover(now)
         except RecorderError as error:
             self._events.fail("rotation_failed", str(error), recording=current.name)
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             return
+        self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
             report = self._events.warn if resubscribe.is_fault else self._events.note
             report(resubscribe.event, resubscribe.sentence, recording=current.name)
+
+    def _check_list(self, now: ClockReading) -> None:
+        """Has a new recording begin where the list of topics was changed."""
+        if not self._is_due("list", LIST_S, now):
+            return
+        before = self._topics.selection.listed
+        if self._topics.look():
+            listed_now = self._topics.selection.listed
+            self._rotate_now |= self._sessions.current is not None
+            self._events.info(
+                "topics_changed",
+                added=sorted({*listed_now} - {*before}),
+                dropped=sorted({*before} - {*listed_now}),
+            )
+        if self._topics.refused is None:
+            self._events.resolve("topics_refused", "")
+        else:
+            self._events.fail_once("topics_refused", "", self._topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
         if self._sessions.current is not None or self._paused or self._disk.away:
@@ -387,7 +406,9 @@ class Supervisor:
         current = self._sessions.current
         if current is None or not current.of_unknown_type or current.age_s(now) < TYPES_S:
             return
-        unknown = frozenset({*self._expected(), *current.of_unknown_type} - current.subscribed)
+        unknown = frozenset(
+            {*self._topics.selection.exact, *current.of_unknown_type} - current.subscribed
+        )
         if unknown != self._unknown:
             self._unknown = unknown
             self._events.warn(
@@ -416,7 +437,8 @@ class Supervisor:
                 topics=sorted(new),
             )
         self._not_offered |= missing
-        gone = frozenset(self._heartbeat.offered - current.subscribed - OWN_TOPICS)
+        offered = self._heartbeat.offered - current.subscribed - OWN_TOPICS
+        gone = frozenset(filter(self._topics.selection.matches, offered))
         if new := gone - self._heartbeat.gone:
             self._events.remark(
                 "topic_silent",
@@ -433,7 +455,7 @@ class Supervisor:
         running, sessions = self._sessions.running, self._sessions
         idle_s = max(0.0, now.monotonic_s - sessions.grew_s)
         silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
-        found = self._topics.look(
+        found = self._topic_watch.look(
             Seen(
                 now_s=now.monotonic_s,
                 offered=frozenset[str]().union(*(each.subscribed for each in running)),

@@ -73,7 +73,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     monkeypatch.setenv("MCP_PORT", str(port))
-    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.01"]
+    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.1"]
     monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", " ".join([*overrides, "retention.min_free_gb=0"]))
     beat(bag_dir)
     return bag_dir
@@ -177,7 +177,21 @@ def test_of_bags_that_are_not_there_nothing_is_used(tmp_path: Path, capsys: Capt
         other.truncate(10**8)
     cli.main(["doctor", "--json", f"recording.bag_dir={tmp_path / 'gone'}"])
     seen = {each["about"]: each["seen"] for each in json.loads(capsys.readouterr().out)["findings"]}
-    assert "; 0.0 of 5 GB used" in seen["disk"]
+    assert "; 0.0 of 5 GB used: bags 0 GB, what is stored beside them 0 GB" in seen["disk"]
+
+
+def test_a_budget_of_which_what_is_beside_the_bags_takes_much_is_reported(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / ".episodic").mkdir()
+    (robot / ".episodic" / "columns.sqlite").write_bytes(bytes(20_000_000))
+    assert cli.main(["doctor"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "0.0 of 0.1 GB used: bags " in shown
+    assert "what is stored beside them 0.02 GB" in shown
+    code, wrong = examined(capsys, "retention.max_total_gb=0.05")
+    assert code == 1
+    assert "retention.max_total_gb=0.05 is less than 0.1" in wrong["disk"][-1]["seen"]
 
 
 def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys: Capture) -> None:
@@ -507,7 +521,7 @@ def test_a_recorder_with_another_list_of_topics_is_reported_instead_of_the_topic
     assert "settings" in finding["do"]
 
 
-def test_a_list_of_topics_that_was_changed_since_the_recorder_started_asks_for_a_restart(
+def test_a_list_of_topics_that_the_recorder_does_not_have_is_reported(
     robot: Path, capsys: Capture
 ) -> None:
     beat(robot, listed=("/odom", "/gone"))
@@ -517,7 +531,14 @@ def test_a_list_of_topics_that_was_changed_since_the_recorder_started_asks_for_a
     assert code == 1
     assert "adds /said" in finding["seen"]
     assert "lacks /gone" in finding["seen"]
-    assert finding["do"].startswith("restart the recorder")
+    assert finding["do"].startswith("a changed list is taken within seconds")
+
+
+def test_a_changed_list_that_the_recorder_refuses_is_an_error(robot: Path, capsys: Capture) -> None:
+    beat(robot, listed=("/odom",), list_refused="topics.yaml: it is not YAML; it keeps the list")
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "it is not YAML" in wrong["recorder"][0]["seen"]
 
 
 def test_what_the_recorder_receives_by_now_is_not_missed_in_closed_bags(

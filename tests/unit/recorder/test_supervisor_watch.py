@@ -375,3 +375,56 @@ class TestShortfall:
         world.supervisor.start()
         world.run(300)
         assert len(world.recorders) == 2
+
+
+class TestChangedList:
+    def test_a_changed_list_begins_a_recording_and_loses_nothing(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
+        world.supervisor.start()
+        world.run(20)
+        world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
+        world.topics_path.write_text("topics: [/bumper, /lidar]\n")
+        with capture_logs() as logs:
+            world.run(15)
+        [changed] = events(logs, "topics_changed")
+        assert changed["added"] == ["/lidar"]
+        assert "/door" in changed["dropped"]
+        assert not events(logs, "rotated_without")
+        beat = world.heartbeat()
+        assert (beat["listed"], beat["subscribed"]) == (["/bumper", "/lidar"],) * 2
+        assert (len(world.recorders), beat["missing"], beat["silent"]) == (2, [], [])
+        world.run(60)
+        assert world.heartbeat()["fell_silent"] == []
+        assert len(world.recorders) == 2
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
+        world.supervisor.start()
+        world.run(20)
+        before = world.heartbeat()["listed"]
+        world.topics_path.write_text("topics: [no slash]\n")
+        with capture_logs() as logs:
+            world.run(30)
+        [refused] = events(logs, "topics_refused")
+        beat = world.heartbeat()
+        assert beat["list_refused"] == refused["reason"] == beat["last_error"]
+        assert "'no slash' cannot be recorded" in beat["list_refused"]
+        assert (beat["listed"], beat["recovered"], len(world.recorders)) == (before, False, 1)
+        world.topics_path.write_text("topics: [/bumper, /door]\n")
+        world.run(20)
+        beat = world.heartbeat()
+        assert (beat["list_refused"], beat["listed"]) == (None, ["/bumper", "/door"])
+
+    def test_a_file_that_is_touched_or_written_in_steps_is_no_change(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper",))
+        whole = world.topics_path.read_text()
+        world.supervisor.start()
+        world.run(20)
+        world.topics_path.write_text("topics:\n")
+        world.run(1.5)
+        world.topics_path.write_text(whole)
+        world.run(20)
+        assert (len(world.recorders), world.heartbeat()["last_error"]) == (1, None)
