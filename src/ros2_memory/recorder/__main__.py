@@ -141,7 +141,7 @@ def _record(settings: Settings) -> None:
             housekeeper=housekeeper,
             own=own,
             keep_open=(lock.descriptor,),
-            needed={
+            excluding={
                 each.topic: f"the rule {each.name!r} of recording.exclude_when"
                 for each in exclusions_of(settings)
             },

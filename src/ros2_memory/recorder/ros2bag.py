@@ -47,6 +47,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
 
+ROSOUT: Final = "/rosout"
 HELP_TIMEOUT_S: Final = 60.0
 LOGS_KEPT: Final = 20
 
@@ -76,7 +77,7 @@ class Ros2BagRecorder(Recorder):
         housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
-        needed: topics that the list must have, each with what needs it.
+        excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class Ros2BagRecorder(Recorder):
         housekeeper: Housekeeper | None = None,
         own: OwnRecordings | None = None,
         keep_open: Collection[int] = (),
-        needed: Mapping[str, str] | None = None,
+        excluding: Mapping[str, str] | None = None,
     ) -> None:
         self._bag_dir = bag_dir.absolute()
         self._split_duration_s = split_duration_s
@@ -114,14 +115,19 @@ class Ros2BagRecorder(Recorder):
             for each in required
             if "*" not in str(each["topic"])
         }
-        self._topics = TopicsFile(topics_file, {**by_setting, **(needed or {})})
+        self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
         self._options: frozenset[str] = frozenset()
         self._queue_bytes = queue_mb * 2**20
         self._min_free_bytes = round(min_free_gb * GB)
         self._reception = Reception(
-            reader, self._queue_bytes, bag_dir=self._bag_dir, latched=latched_topics
+            reader,
+            self._queue_bytes,
+            bag_dir=self._bag_dir,
+            latched=latched_topics,
+            # Each recording would receive the log of an excluded time again.
+            volatile={ROSOUT} - excluding.keys() if excluding else (),
         )
         self._supervisor = Supervisor(
             Orders(

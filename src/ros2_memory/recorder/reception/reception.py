@@ -71,6 +71,7 @@ class Reception:
         queue_bytes: what the queues of all topics together may take.
         bag_dir: where losses are written; nowhere where None.
         latched: topics that count as latched, see `qos_overrides`.
+        volatile: topics that are not asked for their earlier messages once a split has shown them.
         run: runs a task that takes a while; in a thread of its own where None.
     """
 
@@ -81,11 +82,13 @@ class Reception:
         *,
         bag_dir: Path | None = None,
         latched: Collection[str] = (),
+        volatile: Collection[str] = (),
         run: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
         self._latched = tuple(latched)
+        self._volatile = tuple(volatile)
         self._run = run or _in_thread()
         self._bag_dir = bag_dir
         self._losses = LossCounter()
@@ -115,7 +118,9 @@ class Reception:
             latched = [topic for topic in self._latched if topic not in self._asked_anew]
             # A latched topic that is asked for as volatile would lose what was published before.
             weakest = self._asked_anew.difference(self._latched)
-            return qos_overrides(self._flows, plan, latched=latched, weakest=weakest)
+            return qos_overrides(
+                self._flows, plan, latched=latched, weakest=weakest, volatile=self._volatile
+            )
 
     def recall(self, path: Path) -> None:
         """Measures a closed split of an earlier run at once. Raises nothing."""
