@@ -61,6 +61,8 @@ class PlayedRecorder(Child):
     splits: int = 0
     patience_s: float = 15.0
     deaf: bool = False
+    buffers: bool = False
+    """Whether an open file does not grow."""
     _age_s: float = 0.0
     _subscribed: bool = False
     _held: list[Msg] = field(default_factory=list)
@@ -118,7 +120,7 @@ class PlayedRecorder(Child):
             self._held.append(replace(message, log_time=logged, publish_time=published))
         if self.directory.is_dir():
             # An open file that grows; what is in it matters when its recorder dies.
-            size = 0 if self.world.disk_full else 50 * len(self._held)
+            size = 0 if self.world.disk_full or self.buffers else 50 * len(self._held)
             (self.directory / self._file).write_bytes(MCAP_MAGIC[: size and 8] + bytes(size))
 
     @property

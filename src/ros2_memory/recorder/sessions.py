@@ -344,7 +344,8 @@ class RecordingSessions:
         changes = session.splits.observe(now.monotonic_s)
         if session.splits.bytes_written > before:
             session.grew_at = now.wall
-            if session.age_s(now) >= SETTLE_S:
+            # The end of a file is written when its recording ends, too.
+            if session.is_recording and session.age_s(now) >= SETTLE_S:
                 self.grew_s = now.monotonic_s
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)

@@ -29,7 +29,7 @@ from ros2_memory.recorder.policies import (
 )
 from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
-from ros2_memory.recorder.shortfall import Required, Seen, TopicWatch
+from ros2_memory.recorder.shortfall import Required, Seen, Shortfall, TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
@@ -60,6 +60,8 @@ LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
 """How often topics are looked for that are not recorded as they should be."""
+IDLE_SPLITS: Final = 2
+"""Recordings that have not grown for longer than so many splits are idle."""
 TYPES_S: Final = 15.0
 """By then a recording has subscribed to all topics of known types that are offered."""
 
@@ -453,7 +455,10 @@ class Supervisor:
         if current is None or not self._is_due("topics", TOPICS_S, now):
             return
         running, sessions = self._sessions.running, self._sessions
-        idle_s = max(0.0, now.monotonic_s - sessions.grew_s)
+        split_s = self._orders.split_duration_s
+        # What comes slowly is written when its split is closed.
+        idle_s = max(0.0, now.monotonic_s - sessions.grew_s - IDLE_SPLITS * split_s)
+        known_s = sessions.closed_s if current.splits.bytes_written else now.monotonic_s - split_s
         silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
         found = self._topic_watch.look(
             Seen(
@@ -461,13 +466,16 @@ class Supervisor:
                 offered=frozenset[str]().union(*(each.subscribed for each in running)),
                 heard=sessions.heard,
                 unknown=frozenset[str]().union(*(each.of_unknown_type for each in running)),
-                known_s=sessions.closed_s if current.splits.bytes_written else now.monotonic_s,
+                known_s=known_s,
                 silent=silent,
                 rates_hz=rates_hz,
                 settled=len(running) == 1 and current.age_s(now) >= TYPES_S,
             )
         )
-        before, self._heartbeat.shortfall = self._heartbeat.shortfall, found
+        self._report_shortfall(self._heartbeat.shortfall, found)
+        self._heartbeat.shortfall = found
+
+    def _report_shortfall(self, before: Shortfall, found: Shortfall) -> None:
         if new := sorted({*found.unheard} - {*before.unheard}):
             sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
             self._events.remark("topics_unheard", sentence, topics=new)

@@ -323,7 +323,7 @@ class TestShortfall:
         assert world.heartbeat()["fell_silent"] == []
         world.running[-1].heard = still
         world.defaults["heard"] = still
-        world.run(25)
+        world.run(30)
         stopped = sorted({"/bumper", "/door"} - {*still})
         assert world.heartbeat()["fell_silent"] == stopped
         world.run(60)
@@ -332,6 +332,18 @@ class TestShortfall:
             recorder.heard = ("/bumper", "/door")
         world.run(20)
         assert world.heartbeat()["fell_silent"] == []
+
+    def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, split_duration_s=10, required=[Required("/bumper", 3.5)])
+        world.defaults["buffers"] = True
+        world.supervisor.start()
+        world.run(60)
+        for _ in range(60):
+            world.run(1)
+            beat = world.heartbeat()
+            assert (beat["fell_silent"], beat["unheard"], beat["required_missing"]) == ([], [], [])
 
     def test_required_topics_are_missed_by_name_and_rate(self, tmp_path: Path) -> None:
         required = [Required("/bumper", 3.0), Required("/d*", 5.0), Required("/never")]
