@@ -184,7 +184,6 @@ def _watch_of(
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.search import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
@@ -197,8 +196,18 @@ def _watch_of(
         own,
         clock=WallClock(),
         split_duration_s=settings.recording.split_duration_s,
-        is_recorded=load_topics(settings.recording.topics_file).matches,
+        is_recorded=lambda topic: _is_listed(settings.recording.topics_file, topic),
     )
+
+
+def _is_listed(topics_file: Path, topic: str) -> bool:
+    """Whether the list of topics, which may have changed, has a topic; True where it is refused."""
+    from ros2_memory.recorder.process.topics import load_topics
+
+    try:
+        return load_topics(topics_file).matches(topic)
+    except ConfigError:
+        return True
 
 
 def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:

@@ -204,6 +204,22 @@ _REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class RequiredTopic:
+    """A name or a glob of topics without which recording counts as failed, and the least rate."""
+
+    topic: Text
+    min_hz: Tolerance = 0.0
+
+
+def _topic_alone(value: object) -> object:
+    """Takes a name for an entry without a rate."""
+    return {"topic": value} if isinstance(value, str) else value
+
+
+RequiredTopics: TypeAlias = tuple[Annotated[RequiredTopic, BeforeValidator(_topic_alone)], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class RecordingSettings:
     """What is recorded, and where to.
 
@@ -221,6 +237,7 @@ class RecordingSettings:
     topics_file: ConfigFile
     keep_when: ConfigFile
     exclude_when: ConfigFile
+    required: RequiredTopics
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
@@ -411,6 +428,7 @@ class Ros2BagNode(AdapterNode):
     setup_files: Annotated[tuple[AnyPath, ...], BeforeValidator(_listed)]
     latched_topics: tuple[Text, ...]
     repeat_latched: tuple[Text, ...]
+    required: RequiredTopics
     chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
 
 

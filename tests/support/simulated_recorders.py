@@ -12,6 +12,8 @@ from collections.abc import Collection, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
+import yaml
+
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.errors import RecorderError
@@ -19,6 +21,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper
 from ros2_memory.recorder.process.child import Child
+from ros2_memory.recorder.process.topics import TopicsFile
+from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
@@ -28,12 +32,14 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from ros2_memory.recorder.shortfall import Required
     from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S
 PERIOD = NS_PER_S // 4
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 TOPICS = ("/bumper", "/door")
+ANY_TOPIC = ("/*", "/*/*", "/*/*/*")
 
 
 @dataclass
@@ -55,6 +61,8 @@ class PlayedRecorder(Child):
     splits: int = 0
     patience_s: float = 15.0
     deaf: bool = False
+    buffers: bool = False
+    """Whether an open file does not grow."""
     _age_s: float = 0.0
     _subscribed: bool = False
     _held: list[Msg] = field(default_factory=list)
@@ -112,7 +120,7 @@ class PlayedRecorder(Child):
             self._held.append(replace(message, log_time=logged, publish_time=published))
         if self.directory.is_dir():
             # An open file that grows; what is in it matters when its recorder dies.
-            size = 0 if self.world.disk_full else 50 * len(self._held)
+            size = 0 if self.world.disk_full or self.buffers else 50 * len(self._held)
             (self.directory / self._file).write_bytes(MCAP_MAGIC[: size and 8] + bytes(size))
 
     @property
@@ -146,6 +154,7 @@ class World:
         *,
         housekeeper: Housekeeper | None = None,
         expected: Sequence[str] = (),
+        required: Sequence[Required] = (),
         **orders: object,
     ) -> None:
         self.bag_dir = bag_dir
@@ -167,6 +176,10 @@ class World:
         }
         self.orders = Orders(**(plan | orders))  # type: ignore[arg-type]
         self.reader = McapReader()
+        self.topics_path = bag_dir.with_name(f"{bag_dir.name}.topics.yaml")
+        self.list_topics(*expected)
+        self.topics = TopicsFile(self.topics_path)
+        self.topics.load()
         self.supervisor = Supervisor(
             self.orders,
             self._start,
@@ -176,8 +189,14 @@ class World:
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,
             device=lambda _directory: self.device,
-            expected=lambda: expected,
+            topics=self.topics,
+            required=required,
+            reception=Reception(self.reader, run=lambda task: task()),
         )
+
+    def list_topics(self, *names: str) -> None:
+        """Writes the list of topics: these, and whatever else the recorders know."""
+        self.topics_path.write_text(yaml.safe_dump({"topics": [*names, *ANY_TOPIC]}))
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:
         self.named_at_start.append(self.heartbeat()["recordings"])

@@ -57,10 +57,16 @@ from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import bags_with_remarks, nothing_here
+from ros2_memory.insights.status import (
+    bags_with_remarks,
+    nothing_here,
+    required_missing,
+    unrecorded,
+)
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.retention.policy import GB
+from ros2_memory.retention.inventory import state_bytes_in
+from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
 from ros2_memory.storage.base import BagReader, Closing
 
@@ -77,6 +83,10 @@ _COPY_AGAIN: Final = "answers use the readable part; copy the bags again for the
 _NOTHING_MISSING: Final = "nothing is missing: what it states of itself is wrong, not its messages"
 _NOT_DECODED: Final = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
 _NOT_REPAIRED: Final = "copy them again from their source, or delete them"
+_UNRECORDED: Final = (
+    "name the workspace of an unknown type in recorder.setup_files; compare the others with "
+    "`ros2 topic echo`"
+)
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 
@@ -202,6 +212,9 @@ def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Findin
         yield _warning("bag_dir", seen, "run any `ros2-memory forget`: it finishes that first")
     if records:
         yield _check_disk(settings, bag_dir, foreign_bytes)
+        if (budget := settings.retention.max_total_gb) < SMALL_BUDGET_GB:
+            do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
+            yield _warning("disk", small_budget(budget), do)
 
 
 def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
@@ -232,7 +245,11 @@ def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Findin
     mount = next(each for each in (existing, *existing.parents) if os.path.ismount(each))
     limits = settings.retention
     free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
-    seen = f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used"
+    state = state_bytes_in(bag_dir) / GB
+    seen = (
+        f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used: "
+        f"bags {max(used - state, 0):.2g} GB, what is stored beside them {state:.2g} GB"
+    )
     if foreign_bytes:
         seen += (
             f"; bags that this recorder did not make take {foreign_bytes / GB:.2g} GB more, and "
@@ -426,21 +443,25 @@ def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
 
 
 def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
-    if heartbeat.silent:
+    for seen in required_missing(heartbeat):
+        yield _error("recorder", seen, "are their publishers running? compare recording.required")
+    for seen in unrecorded(heartbeat):
+        yield _warning("recorder", seen, _UNRECORDED)
+    if silent := sorted({*heartbeat.silent} - {*heartbeat.unheard, *heartbeat.fell_silent}):
         do = (
             "is their publisher running? If it runs as another user, the recorder receives it only "
             "over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the "
             "discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
         )
-        yield _warning(
-            "recorder", f"subscribed, but no messages from: {listed(heartbeat.silent)}", do
-        )
+        yield _warning("recorder", f"subscribed, but no messages from: {listed(silent)}", do)
     if heartbeat.age_held:
         do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
         yield _warning("recorder", heartbeat.age_held, do)
     if heartbeat.unshipped:
         do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
         yield _warning("recorder", heartbeat.unshipped, do)
+    if heartbeat.list_refused:
+        yield _error("recorder", heartbeat.list_refused, "correct the list of topics")
     if heartbeat.failing_rules:
         do = (
             "correct the rule in the file that recording.exclude_when names, and restart the "
@@ -451,12 +472,21 @@ def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     elif heartbeat.held_back:
         do = "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it"
         yield _warning("recorder", heartbeat.held_back, do)
+    yield from _check_error(heartbeat)
+
+
+def _check_error(heartbeat: Heartbeat) -> Iterator[Finding]:
     if heartbeat.last_error:
-        seen = f"its last error: {heartbeat.last_error}"
+        at = heartbeat.last_error_at
+        when = "" if at is None else f" ({iso_local(at)})"
+        seen = f"its last error{when}: {heartbeat.last_error}"
         if heartbeat.restarts:
             times = counted(heartbeat.restarts, "time")
             seen = f"it restarted ros2 bag record {times}; {seen}"
-        yield _warning("recorder", seen, "see its log")
+        if heartbeat.recovered:
+            yield _ok("recorder", f"recording goes on since; {seen}")
+        else:
+            yield _warning("recorder", seen, "see its log")
 
 
 def check_ros(
@@ -495,19 +525,10 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
     live = heartbeat if heartbeat and heartbeat.is_live(now) else None
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(selection, snapshot, query_settings_of(settings).latching, heard)
-    if live and live.listed and {*live.listed} != {*selection.listed}:
-        yield _changed_list(file, selection, live)
-        return
     unoffered = live.missing if live else ()
-    others = _of_another_list(selection, live) if live else []
-    if others:
-        which = listed(others)
-        seen = f"the running recorder records or waits for {which}, not listed in {file}"
-        do = (
-            "give this command the recorder's settings (its environment and key=value arguments), "
-            "or restart the recorder if the list is newer"
-        )
-        yield _warning("topics", seen, do)
+    other = _other_list(file, selection, live) if live else None
+    if other is not None:
+        yield other
         return
     entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
@@ -515,16 +536,39 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
     elif not missing and not unoffered:
         seen = f"{entries} of {file}: all are in the newest hour of data, or latched"
         yield _ok("topics", seen)
+    unknown = live.unknown_types if live else ()
+    # ros2 bag record names one topic of each unknown type.
+    unseen = f"{_UNOFFERED}, or its type is unknown, too" if unknown else _UNOFFERED
     for entry, similar in missing.items():
         hint = f"is it {' or '.join(similar)}? " if similar else ""
-        why = f"; {_UNOFFERED}" if entry in unoffered else ""
+        why = f"; {unseen}" if entry in unoffered else ""
+        if of_unknown := [*filter(TopicSelection((entry,)).matches, unknown)]:
+            seen = f"{entry} is in {file}; ros2 bag record does not know the type of"
+            do = "name the workspace that defines it in recorder.setup_files"
+            yield _warning("topics", f"{seen} {listed(of_unknown)}", do)
+            continue
         seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
         do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
         yield _warning("topics", seen, f"{hint}{do}")
     for entry in unoffered:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
-            yield _warning("topics", f"{entry} is in {file}; {_UNOFFERED}", do)
+            yield _warning("topics", f"{entry} is in {file}; {unseen}", do)
+
+
+def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding | None:
+    """Returns the finding on a running recorder whose list is not this one; else None."""
+    if live.listed and {*live.listed} != {*selection.listed}:
+        return _changed_list(file, selection, live)
+    others = _of_another_list(selection, live)
+    if not others:
+        return None
+    seen = f"the running recorder records or waits for {listed(others)}, not listed in {file}"
+    do = (
+        "give this command the recorder's settings (its environment and key=value arguments); "
+        "a changed list is taken within seconds"
+    )
+    return _warning("topics", seen, do)
 
 
 def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding:
@@ -537,12 +581,10 @@ def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Fin
         if each
     ]
     do = (
-        "restart the recorder, which reads the list when it starts (sudo systemctl restart "
-        "ros2-memory-recorder); if it has another list, give this command its settings"
+        "a changed list is taken within seconds; if the recorder has another file, give this "
+        "command its settings"
     )
-    return _warning(
-        "topics", f"the running recorder started with another list: {'; '.join(what)}", do
-    )
+    return _warning("topics", f"the running recorder has another list: {'; '.join(what)}", do)
 
 
 def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[str]:

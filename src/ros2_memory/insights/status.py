@@ -24,6 +24,7 @@ from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.insights.silences import silences_of
 from ros2_memory.recorder.policies import OWN_TOPICS
 from ros2_memory.results import ANOTHER, Budget, SilentTopic, Status, Undecodable
+from ros2_memory.retention.inventory import state_bytes_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -164,6 +165,26 @@ def problems_of(snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> It
         yield f"the recorder waits: {heartbeat.waiting_for or 'it gives no reason'}"
     if heartbeat.held_back is not None and heartbeat.is_live(wall):
         yield heartbeat.held_back
+    if heartbeat.is_live(wall):
+        yield from required_missing(heartbeat)
+        yield from unrecorded(heartbeat)
+
+
+def required_missing(heartbeat: Heartbeat) -> Iterator[str]:
+    """Yields which topics of `recording.required` are not recorded as required, if any."""
+    if heartbeat.required_missing:
+        yield f"required, and not recorded: {listed(heartbeat.required_missing)}"
+
+
+def unrecorded(heartbeat: Heartbeat) -> Iterator[str]:
+    """Yields the topics that are offered and not recorded, a sentence for each reason."""
+    if unknown := heartbeat.unknown_types:
+        yield f"not recorded, since ros2 bag record does not know the type: {listed(unknown)}"
+    if heartbeat.unheard:
+        advice = f"; {heartbeat.advice}" if heartbeat.advice else ""
+        yield f"offered for 30 s, and no message has come: {listed(heartbeat.unheard)}{advice}"
+    if heartbeat.fell_silent:
+        yield f"regular until now, and silent: {listed(heartbeat.fell_silent)}"
 
 
 def missing_data(view: View) -> Iterator[str]:
@@ -233,7 +254,9 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     used -= 0 if foreign is None else foreign.bag_bytes
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
     if heartbeat is None or not (recording and heartbeat.is_live(wall)):
-        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes)
+        state = state_bytes_in(memory.index.bag_dir)
+        used += state
+        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes, state)
     grown, since = 0, latest
     if latest is not None:
         for bag in reversed(snapshot.bags):
@@ -243,7 +266,8 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
                 continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
-    state = 0
+    state = state_bytes_in(memory.index.bag_dir)
+    used += state
     if heartbeat.counted_bytes is not None:
         used, state = heartbeat.counted_bytes, heartbeat.state_bytes
     span = 0 if latest is None or since is None else latest - since

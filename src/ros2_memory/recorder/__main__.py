@@ -20,7 +20,13 @@ import structlog
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import build_housekeeper, build_reader, build_recorder, claim
+from ros2_memory.bootstrap import (
+    build_housekeeper,
+    build_reader,
+    build_recorder,
+    claim,
+    exclusions_of,
+)
 from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
@@ -35,6 +41,7 @@ from ros2_memory.recorder.handover.recovery import recover_handovers, recover_un
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
+from ros2_memory.retention.policy import SMALL_BUDGET_GB, small_budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -115,6 +122,8 @@ def _record(settings: Settings) -> None:
             f"recording.session_duration_s ({recording.session_duration_s:g}), which ends splits "
             "earlier",
         )
+    if settings.retention.max_total_gb < SMALL_BUDGET_GB:
+        _log.warning("budget_small", reason=small_budget(settings.retention.max_total_gb))
     bag_dir = settings.recording.bag_dir.absolute()
     reader = build_reader(settings, cache_mb=CACHE_MB)
     reader = BagDirReader(reader, bag_dir, every_message=True)
@@ -132,6 +141,10 @@ def _record(settings: Settings) -> None:
             housekeeper=housekeeper,
             own=own,
             keep_open=(lock.descriptor,),
+            excluding={
+                each.topic: f"the rule {each.name!r} of recording.exclude_when"
+                for each in exclusions_of(settings)
+            },
         )
         recorder.check()
         claim(own)

@@ -11,6 +11,7 @@ from ros2_memory.recorder.process.output import LineKind
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.recorder.process.output import Line
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -33,10 +34,23 @@ _ADVICE = {
 
 
 class EventLog:
-    """Log events of the recorder; `last_error` is the sentence of the newest fault."""
+    """Log events of the recorder.
 
-    def __init__(self) -> None:
+    Args:
+        clock: the wall clock.
+
+    Attributes:
+        last_error: the sentence of the newest fault.
+        last_error_at: when that was.
+        recovered: whether recording has gone on since.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self.last_error: str | None = None
+        self.last_error_at: Ns | None = None
+        self.recovered = False
+        self._lasting: tuple[str, str] | None = None
         self._unresolved: set[tuple[str, str]] = set()
 
     def info(self, event: str, **values: object) -> None:
@@ -49,7 +63,7 @@ class EventLog:
 
     def warn(self, event: str, sentence: str, **values: object) -> None:
         """Logs a fault that does not stop recording."""
-        self.last_error = sentence
+        self._note_error(sentence)
         _log.warning(event, reason=sentence, **values)
 
     def remark(self, event: str, sentence: str, **values: object) -> None:
@@ -58,7 +72,7 @@ class EventLog:
 
     def fail(self, event: str, sentence: str, **values: object) -> None:
         """Logs a fault that keeps something from being recorded."""
-        self.last_error = sentence
+        self._note_error(sentence)
         _log.error(event, reason=sentence, **values)
 
     def fail_once(self, event: str, subject: str, sentence: str, **values: object) -> None:
@@ -66,6 +80,23 @@ class EventLog:
         if (event, subject) not in self._unresolved:
             self._unresolved.add((event, subject))
             self.fail(event, sentence, **values)
+            self._lasting = (event, subject)
+
+    def recorded(self) -> None:
+        """Notes that recording goes on: the last fault is past, unless it lasts."""
+        self.recovered = self.last_error is not None and self._lasting not in self._unresolved
+
+    def ended(self, recording: str) -> None:
+        """Notes that a recording has ended, and with it its lasting faults."""
+        self._unresolved = {
+            (event, subject)
+            for event, subject in self._unresolved
+            if subject.partition("/")[0] != recording
+        }
+
+    def _note_error(self, sentence: str) -> None:
+        self.last_error, self.last_error_at = sentence, self._clock.now()
+        self.recovered, self._lasting = False, None
 
     def resolve(self, event: str, subject: str) -> None:
         """Has `fail_once` log the fault when it comes again."""

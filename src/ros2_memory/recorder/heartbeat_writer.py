@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.recorder.shortfall import Shortfall
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.sessions import RecordingSessions
 
@@ -33,13 +35,14 @@ class HeartbeatWriter:
         unshipped: describes bags that were deleted though they were in no lake and had to be, or
             None.
         usage: gives what the budget counts, see `Housekeeper`.
-        expected: gives the topics that are to be recorded by name.
+        topics: the list of topics to record.
         reception: knows what was lost.
-        listed: gives what the list of topics has.
+        advice: says what to do where publishers are subscribed to and not heard.
 
     Attributes:
         offered: the topics that some publisher has offered since the start.
         gone: those that none offers any more; silent in the heartbeat, too.
+        shortfall: the topics that are not recorded as they should be.
     """
 
     def __init__(
@@ -50,28 +53,29 @@ class HeartbeatWriter:
         events: EventLog,
         *,
         age_held: Callable[[], str | None],
-        expected: Callable[[], Sequence[str]],
+        topics: TopicsFile,
         reception: Reception,
         held_back: Callable[[], str | None] = lambda: None,
         failing_rules: Callable[[], tuple[str, ...]] = tuple,
         unshipped: Callable[[], str | None] = lambda: None,
-        listed: Callable[[], tuple[str, ...]] = tuple,
         usage: Callable[[], tuple[int, int] | None] = lambda: None,
+        advice: Callable[[], str] = str,
     ) -> None:
+        self._advice = advice
         self._held_back = held_back
         self._failing_rules = failing_rules
         self._unshipped = unshipped
-        self._listed = listed
         self._usage = usage
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
         self._events = events
         self._age_held = age_held
-        self._expected = expected
+        self._topics = topics
         self._reception = reception
         self.offered = set[str]()
         self.gone = frozenset[str]()
+        self.shortfall = Shortfall()
         self._state = RecorderState.STOPPED
         self._since = clock.now()
         self._written: Heartbeat | None = None
@@ -113,6 +117,8 @@ class HeartbeatWriter:
             subscribed=tuple(sorted(subscribed)),
             silent=tuple(sorted(silent | self.gone)),
             last_error=self._events.last_error,
+            last_error_at=self._events.last_error_at,
+            recovered=self._events.recovered,
             interval_s=self._interval_s,
             restarts=sessions.restarts,
             missing=self.missing(sessions),
@@ -123,10 +129,16 @@ class HeartbeatWriter:
             held_back=self._held_back(),
             failing_rules=self._failing_rules(),
             unshipped=self._unshipped(),
-            listed=self._listed(),
+            listed=self._topics.selection.listed,
+            list_refused=self._topics.refused,
             process=process_of(os.getpid()),
             counted_bytes=None if usage is None else usage[0],
             state_bytes=0 if usage is None else usage[1],
+            unknown_types=self.shortfall.unknown_types,
+            unheard=self.shortfall.unheard,
+            fell_silent=self.shortfall.fell_silent,
+            required_missing=self.shortfall.required_missing,
+            advice=self._advice() if self.shortfall.unheard else None,
         )
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
@@ -135,7 +147,9 @@ class HeartbeatWriter:
             self.offered |= session.subscribed | session.splits.received
         if not any(session.has_recorded for session in sessions.running):
             return ()
-        return tuple(sorted({*self._expected()} - self.offered))
+        unknown = (each.of_unknown_type for each in sessions.running)
+        known = self.offered.union(self.shortfall.unknown_types, *unknown)
+        return tuple(sorted({*self._topics.selection.exact} - known))
 
     def _write(self, heartbeat: Heartbeat) -> None:
         self._written = _without_amounts(heartbeat)

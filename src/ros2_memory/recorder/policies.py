@@ -60,7 +60,9 @@ class SilenceWatch:
 
     A split is closed only by a message that comes after its time, so the last messages before a
     silence would stay unreadable for as long as it lasts. A recording that grew and then stopped
-    growing is rotated once: the next one must grow before it can be rotated for silence again.
+    growing is rotated once: the next one must grow before it can be rotated for silence again. So
+    is one that never grew though topics are offered, unless the one before did not grow either:
+    some recorders live and write nothing (rosbag2 issue 2463), and another one does.
 
     A robot that publishes now and then, and is silent for longer than three splits in between,
     would begin a recording with every message. So each rotation for silence doubles the patience,
@@ -73,6 +75,8 @@ class SilenceWatch:
         self._patience_s = self._first_s
         self._settled_at_s = 0.0
         self._grew_at_s: float | None = None
+        self._has_grown = False
+        self._must_grow = False
         self._bytes = 0
 
     def began(self, now_s: float, settle_s: float) -> None:
@@ -81,19 +85,26 @@ class SilenceWatch:
         Those are its headers, and the latched messages that every recording receives again.
         """
         self._settled_at_s = now_s + settle_s
-        self._grew_at_s = None
+        self._grew_at_s = None if self._must_grow else now_s
+        self._has_grown = self._must_grow = False
         self._bytes = 0
 
-    def is_silent(self, now_s: float, bytes_written: int) -> bool:
-        """Whether to rotate, given what the recording has written so far (it never shrinks)."""
+    def is_silent(self, now_s: float, bytes_written: int, *, offered: bool = False) -> bool:
+        """Whether to rotate, given what the recording has written so far (it never shrinks).
+
+        `offered`: whether publishers offer any topic of the robot.
+        """
         if bytes_written > self._bytes:
             self._bytes = bytes_written
             if now_s >= self._settled_at_s:
-                self._grew_at_s = now_s
-        return self._grew_at_s is not None and now_s - self._grew_at_s >= self._patience_s
+                self._grew_at_s, self._has_grown = now_s, True
+        if self._grew_at_s is None or not (self._has_grown or offered):
+            return False
+        return now_s - self._grew_at_s >= self._patience_s
 
     def rotated(self, *, for_silence: bool) -> None:
         """Notes that the recording was rotated, for silence or because its session was over."""
+        self._must_grow = for_silence or not self._has_grown
         doubled_s = min(2 * self._patience_s, self._cap_s)
         self._patience_s = doubled_s if for_silence else self._first_s
 

@@ -32,20 +32,22 @@ from ros2_memory.recorder.process.environment import (
     find_ros2,
     robot_environment,
 )
-from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_split
 from ros2_memory.recorder.sessions import Orders
+from ros2_memory.recorder.shortfall import Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
 
+ROSOUT: Final = "/rosout"
 HELP_TIMEOUT_S: Final = 60.0
 LOGS_KEPT: Final = 20
 
@@ -69,10 +71,13 @@ class Ros2BagRecorder(Recorder):
             recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
+        required: topics without which recording counts as failed: a name or a glob in `topic`, and
+            in `min_hz` the least messages a second.
         chunk_bytes: size of an MCAP chunk before compression.
         housekeeper: repairs and deletes; nothing does where None.
         own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
+        excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
     """
 
     def __init__(
@@ -89,13 +94,14 @@ class Ros2BagRecorder(Recorder):
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
         repeat_latched: Sequence[str],
+        required: Sequence[Mapping[str, str | float]] = (),
         chunk_bytes: int,
         housekeeper: Housekeeper | None = None,
         own: OwnRecordings | None = None,
         keep_open: Collection[int] = (),
+        excluding: Mapping[str, str] | None = None,
     ) -> None:
         self._bag_dir = bag_dir.absolute()
-        self._topics_file = topics_file
         self._split_duration_s = split_duration_s
         self._use_sim_time = use_sim_time
         self._setup_files = tuple(setup_files)
@@ -104,14 +110,24 @@ class Ros2BagRecorder(Recorder):
         self._keep_open = tuple(keep_open)
         self._own = own or OwnRecordings(self._bag_dir)
         self._checked = False
-        self._topics = TopicSelection(())
+        by_setting = {
+            str(each["topic"]): "recording.required"
+            for each in required
+            if "*" not in str(each["topic"])
+        }
+        self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
         self._env: dict[str, str] = {}
         self._ros2 = "ros2"
         self._options: frozenset[str] = frozenset()
         self._queue_bytes = queue_mb * 2**20
         self._min_free_bytes = round(min_free_gb * GB)
         self._reception = Reception(
-            reader, self._queue_bytes, bag_dir=self._bag_dir, latched=latched_topics
+            reader,
+            self._queue_bytes,
+            bag_dir=self._bag_dir,
+            latched=latched_topics,
+            # Each recording would receive the log of an excluded time again.
+            volatile={ROSOUT} - excluding.keys() if excluding else (),
         )
         self._supervisor = Supervisor(
             Orders(
@@ -126,22 +142,23 @@ class Ros2BagRecorder(Recorder):
             reader,
             housekeeper or Housekeeper(),
             WallClock(),
-            expected=lambda: self._topics.exact,
-            listed=lambda: self._topics.listed,
+            topics=self._topics,
             own=self._own,
             reception=self._reception,
+            required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
         )
 
     def check(self) -> None:
         """Makes the environment of `ros2` and reads its options from its help."""
-        self._topics = load_topics(self._topics_file)
+        self._topics.load()
         self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         self._ros2 = find_ros2(self._env, sourced=bool(self._setup_files))
         self._options = self._known_options()
-        if self._topics.services and SERVICES not in self._options:
+        services = self._topics.selection.services
+        if services and SERVICES not in self._options:
             _log.warning(
                 "services_not_recorded",
-                topics=list(self._topics.services),
+                topics=list(services),
                 reason="this ros2 bag record has no --services: Jazzy and later have it",
             )
         self._checked = True
@@ -199,7 +216,7 @@ class Ros2BagRecorder(Recorder):
         argv = record_argv(
             ros2=self._ros2,
             directory=directory,
-            topics=self._topics,
+            topics=self._topics.selection,
             split_duration_s=self._split_duration_s,
             qos_file=qos_file,
             storage_file=storage_file,

@@ -34,7 +34,7 @@ from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -43,10 +43,13 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.handover.plan import ClockReading
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.session import SplitChanges
     from ros2_memory.storage.base import BagReader
 
+SETTLE_S: Final = 5.0
+"""A recording this young writes its headers and latched messages, which do not end a silence."""
 WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less is too short to report topics without messages."""
 
@@ -80,7 +83,7 @@ class RecordingSessions:
         events: where everything is reported.
         own: the list of recordings that were made here.
         reception: measures closed splits, and receives the publishers that were refused.
-        expected: returns the topics that are to be recorded by their names.
+        topics: the list of topics to record.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -88,6 +91,9 @@ class RecordingSessions:
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
         waiting_for: why no message has arrived since recording started, as a sentence; else None.
+        heard: the topics of which a closed split had a message.
+        closed_s: when a split was last closed, by the monotonic clock.
+        grew_s: when a recording last grew by more than its beginning, by that clock.
     """
 
     def __init__(
@@ -100,7 +106,7 @@ class RecordingSessions:
         *,
         own: OwnRecordings,
         reception: Reception,
-        expected: Callable[[], Sequence[str]] = tuple,
+        topics: TopicsFile,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -108,7 +114,7 @@ class RecordingSessions:
         self._announce = announce
         self._own = own
         self._reception = reception
-        self._expected = expected
+        self._topics = topics
         self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
@@ -121,6 +127,9 @@ class RecordingSessions:
         self._ended_bytes = 0
         self.restarts = 0
         self.waiting_for: str | None = None
+        self.heard = set[str]()
+        self.closed_s = 0.0
+        self.grew_s = 0.0
         self._silent_since_s: float | None = None
         self._interruptions: list[tuple[Ns, Interruption]] = []
 
@@ -137,6 +146,7 @@ class RecordingSessions:
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
         self._silent_since_s = now.monotonic_s
+        self.grew_s = max(self.grew_s, now.monotonic_s)
 
     def begin_handover(self, now: ClockReading) -> None:
         """Starts a recording that is to take over from the current one.
@@ -156,7 +166,14 @@ class RecordingSessions:
             raise
         orders = self._orders
         plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)
-        self.handover = HandoverTransfer(old, new, plan, self._reader, simulated=orders.simulated)
+        self.handover = HandoverTransfer(
+            old,
+            new,
+            plan,
+            self._reader,
+            simulated=orders.simulated,
+            is_listed=self._topics.selection.matches,
+        )
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
@@ -182,6 +199,9 @@ class RecordingSessions:
             self._silent_since_s = None
         since_s, current = self._silent_since_s, self.current
         patience_s = max(WAITING_S, self._orders.split_duration_s)
+        if current is not None and current.splits.bytes_written:
+            # What it has is known when its first split is closed.
+            patience_s += self._orders.split_duration_s
         if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
             self.waiting_for = None
             self._events.resolve("recording_waits", "")
@@ -194,7 +214,11 @@ class RecordingSessions:
     def _hears(self, session: RecordingSession) -> bool:
         """Returns whether a session has recorded something that may be of the robot."""
         splits = session.splits
-        if session.subscribed | splits.received <= OWN_TOPICS and {*self._expected()} - OWN_TOPICS:
+        if splits.received - OWN_TOPICS:
+            return True
+        # Of what else it writes, some may be of nodes of its own user, as /rosout always is.
+        others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
+        if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
             return False
         return bool(splits.messages or splits.bytes_written)
 
@@ -322,10 +346,15 @@ class RecordingSessions:
         changes = session.splits.observe(now.monotonic_s)
         if session.splits.bytes_written > before:
             session.grew_at = now.wall
+            # The end of a file is written when its recording ends, too.
+            if session.is_recording and session.age_s(now) >= SETTLE_S:
+                self.grew_s = now.monotonic_s
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)
             self._reception.learn(session.name, session.splits.directory / name)
         if changes.closed:
+            self.heard |= session.splits.received
+            self.closed_s = now.monotonic_s
             self._flush(session, session.splits.directory, changes.closed)
         for name in changes.empty:
             file = f"{session.name}/{name}"
@@ -435,6 +464,7 @@ class RecordingSessions:
             with self._reported(session):
                 completed.add_late_splits()
         self._list_own(session)
+        self._events.ended(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
             self._events.info("recording_empty", recording=session.name)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
@@ -26,7 +28,8 @@ from ros2_memory.recorder.policies import (
     space_action,
 )
 from ros2_memory.recorder.reception.reception import Reception
-from ros2_memory.recorder.sessions import RecordingSessions
+from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
+from ros2_memory.recorder.shortfall import Required, Seen, Shortfall, TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
@@ -36,6 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.sessions import Orders
     from ros2_memory.storage.base import BagReader
 
@@ -47,13 +51,17 @@ SCREENING_S: Final = 2.0
 """How often closed splits are looked for that are to be screened."""
 FAULT_S: Final = 60.0
 """How often a failing task, which every tick tries again, is reported."""
-SETTLE_S: Final = 5.0
-"""A recording this young writes its headers and latched messages, which do not end a silence."""
 RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
 HEARTBEAT_S: Final = 5.0
+LIST_S: Final = 2.0
+"""How often the file of topics is looked at."""
+TOPICS_S: Final = 1.0
+"""How often topics are looked for that are not recorded as they should be."""
+IDLE_SPLITS: Final = 2
+"""Recordings that have not grown for longer than so many splits are idle."""
 TYPES_S: Final = 15.0
 """By then a recording has subscribed to all topics of known types that are offered."""
 
@@ -70,10 +78,10 @@ class Supervisor:
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
-        expected: gives the topics that are to be recorded by name.
-        listed: gives what the list of topics has.
+        topics: the list of topics to record.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed.
+        required: the topics without which recording counts as failed.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -90,10 +98,10 @@ class Supervisor:
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
-        expected: Callable[[], Sequence[str]] = tuple,
-        listed: Callable[[], tuple[str, ...]] = tuple,
+        topics: TopicsFile,
         own: OwnRecordings | None = None,
         reception: Reception | None = None,
+        required: Sequence[Required] = (),
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
@@ -102,7 +110,7 @@ class Supervisor:
         self._free_bytes_of = free_bytes_of
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
-        self._events = EventLog()
+        self._events = EventLog(clock)
         self._reception = reception or Reception(reader)
         self._heartbeat = HeartbeatWriter(
             orders.bag_dir,
@@ -114,9 +122,9 @@ class Supervisor:
             failing_rules=housekeeper.failing_rules,
             unshipped=housekeeper.unshipped,
             usage=housekeeper.usage,
-            expected=expected,
+            topics=topics,
             reception=self._reception,
-            listed=listed,
+            advice=orders.advice,
         )
         self._sessions = RecordingSessions(
             orders,
@@ -126,14 +134,15 @@ class Supervisor:
             self._events,
             own=own or OwnRecordings(orders.bag_dir),
             reception=self._reception,
-            expected=expected,
+            topics=topics,
         )
+        self._topics = topics
+        self._topic_watch = TopicWatch(required)
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
-        self._expected = expected
         self._unknown = frozenset[str]()
         self._not_offered = frozenset[str]()
         self._paused = False
@@ -209,10 +218,12 @@ class Supervisor:
             "deaths": self._check_exits,
             "space": self._check_space,
             "takeover": self._check_handover,
+            "list": self._check_list,
             "rotation": self._check_rotation,
             "restart": self._check_restart,
             "types": self._check_types,
             "offers": self._check_offers,
+            "topics": self._check_topics,
             "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
             "house": self._apply_retention,
@@ -229,10 +240,13 @@ class Supervisor:
 
     def _observe(self, now: ClockReading) -> None:
         if self._is_due("observe", OBSERVE_S, now):
-            self._splits_closed |= self._sessions.observe(now)
+            closed = self._sessions.observe(now)
+            self._splits_closed |= closed
             current = self._sessions.current
             if current is not None and current.splits.messages:
                 self._backoff.succeeded()
+                if closed:
+                    self._events.recorded()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -325,7 +339,11 @@ class Supervisor:
         current = self._sessions.current
         if current is None:
             return
-        silent = self._silence.is_silent(now.monotonic_s, current.splits.bytes_written)
+        silent = self._silence.is_silent(
+            now.monotonic_s,
+            current.splits.bytes_written,
+            offered=bool(current.subscribed - OWN_TOPICS),
+        )
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
         over = current.age_s(now) >= self._orders.session_duration_s
@@ -336,22 +354,40 @@ class Supervisor:
             return
         if silent:
             sentence = (
-                f"{current.name} has stopped growing: the robot is silent, or its messages do not "
+                f"{current.name} does not grow: the robot is silent, or its messages do not "
                 "arrive; the recording is closed"
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over
-        self._rotate_now = False
         try:
             self._sessions.begin_handover(now)
         except RecorderError as error:
             self._events.fail("rotation_failed", str(error), recording=current.name)
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             return
+        self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
             report = self._events.warn if resubscribe.is_fault else self._events.note
             report(resubscribe.event, resubscribe.sentence, recording=current.name)
+
+    def _check_list(self, now: ClockReading) -> None:
+        """Has a new recording begin where the list of topics was changed."""
+        if not self._is_due("list", LIST_S, now):
+            return
+        before = self._topics.selection.listed
+        if self._topics.look():
+            listed_now = self._topics.selection.listed
+            self._rotate_now |= self._sessions.current is not None
+            self._events.info(
+                "topics_changed",
+                added=sorted({*listed_now} - {*before}),
+                dropped=sorted({*before} - {*listed_now}),
+            )
+        if self._topics.refused is None:
+            self._events.resolve("topics_refused", "")
+        else:
+            self._events.fail_once("topics_refused", "", self._topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
         if self._sessions.current is not None or self._paused or self._disk.away:
@@ -372,7 +408,9 @@ class Supervisor:
         current = self._sessions.current
         if current is None or not current.of_unknown_type or current.age_s(now) < TYPES_S:
             return
-        unknown = frozenset({*self._expected(), *current.of_unknown_type} - current.subscribed)
+        unknown = frozenset(
+            {*self._topics.selection.exact, *current.of_unknown_type} - current.subscribed
+        )
         if unknown != self._unknown:
             self._unknown = unknown
             self._events.warn(
@@ -392,7 +430,7 @@ class Supervisor:
         current = self._sessions.current
         if current is None or current.age_s(now) < WAITING_S or self._sessions.handover is not None:
             return
-        missing = frozenset(self._heartbeat.missing(self._sessions)) - current.of_unknown_type
+        missing = frozenset(self._heartbeat.missing(self._sessions))
         if new := missing - self._not_offered:
             self._events.remark(
                 "topic_not_offered",
@@ -401,7 +439,8 @@ class Supervisor:
                 topics=sorted(new),
             )
         self._not_offered |= missing
-        gone = frozenset(self._heartbeat.offered - current.subscribed - OWN_TOPICS)
+        offered = self._heartbeat.offered - current.subscribed - OWN_TOPICS
+        gone = frozenset(filter(self._topics.selection.matches, offered))
         if new := gone - self._heartbeat.gone:
             self._events.remark(
                 "topic_silent",
@@ -409,6 +448,43 @@ class Supervisor:
                 topics=sorted(new),
             )
         self._heartbeat.gone = gone
+
+    def _check_topics(self, now: ClockReading) -> None:
+        """Looks for topics that are offered and not recorded, and for required ones."""
+        current = self._sessions.current
+        if current is None or not self._is_due("topics", TOPICS_S, now):
+            return
+        running, sessions = self._sessions.running, self._sessions
+        split_s = self._orders.split_duration_s
+        # What comes slowly is written when its split is closed.
+        idle_s = max(0.0, now.monotonic_s - sessions.grew_s - IDLE_SPLITS * split_s)
+        known_s = sessions.closed_s if current.splits.bytes_written else now.monotonic_s - split_s
+        silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
+        found = self._topic_watch.look(
+            Seen(
+                now_s=now.monotonic_s,
+                offered=frozenset[str]().union(*(each.subscribed for each in running)),
+                heard=sessions.heard,
+                unknown=frozenset[str]().union(*(each.of_unknown_type for each in running)),
+                known_s=known_s,
+                silent=silent,
+                rates_hz=rates_hz,
+                settled=len(running) == 1 and current.age_s(now) >= TYPES_S,
+            )
+        )
+        self._report_shortfall(self._heartbeat.shortfall, found)
+        self._heartbeat.shortfall = found
+
+    def _report_shortfall(self, before: Shortfall, found: Shortfall) -> None:
+        if new := sorted({*found.unheard} - {*before.unheard}):
+            sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
+            self._events.remark("topics_unheard", sentence, topics=new)
+        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
+            sentence = f"regular until now, and silent: {listed(new)}"
+            self._events.remark("topics_stopped", sentence, topics=new)
+        if found.required_missing and not before.required_missing:
+            sentence = f"required, and not recorded: {listed(found.required_missing)}"
+            self._events.remark("required_missing", sentence)
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)

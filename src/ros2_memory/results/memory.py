@@ -45,7 +45,6 @@ ANOTHER: Final = "another program"
 _MAX_LISTED: Final = 20
 _MAX_TOPICS: Final = 10
 _S_PER_DAY: Final = 86_400
-_LARGE_PARTS: Final = 10
 _SMALL_BYTES: Final = GB // 10
 """Smaller sizes are given to the kilobyte."""
 
@@ -149,7 +148,7 @@ class SilentTopic:
 @result(
     _GIGABYTES("used_gb", "used"),
     _GIGABYTES("max_gb", "most"),
-    _GIGABYTES("state_gb", "large_state").if_known,
+    _GIGABYTES("state_gb", "state").if_any,
     _GIGABYTES("foreign_gb", "foreign"),
     _GIGABYTES("growth_gb_per_day", "per_day"),
     digits(2)("full_in_days").if_known,
@@ -158,7 +157,7 @@ class SilentTopic:
 class Budget:
     """The bytes of all bags, the limit, and the growth per day; None where not known.
 
-    `used` is what a live recorder counts, its own files (`state`) and sidecars too. `foreign`: the
+    `used` is all that counts, and `state` what of it is stored beside the bags. `foreign`: the
     bytes of bags that the recorder did not make; they are in none of the others.
     """
 
@@ -168,12 +167,6 @@ class Budget:
     max_age: Ns | None
     foreign: int | None = None
     state: int = 0
-
-    @property
-    def large_state(self) -> int | None:
-        """The bytes of all but recordings, if that is a large part of the limit."""
-        is_large = self.most is not None and _LARGE_PARTS * self.state > self.most
-        return self.state if is_large else None
 
     @property
     def full_in_days(self) -> float | None:

@@ -130,7 +130,7 @@ class Inventory:
             OSError: the list of the recorder's own recordings cannot be read.
         """
         bags: list[StoredBag] = []
-        others = state_bytes = self._own_bytes()
+        others = state_bytes = state_bytes_in(self._root)
         occupied: set[str] = set()
         mixed: set[str] = set()
         foreign: dict[tuple[int, int], int] = {}
@@ -303,16 +303,17 @@ class Inventory:
             for path in self._folders.keys() - recordings:
                 del self._folders[path]
 
-    def _own_bytes(self) -> int:
-        """Returns the size of what this program stores beside the recordings, in bytes."""
-        own = [self._root / name for name in (*OWN_FILES, LOCK_FILE)]
+
+def state_bytes_in(bag_dir: Path) -> int:
+    """Returns the size of what is stored beside the bags, columns and logs, in bytes."""
+    own = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
+    with suppress(OSError):
+        own += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
+    for folder in OWN_FOLDERS:
         with suppress(OSError):
-            own += (self._root / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
-        for folder in OWN_FOLDERS:
-            with suppress(OSError):
-                own += (self._root / folder).iterdir()
-        # Deleting bags makes that list longer.
-        return sum(size_of(each) for each in own if each != self._root / DELETED_FILE)
+            own += (bag_dir / folder).iterdir()
+    # Deleting bags makes that list longer.
+    return sum(size_of(each) for each in own if each != bag_dir / DELETED_FILE)
 
 
 def _file(device: int, stamp: Stamp) -> StoredFile:

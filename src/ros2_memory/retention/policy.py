@@ -36,10 +36,20 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
 _BLOCK: Final = 4096
+SMALL_BUDGET_GB: Final = 0.1
+"""Of a smaller budget, what is stored beside the bags may take a large part."""
 GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """A shorter pause never parts two eras, however little history is kept."""
+
+
+def small_budget(max_total_gb: float) -> str:
+    """Returns the warning about a budget below `SMALL_BUDGET_GB`."""
+    return (
+        f"retention.max_total_gb={max_total_gb:g} is less than {SMALL_BUDGET_GB:g}: what is stored "
+        "beside the bags counts, too, and may take a large part of it"
+    )
 
 
 @dataclass(frozen=True, slots=True)

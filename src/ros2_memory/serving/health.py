@@ -17,7 +17,7 @@ from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.reply import moment, seconds
 from ros2_memory.history.context import short_name
-from ros2_memory.insights.status import clock_faults, left_open, problems_of
+from ros2_memory.insights.status import clock_faults, left_open, problems_of, unrecorded
 from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
@@ -229,10 +229,14 @@ def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "heartbeat_age_s": seconds(now - heartbeat.updated),
         "restarts": heartbeat.restarts,
         "last_error": None if error is None else _short(error),
+        "last_error_at": moment(heartbeat.last_error_at),
+        "recovered": heartbeat.recovered,
         "waiting_for": None if waits is None else _short(waits),
         "age_held": None if held is None else _short(held),
         "unshipped": None if unshipped is None else _short(unshipped),
         "failing_rules": [_short(each) for each in heartbeat.failing_rules],
+        "required_missing": [_short(each) for each in heartbeat.required_missing[:_MAX_MISSING]],
+        "degraded": [_short(each) for each in unrecorded(heartbeat)],
     }
     for kind, topics, most in (
         ("silent", heartbeat.silent, _MAX_TOPICS),

@@ -60,14 +60,19 @@ _UNAVAILABLE: Final = 503
 def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     """Returns whether the recorder records, by what `/health` shows: 200, else 503.
 
-    Also 503 while a rule of `recording.exclude_when` cannot be evaluated: nothing is served then of
-    what is recorded, or it is served against the rule.
+    Also 503 while a topic of `recording.required` is not recorded as required, or a rule of
+    `recording.exclude_when` cannot be evaluated: nothing is served then of what is recorded, or it
+    is served against the rule. Other topics that are offered and not recorded are in `degraded`.
     """
     found = report.get("recorder")
     recorder = found if isinstance(found, dict) else {}
     failing = recorder.get("failing_rules")
+    required = recorder.get("required_missing")
     recording = (
-        recorder.get("live") is True and recorder.get("state") == "recording" and not failing
+        recorder.get("live") is True
+        and recorder.get("state") == "recording"
+        and not failing
+        and not required
     )
     shown: JsonObject = {"recording": recording}
     if all_of_it:
@@ -75,6 +80,8 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
         shown["recorder_alive"] = recorder.get("live", False)
         shown["waiting_for"] = recorder.get("waiting_for")
         shown["failing_rules"] = failing or []
+        shown["required_missing"] = required or []
+        shown["degraded"] = recorder.get("degraded") or []
     return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
 

@@ -205,7 +205,8 @@ class TestInfo:
         )
         assert cli.main(["info", "deployment=robot", "retention.max_total_gb=2.0"]) == 0
         shown = capsys.readouterr().out
-        assert "of 2 GB" in shown
+        assert "of 2 GB: bags 0" in shown
+        assert "what is stored beside them 0" in shown
         assert "full in" in shown
 
     def test_a_small_budget_is_in_megabytes(self) -> None:

@@ -73,7 +73,7 @@ def robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, port: int) -> Path:
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
     monkeypatch.setenv("MCP_PORT", str(port))
-    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.01"]
+    overrides = [f"recording.topics_file={tmp_path / 'topics.yaml'}", "retention.max_total_gb=0.1"]
     monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", " ".join([*overrides, "retention.min_free_gb=0"]))
     beat(bag_dir)
     return bag_dir
@@ -177,7 +177,21 @@ def test_of_bags_that_are_not_there_nothing_is_used(tmp_path: Path, capsys: Capt
         other.truncate(10**8)
     cli.main(["doctor", "--json", f"recording.bag_dir={tmp_path / 'gone'}"])
     seen = {each["about"]: each["seen"] for each in json.loads(capsys.readouterr().out)["findings"]}
-    assert "; 0.0 of 5 GB used" in seen["disk"]
+    assert "; 0.0 of 5 GB used: bags 0 GB, what is stored beside them 0 GB" in seen["disk"]
+
+
+def test_a_budget_of_which_what_is_beside_the_bags_takes_much_is_reported(
+    robot: Path, capsys: Capture
+) -> None:
+    (robot / ".episodic").mkdir()
+    (robot / ".episodic" / "columns.sqlite").write_bytes(bytes(20_000_000))
+    assert cli.main(["doctor"]) == 0
+    shown = " ".join(capsys.readouterr().out.split())
+    assert "0.0 of 0.1 GB used: bags " in shown
+    assert "what is stored beside them 0.02 GB" in shown
+    code, wrong = examined(capsys, "retention.max_total_gb=0.05")
+    assert code == 1
+    assert "retention.max_total_gb=0.05 is less than 0.1" in wrong["disk"][-1]["seen"]
 
 
 def test_data_from_the_future_means_that_the_clock_is_wrong(robot: Path, capsys: Capture) -> None:
@@ -428,6 +442,37 @@ def test_a_topic_that_nobody_offers_and_restarts_are_reported(robot: Path, capsy
     assert "it restarted ros2 bag record 1 time; its last error" in wrong["recorder"][0]["seen"]
 
 
+def test_an_error_that_is_past_is_shown_with_its_time(robot: Path, capsys: Capture) -> None:
+    beat(robot, last_error="it died", last_error_at=time.time_ns(), recovered=True, restarts=1)
+    assert cli.main(["doctor"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert (
+        "recording goes on since; it restarted ros2 bag record 1 time; its last error (20" in said
+    )
+
+
+def test_a_topic_of_an_unknown_type_is_offered_and_not_recorded(
+    robot: Path, capsys: Capture
+) -> None:
+    topics = robot.parent / "topics.yaml"
+    topics.write_text("topics: [/odom, /arm, /gone]\n")
+    beat(robot, missing=("/gone",), unknown_types=("/arm",))
+    code, wrong = examined(capsys)
+    assert code == 1
+    arm, gone = wrong["topics"]
+    assert arm["seen"].endswith("ros2 bag record does not know the type of /arm")
+    assert arm["do"].startswith("name the workspace")
+    assert gone["seen"].endswith("since the recorder started, or its type is unknown, too")
+
+
+def test_what_is_required_and_not_recorded_is_an_error(robot: Path, capsys: Capture) -> None:
+    beat(robot, required_missing=("/odom: 2 Hz, and 10 are required",), unheard=("/scan",))
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "/odom: 2 Hz, and 10 are required" in wrong["recorder"][0]["seen"]
+    assert "no message has come: /scan" in wrong["recorder"][1]["seen"]
+
+
 class TestExtras:
     def test_what_the_configuration_asks_for_must_be_installed(
         self, robot: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture
@@ -476,7 +521,7 @@ def test_a_recorder_with_another_list_of_topics_is_reported_instead_of_the_topic
     assert "settings" in finding["do"]
 
 
-def test_a_list_of_topics_that_was_changed_since_the_recorder_started_asks_for_a_restart(
+def test_a_list_of_topics_that_the_recorder_does_not_have_is_reported(
     robot: Path, capsys: Capture
 ) -> None:
     beat(robot, listed=("/odom", "/gone"))
@@ -486,7 +531,14 @@ def test_a_list_of_topics_that_was_changed_since_the_recorder_started_asks_for_a
     assert code == 1
     assert "adds /said" in finding["seen"]
     assert "lacks /gone" in finding["seen"]
-    assert finding["do"].startswith("restart the recorder")
+    assert finding["do"].startswith("a changed list is taken within seconds")
+
+
+def test_a_changed_list_that_the_recorder_refuses_is_an_error(robot: Path, capsys: Capture) -> None:
+    beat(robot, listed=("/odom",), list_refused="topics.yaml: it is not YAML; it keeps the list")
+    code, wrong = examined(capsys)
+    assert code == 2
+    assert "it is not YAML" in wrong["recorder"][0]["seen"]
 
 
 def test_what_the_recorder_receives_by_now_is_not_missed_in_closed_bags(

@@ -308,7 +308,7 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
     assert (budget["used_gb"], budget["state_gb"]) == (0.0049, 0.0047)
     beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=200_000, state_bytes=50_000)
     budget = shown(memory, tmp_path)["budget"]
-    assert (budget["used_gb"], "state_gb" in budget) == (0.0002, False)
+    assert (budget["used_gb"], budget["state_gb"]) == (0.0002, 0.00005)
 
 
 def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
@@ -324,14 +324,16 @@ def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
 def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
     size = (tmp_path / "bag.mcap").stat().st_size
-    budget = RetentionLimits(max_total_bytes=size * 49, max_age_ns=7 * DAY)
-    memory = replace(memory, limits=replace(memory.limits, kept=budget))
     beating(tmp_path, RecorderState.RECORDING, 59)
+    beside = (tmp_path / "recorder.json").stat().st_size
+    budget = RetentionLimits(max_total_bytes=size * 49 + beside, max_age_ns=7 * DAY)
+    memory = replace(memory, limits=replace(memory.limits, kept=budget))
     answer = memory_status(memory, Call())
-    assert (answer.budget.used, answer.budget.per_day) == (size, size * 24)  # all within an hour
+    assert (answer.budget.used, answer.budget.state) == (size + beside, beside)
+    assert answer.budget.per_day == size * 24  # all within an hour
     told = shown(memory, tmp_path)["budget"]
     assert told["full_in_days"] == 2.0
-    assert told["keeps_days"] == 2.04
+    assert told["keeps_days"] == 2.05
     older = replace(memory.limits, kept=replace(budget, max_age_ns=DAY))
     assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.support.simulated_recorders import World
+from tests.support.simulated_recorders import PlayedHousekeeper, World
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,3 +56,33 @@ def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
     world.running[0].die()
     world.run(10)
     assert world.heartbeat()["missing"] == ["/gone"]
+
+
+def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path) -> None:
+    world = World(tmp_path)
+    world.supervisor.start()
+    world.run(20)
+    world.running[0].die()
+    world.run(0.25)
+    beat = world.heartbeat()
+    assert "was killed" in beat["last_error"]
+    assert (beat["last_error_at"], beat["recovered"]) == (world.wall, False)
+    world.run(20)
+    later = world.heartbeat()
+    assert (later["last_error"], later["recovered"]) == (beat["last_error"], True)
+    assert later["last_error_at"] == beat["last_error_at"]
+
+
+def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
+    housekeeper = PlayedHousekeeper()
+    world = World(tmp_path, housekeeper=housekeeper)
+    world.supervisor.start()
+    housekeeper.failed = {"apply": "the list cannot be read"}
+    world.run(30)
+    assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (
+        "the list cannot be read",
+        False,
+    )
+    housekeeper.failed = {}
+    world.run(10)
+    assert world.heartbeat()["recovered"] is True

@@ -9,6 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.recorder.shortfall import Required
 from tests.support.simulated_recorders import World, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
@@ -272,3 +273,170 @@ def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> 
     (reported,) = events(logs, "topics_not_recorded")
     assert "not recorded: /arm, /grip;" in reported["reason"]
     assert "of those that a glob selects, others of the same type" in reported["reason"]
+
+
+class TestShortfall:
+    """Topics that are offered and not recorded, as the heartbeat has them."""
+
+    def test_a_topic_of_unknown_type_is_offered_and_not_missing(self, tmp_path: Path) -> None:
+        world = World(tmp_path, expected=("/bumper", "/door", "/arm", "/never"))
+        world.defaults["lines"] = [
+            "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
+        ]
+        world.supervisor.start()
+        world.run(7)
+        assert world.heartbeat()["unknown_types"] == ["/arm"]
+        assert world.heartbeat()["missing"] == ["/never"]
+
+    def test_a_topic_that_is_offered_and_never_comes_is_named_with_advice(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20, advice=lambda: "look at the users")
+        world.defaults["heard"] = ("/bumper",)
+        world.supervisor.start()
+        world.run(25)
+        assert world.heartbeat()["unheard"] == []
+        with capture_logs() as logs:
+            world.run(60)
+        beat = world.heartbeat()
+        assert (beat["state"], beat["unheard"]) == ("recording", ["/door"])
+        assert beat["advice"] == "look at the users"
+        assert [each["topics"] for each in events(logs, "topics_unheard")] == [["/door"]]
+        world.running[-1].heard = ("/bumper", "/door")
+        world.run(15)
+        assert (world.heartbeat()["unheard"], world.heartbeat()["advice"]) == ([], None)
+
+    def test_services_and_actions_may_be_unused(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.defaults |= {"topics": ("/bumper", "/go/_action/feedback"), "heard": ("/bumper",)}
+        world.supervisor.start()
+        world.run(60)
+        assert world.heartbeat()["unheard"] == []
+
+    @pytest.mark.parametrize("still", [("/bumper",), ()])
+    def test_a_regular_topic_that_stops_is_silent_until_it_comes(
+        self, tmp_path: Path, still: tuple[str, ...]
+    ) -> None:
+        world = World(tmp_path)
+        world.supervisor.start()
+        world.run(60)
+        assert world.heartbeat()["fell_silent"] == []
+        world.running[-1].heard = still
+        world.defaults["heard"] = still
+        world.run(30)
+        stopped = sorted({"/bumper", "/door"} - {*still})
+        assert world.heartbeat()["fell_silent"] == stopped
+        world.run(60)
+        assert world.heartbeat()["fell_silent"] == stopped
+        for recorder in world.running:
+            recorder.heard = ("/bumper", "/door")
+        world.run(20)
+        assert world.heartbeat()["fell_silent"] == []
+
+    def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, split_duration_s=10, required=[Required("/bumper", 3.5)])
+        world.defaults["buffers"] = True
+        world.supervisor.start()
+        world.run(60)
+        for _ in range(60):
+            world.run(1)
+            beat = world.heartbeat()
+            assert (beat["fell_silent"], beat["unheard"], beat["required_missing"]) == ([], [], [])
+
+    def test_required_topics_are_missed_by_name_and_rate(self, tmp_path: Path) -> None:
+        required = [Required("/bumper", 3.0), Required("/d*", 5.0), Required("/never")]
+        world = World(tmp_path, required=required)
+        world.supervisor.start()
+        world.run(20)
+        assert world.heartbeat()["required_missing"] == []
+        world.run(40)
+        rate, never = world.heartbeat()["required_missing"]
+        assert rate.startswith("/door: 4")
+        assert rate.endswith("Hz, and 5 are required")
+        assert never == "/never: no publisher offers it"
+        world.running[-1].heard = ("/door",)
+        world.run(30)
+        assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
+
+    def test_of_another_user_only_nodes_of_the_recorders_user_are_heard(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path, advice=lambda: "look at the users")
+        world.defaults |= {"topics": ("/rosout", "/odom"), "heard": ("/rosout",)}
+        world.supervisor.start()
+        world.run(45)
+        beat = world.heartbeat()
+        assert beat["state"] == "waiting"
+        assert "look at the users" in beat["waiting_for"]
+
+    def test_a_child_that_lives_and_writes_nothing_is_replaced_once(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.defaults["deaf"] = True
+        world.supervisor.start()
+        world.run(10)
+        world.defaults["deaf"] = False
+        world.run(20)
+        assert [each.deaf for each in world.running] == [False]
+        assert world.heartbeat()["state"] == "recording"
+
+    def test_a_robot_that_says_nothing_is_not_asked_again_and_again(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.silent = True
+        world.supervisor.start()
+        world.run(300)
+        assert len(world.recorders) == 2
+
+
+class TestChangedList:
+    def test_a_changed_list_begins_a_recording_and_loses_nothing(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
+        world.supervisor.start()
+        world.run(20)
+        world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
+        world.topics_path.write_text("topics: [/bumper, /lidar]\n")
+        with capture_logs() as logs:
+            world.run(15)
+        [changed] = events(logs, "topics_changed")
+        assert changed["added"] == ["/lidar"]
+        assert "/door" in changed["dropped"]
+        assert not events(logs, "rotated_without")
+        beat = world.heartbeat()
+        assert (beat["listed"], beat["subscribed"]) == (["/bumper", "/lidar"],) * 2
+        assert (len(world.recorders), beat["missing"], beat["silent"]) == (2, [], [])
+        world.run(60)
+        assert world.heartbeat()["fell_silent"] == []
+        assert len(world.recorders) == 2
+        world.supervisor.stop()
+        stands, counts = world.published(counting=False), world.published(counting=True)
+        assert counts == dict.fromkeys(stands, 1)
+
+    def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
+        world.supervisor.start()
+        world.run(20)
+        before = world.heartbeat()["listed"]
+        world.topics_path.write_text("topics: [no slash]\n")
+        with capture_logs() as logs:
+            world.run(30)
+        [refused] = events(logs, "topics_refused")
+        beat = world.heartbeat()
+        assert beat["list_refused"] == refused["reason"] == beat["last_error"]
+        assert "'no slash' cannot be recorded" in beat["list_refused"]
+        assert (beat["listed"], beat["recovered"], len(world.recorders)) == (before, False, 1)
+        world.topics_path.write_text("topics: [/bumper, /door]\n")
+        world.run(20)
+        beat = world.heartbeat()
+        assert (beat["list_refused"], beat["listed"]) == (None, ["/bumper", "/door"])
+
+    def test_a_file_that_is_touched_or_written_in_steps_is_no_change(self, tmp_path: Path) -> None:
+        world = World(tmp_path / "bags", expected=("/bumper",))
+        whole = world.topics_path.read_text()
+        world.supervisor.start()
+        world.run(20)
+        world.topics_path.write_text("topics:\n")
+        world.run(1.5)
+        world.topics_path.write_text(whole)
+        world.run(20)
+        assert (len(world.recorders), world.heartbeat()["last_error"]) == (1, None)

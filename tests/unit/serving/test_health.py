@@ -145,10 +145,14 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
         "silent_topics": ["/b"],
         "missing_topics": ["/c"],
         "last_error": None,
+        "last_error_at": None,
+        "recovered": False,
         "waiting_for": None,
         "age_held": None,
         "unshipped": None,
         "failing_rules": [],
+        "required_missing": [],
+        "degraded": [],
     }
 
 
@@ -274,10 +278,46 @@ async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> 
         (tmp_path / f"{'x' * 200}{number}.mcap").write_bytes(b"no bag at all, but not empty")
     names = tuple(f"/topic_{n}/{'y' * 300}" for n in range(1000))
     reply = beat(RecorderState.PAUSED, updated=T0 + 3600 * NS_PER_S, last_error="z" * 100_000)
-    write_heartbeat(tmp_path, replace(reply, silent=names, subscribed=names, missing=names))
+    write_heartbeat(
+        tmp_path,
+        replace(
+            reply,
+            silent=names,
+            subscribed=names,
+            missing=names,
+            unheard=names[:5],
+            required_missing=names[:7],
+        ),
+    )
     said = await Health(memory_at(tmp_path, seconds=3600), "1")()
-    assert len(json.dumps(said)) < 10_000
+    assert len(json.dumps(said)) < 14_000
     assert said["damaged"] == 50
     assert isinstance(said["recorder"], dict)
     assert said["recorder"]["more_silent_topics"] == 980
     assert said["recorder"]["more_missing_topics"] == 994
+
+
+async def test_topics_that_are_offered_and_not_recorded_degrade_it(tmp_path: Path) -> None:
+    heard = beat(RecorderState.RECORDING)
+    write_heartbeat(
+        tmp_path,
+        replace(
+            heard,
+            unknown_types=("/arm",),
+            unheard=("/scan",),
+            fell_silent=("/odom",),
+            required_missing=("/odom: it came regularly, and is silent",),
+            advice="look at the users",
+        ),
+    )
+    report = await Health(memory_at(tmp_path), "1.2.3")()
+    assert report["status"] == "degraded"
+    assert report["problems"] == [
+        "required, and not recorded: /odom: it came regularly, and is silent",
+        "not recorded, since ros2 bag record does not know the type: /arm",
+        "offered for 30 s, and no message has come: /scan; look at the users",
+        "regular until now, and silent: /odom",
+    ]
+    recorder = report["recorder"]
+    assert isinstance(recorder, dict)
+    assert len(recorder["degraded"] or []) == 3  # type: ignore[arg-type]

@@ -106,6 +106,8 @@ async def test_health_is_json() -> None:
         ({"state": "waiting", "live": True, "waiting_for": "/clock"}, 503),
         ({"state": "paused", "live": True}, 503),
         ({"state": "recording", "live": True, "failing_rules": ["the rule a: no field"]}, 503),
+        ({"state": "recording", "live": True, "required_missing": ["/odom: no publisher"]}, 503),
+        ({"state": "recording", "live": True, "degraded": ["silent: /scan"]}, 200),
         (None, 503),
     ],
 )
@@ -118,6 +120,8 @@ async def test_whether_it_records_is_a_status_of_its_own(
     assert shown.status_code == status
     assert shown.json()["recording"] is (status == 200)
     assert shown.json()["waiting_for"] == (recorder or {}).get("waiting_for")
+    assert shown.json()["degraded"] == (recorder or {}).get("degraded", [])
+    assert shown.json()["required_missing"] == (recorder or {}).get("required_missing", [])
     async with client(app(recorder=recorder, api_token=GOOD)) as http:
         hidden = await http.get("/health/recording")
     assert (hidden.status_code, hidden.json()) == (status, {"recording": status == 200})

@@ -367,11 +367,13 @@ def _with_budget_sentence(reply: JsonValue) -> JsonValue:
 
 
 def describe_budget(budget: dict[str, JsonValue]) -> str:
-    """Returns how much of the budget the bags take, and how long it lasts."""
+    """Returns how much of the budget the bags take, and what is beside them; how long it lasts."""
     growth = budget.get("growth_gb_per_day")
     text = f"{_size_text(budget.get('used_gb'))} of {_size_text(budget.get('max_gb'))}"
-    if "state_gb" in budget:
-        text += f", of which .episodic and logs take {_size_text(budget['state_gb'])}"
+    used, state = budget.get("used_gb"), budget.get("state_gb")
+    if isinstance(used, float) and isinstance(state, float):
+        bags = _size_text(max(used - state, 0.0))
+        text += f": bags {bags}, what is stored beside them {_size_text(state)}"
     if budget.get("foreign_gb"):
         foreign = _size_text(budget["foreign_gb"])
         text += f"; bags that the recorder did not make take {foreign} more"

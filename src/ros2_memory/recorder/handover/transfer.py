@@ -26,6 +26,7 @@ from ros2_memory.recorder.handover.plan import (
 from ros2_memory.recorder.handover.recovery import cut_clock
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.recorder.handover.plan import ClockReading, HandoverPlan, Step
@@ -42,6 +43,7 @@ class HandoverTransfer:
         plan: decides when each step is due.
         reader: reads splits that are closed.
         simulated: whether log times come from a simulated clock.
+        is_listed: whether the new session is to record a topic.
     """
 
     def __init__(
@@ -52,7 +54,9 @@ class HandoverTransfer:
         reader: BagReader,
         *,
         simulated: bool,
+        is_listed: Callable[[str], bool],
     ) -> None:
+        self._is_listed = is_listed
         self.old = old
         self.new = new
         self._plan = plan
@@ -81,8 +85,8 @@ class HandoverTransfer:
 
     @property
     def missing(self) -> frozenset[str]:
-        """Topics that the old recorder has subscribed to and the new one has not."""
-        return frozenset(self.old.subscribed - self.new.subscribed)
+        """Topics that the old recorder has subscribed to, and the new one has still to."""
+        return frozenset(filter(self._is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
         """Returns the step that is due at this moment.

@@ -26,6 +26,7 @@ import yaml
 from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from pathlib import Path
 
 MAX_NAME: Final = 247
@@ -83,6 +84,64 @@ class TopicSelection:
     def matches(self, topic: str) -> bool:
         """Whether the topic is recorded."""
         return re.search(self.regex, topic) is not None
+
+
+class TopicsFile:
+    """The list of topics in use, and its file, which may change while the recorder runs.
+
+    Args:
+        path: `topics.yaml`.
+        needed: topics that a list must have, each with what needs it.
+
+    Attributes:
+        selection: the list in use.
+        refused: why the file's present content is not used, as a sentence; else None.
+    """
+
+    def __init__(self, path: Path, needed: Mapping[str, str] | None = None) -> None:
+        self._path = path
+        self._needed = needed or {}
+        self.selection = TopicSelection(())
+        self.refused: str | None = None
+        self._read: bytes | None = None
+        self._seen: bytes | None = None
+
+    def load(self) -> None:
+        """Reads the file.
+
+        Raises:
+            ConfigError: see `load_topics`, or the list lacks a topic that it must have.
+        """
+        self._read = self._seen = self._content()
+        selection = load_topics(self._path)
+        for topic, by in self._needed.items():
+            if not selection.matches(topic):
+                raise ConfigError(f"{self._path}: it does not list {topic}, which {by} needs")
+        self.selection = selection
+
+    def look(self) -> bool:
+        """Reads the file again where it has changed; returns whether another list is in use.
+
+        A content counts when two looks have found it: it may be half written. One that is refused
+        leaves the list as it was. Raises nothing.
+        """
+        before, self._seen = self._seen, self._content()
+        if self._seen == self._read or self._seen != before:
+            return False
+        old = self.selection
+        try:
+            self.load()
+        except ConfigError as error:
+            self.refused = f"{error}; the recorder keeps the list that it has"
+            return False
+        self.refused = None
+        return self.selection != old
+
+    def _content(self) -> bytes | None:
+        try:
+            return self._path.read_bytes()
+        except OSError:
+            return None
 
 
 def load_topics(path: Path) -> TopicSelection:

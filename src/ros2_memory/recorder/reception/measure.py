@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
@@ -27,6 +27,30 @@ _FEWEST: Final = 5
 
 
 @dataclass(frozen=True, slots=True)
+class Arrival:
+    """The messages of a topic, by log time; `pause` is the longest time between two."""
+
+    first: Ns
+    last: Ns
+    messages: int = 1
+    pause: Ns = 0
+
+    @property
+    def period(self) -> Ns:
+        """The time between two messages; 0 for one alone."""
+        return (self.last - self.first) // max(1, self.messages - 1)
+
+    def joined(self, later: Arrival) -> Arrival:
+        """Returns both as one."""
+        return Arrival(
+            min(self.first, later.first),
+            max(self.last, later.last),
+            self.messages + later.messages,
+            max(self.pause, later.pause, later.first - self.last),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class SplitMeasure:
     """How the topics of one split arrived.
 
@@ -35,12 +59,14 @@ class SplitMeasure:
         progress: of those with one publisher, whose messages show what is missing.
         unclear: the other topics that have a message.
         span: first and last log time; None for a split without a message.
+        arrivals: of all topics that have a message.
     """
 
     flows: Mapping[str, TopicFlow]
     progress: Mapping[str, Progress]
     unclear: Collection[str]
     span: tuple[Ns, Ns] | None
+    arrivals: Mapping[str, Arrival] = field(default_factory=dict)
 
 
 def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
@@ -61,6 +87,7 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
             window = TimeWindow(summary.end - TAIL_NS, summary.end + 1)
     times: dict[str, list[Ns]] = {}
     largest: dict[str, int] = {}
+    arrivals: dict[str, Arrival] = {}
     readers = {
         channel.topic: found
         for channel in reader.channels(path)
@@ -72,6 +99,8 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
         topic = record.channel.topic
         times.setdefault(topic, []).append(record.publish_time or record.log_time)
         largest[topic] = max(largest.get(topic, 0), len(record.payload))
+        arrival, known_arrival = Arrival(record.log_time, record.log_time), arrivals.get(topic)
+        arrivals[topic] = arrival if known_arrival is None else known_arrival.joined(arrival)
         span = (record.log_time if span is None else span[0], record.log_time)
         known = readers.get(topic)
         if known is not None:
@@ -91,7 +120,7 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
         for topic, found in positions.items()
         if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
-    return SplitMeasure(flows, progress, times.keys() - progress.keys(), span)
+    return SplitMeasure(flows, progress, times.keys() - progress.keys(), span, arrivals)
 
 
 def burst_of(published: Sequence[Ns]) -> int:

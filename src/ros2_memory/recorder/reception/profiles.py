@@ -150,6 +150,7 @@ def qos_overrides(
     *,
     latched: Collection[str],
     weakest: Collection[str] = (),
+    volatile: Collection[str] = (),
 ) -> str:
     """Returns YAML for `--qos-profile-overrides-path`.
 
@@ -160,6 +161,7 @@ def qos_overrides(
             messages are asked for, unless their publishers are known to be volatile.
         weakest: topics with a publisher that was refused. They are asked for with what fits every
             publisher: rosbag2 itself asks for more where it knows none of them yet.
+        volatile: topics whose earlier messages are not asked for again, though they are latched.
     """
     profiles: dict[str, dict[str, str | int]] = {
         topic: {
@@ -175,7 +177,9 @@ def qos_overrides(
             "history": "keep_last",
             "depth": plan.depth(topic),
             "reliability": "reliable" if flow.offered.reliable else "best_effort",
-            "durability": "transient_local" if flow.offered.latched else "volatile",
+            "durability": (
+                "transient_local" if flow.offered.latched and topic not in volatile else "volatile"
+            ),
         }
     for topic in latched:
         if topic not in flows or flows[topic].offered.latched:

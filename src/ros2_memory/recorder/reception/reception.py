@@ -17,6 +17,7 @@ from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import counted, listed
+from ros2_memory.recorder.reception.arrivals import Arrivals
 from ros2_memory.recorder.reception.losses import LossCounter
 from ros2_memory.recorder.reception.measure import measure_split
 from ros2_memory.recorder.reception.profiles import (
@@ -70,6 +71,7 @@ class Reception:
         queue_bytes: what the queues of all topics together may take.
         bag_dir: where losses are written; nowhere where None.
         latched: topics that count as latched, see `qos_overrides`.
+        volatile: topics that are not asked for their earlier messages once a split has shown them.
         run: runs a task that takes a while; in a thread of its own where None.
     """
 
@@ -80,14 +82,17 @@ class Reception:
         *,
         bag_dir: Path | None = None,
         latched: Collection[str] = (),
+        volatile: Collection[str] = (),
         run: Callable[[Callable[[], None]], None] | None = None,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
         self._latched = tuple(latched)
+        self._volatile = tuple(volatile)
         self._run = run or _in_thread()
         self._bag_dir = bag_dir
         self._losses = LossCounter()
+        self._arrivals = Arrivals()
         self._spans: dict[str, tuple[Ns, Ns]] = {}
         self._lock = threading.Lock()
         self._flows: dict[str, TopicFlow] = {}
@@ -113,7 +118,9 @@ class Reception:
             latched = [topic for topic in self._latched if topic not in self._asked_anew]
             # A latched topic that is asked for as volatile would lose what was published before.
             weakest = self._asked_anew.difference(self._latched)
-            return qos_overrides(self._flows, plan, latched=latched, weakest=weakest)
+            return qos_overrides(
+                self._flows, plan, latched=latched, weakest=weakest, volatile=self._volatile
+            )
 
     def recall(self, path: Path) -> None:
         """Measures a closed split of an earlier run at once. Raises nothing."""
@@ -147,6 +154,11 @@ class Reception:
         """Returns how many messages of each topic are known to be missing of the last hour."""
         with self._lock:
             return self._losses.in_last_hour(now)
+
+    def arrivals(self, idle: Ns) -> tuple[frozenset[str], Mapping[str, float]]:
+        """Returns the topics that have stopped, and the rates of all, see `Arrivals`."""
+        with self._lock:
+            return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
 
     def _report(self, losses: Sequence[Loss]) -> None:
         if not losses:
@@ -242,6 +254,8 @@ class Reception:
                 for name in [*self._spans][:-_PLANS_KEPT]:
                     del self._spans[name]
             self._losses.unclear(recording, split.unclear)
+            if recording:
+                self._arrivals.measured(split)
             # What an earlier run recorded was counted by that.
             losses = self._losses.measured(recording, split.progress) if recording else []
         self._report(losses)

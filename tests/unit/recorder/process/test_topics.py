@@ -13,6 +13,7 @@ from ros2_memory.core.errors import ConfigError
 from ros2_memory.recorder.process.topics import (
     MAX_NAME,
     TopicSelection,
+    TopicsFile,
     load_topics,
 )
 
@@ -185,3 +186,22 @@ def test_what_is_excluded_is_not_selected_by_a_glob(tmp_path: Path) -> None:
     path.write_text("topics: [/odom]\nexclude: [odom]")
     with pytest.raises(ConfigError, match="fully qualified"):
         load_topics(path)
+
+
+def test_a_changed_list_must_have_what_rules_and_settings_need(tmp_path: Path) -> None:
+    path = tmp_path / "topics.yaml"
+    path.write_text("topics: [/odom, /privacy]\n")
+    topics = TopicsFile(path, {"/privacy": "the rule 'private'"})
+    topics.load()
+    path.write_text("topics: [/odom]\n")
+    assert [topics.look() for _ in range(3)] == [False] * 3
+    assert topics.refused is not None
+    assert "does not list /privacy, which the rule 'private' needs" in topics.refused
+    assert topics.selection.matches("/privacy")
+    path.write_text("topics: [/tf, /priv*]\n")
+    assert [topics.look() for _ in range(3)] == [False, True, False]
+    assert not topics.refused
+    assert topics.selection.entries == ("/tf", "/priv*")
+    path.unlink()
+    assert [topics.look() for _ in range(3)] == [False] * 3
+    assert "cannot be read" in str(topics.refused)

@@ -16,7 +16,7 @@ from ros2_memory.recorder.reception.reception import (
     newest_split,
 )
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 
 NS = 10**9
 T0 = 1_795_000_000 * NS
@@ -154,3 +154,13 @@ def test_what_a_split_shows_of_a_refused_publisher_is_asked_for_again(tmp_path: 
     made.overrides("b")
     made.learn("b", split(tmp_path / "b_0.mcap", 50, 4))
     assert profiles(made, "c")["/odom"]["reliability"] == "reliable"
+
+
+def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
+    made = Reception(McapReader(), volatile=["/rosout"], run=lambda task: task())
+    topics = ("/rosout", "/map")
+    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
+    layout = McapLayout(latched=frozenset(topics))
+    made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
+    asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
+    assert asked == {"/rosout": "volatile", "/map": "transient_local"}
