@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.clock_steps import (
+    ALIKE_NS,
     BESIDE_NS,
     SHORTEST_STEP_NS,
     STAMPS_BESIDE_NS,
@@ -181,7 +182,8 @@ def _steps_in(view: View, topic: str | None, suspect: SuspectedHole) -> Sequence
 def _read_steps(view: View, topic: str | None, suspect: SuspectedHole) -> Iterator[ClockStep]:
     for hole in _holes_in(view, suspect):
         step = _step_by_stamps(view, hole)
-        if step is None and hole[1] - hole[0] >= SHORTEST_STEP_NS and topic is not None:
+        is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
+        if step is None and is_long and topic is not None and not _is_late(view, topic, hole):
             step = step_over(
                 hole,
                 _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
@@ -207,6 +209,16 @@ def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
                 changes.append(change)
                 break
     return step_by_delays(hole, changes)
+
+
+def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
+    """Returns whether messages that follow a hole were sent in it: the recorder had stalled."""
+    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+    first = view.stream.first((topic,), after)
+    sent = [] if first is None else [first.record.publish_time]
+    for _, stamps in _stamps(view, topic, after).values():
+        sent += stamps.tolist()
+    return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
 
 
 def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
