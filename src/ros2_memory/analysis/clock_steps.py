@@ -10,7 +10,6 @@ such stamps, too, but only as long as its queues were.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -74,15 +73,6 @@ class Elapsed:
     def skipped_between(self, start: Ns, stop: Ns) -> Ns:
         """Returns how much of the time from one moment to another the clock skipped."""
         return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)
-
-
-def holes(times: Iterable[Ns]) -> list[tuple[Ns, Ns]]:
-    """Returns where the log times of all messages of a bag, in any order, are far apart."""
-    return [
-        (before, after)
-        for before, after in pairwise(sorted(set(times)))
-        if after - before >= SHORTEST_BY_STAMPS_NS
-    ]
 
 
 def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> Ns | None:

@@ -89,7 +89,7 @@ def steps(memory: Memory, folder: Path) -> list[Any]:
 
 def test_a_recorder_that_stalled_while_the_robot_drove_on_is_no_step(tmp_path: Path) -> None:
     memory = recorded(tmp_path, is_on=lambda t: not 52 < t < 57)
-    assert len(memory.index.snapshot().suspected_holes) == 1
+    assert len(memory.index.snapshot().suspects) == 1
     assert steps(memory, tmp_path) == []
 
 
@@ -135,7 +135,7 @@ def test_where_the_robot_stood_a_step_and_a_pause_are_alike(tmp_path: Path) -> N
     memory = recorded(
         tmp_path, shown=lambda t: t + 8.0 * (t > 55), driven=lambda t: t if t < 50 else 50.0
     )
-    assert len(memory.index.snapshot().suspected_holes) == 1
+    assert len(memory.index.snapshot().suspects) == 1
     assert steps(memory, tmp_path) == []
 
 
@@ -209,7 +209,7 @@ def test_one_topic_that_pauses_is_no_hole(tmp_path: Path) -> None:
         messages.sort(key=lambda each: each.log_time)
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspected_holes == ()
+    assert memory.index.snapshot().suspects == []
 
 
 def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -> None:
@@ -217,7 +217,7 @@ def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -
         begin = (BEGIN + number * SPLIT) * S
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(begin, 0.0, 0.0, 0.0)])
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspected_holes == ()
+    assert memory.index.snapshot().suspects == []
 
 
 WHEN = 54.95
