@@ -68,8 +68,13 @@ def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[N
     """Returns those gaps, of a snapshot and in order, that are no step of the clock."""
     if not gaps:
         return gaps
-    window = TimeWindow(gaps[0][0], gaps[-1][1])
-    steps = {at for at, by in _steps_around(view, window) if by > 0}
+    try:
+        steps = {
+            at for at, by in _steps_around(view, TimeWindow(gaps[0][0], gaps[-1][1])) if by > 0
+        }
+    except QueryTimeoutError:
+        _note_timeout(view)
+        return gaps
     return [gap for gap in gaps if gap[0] not in steps]
 
 
@@ -82,10 +87,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
             if window.overlaps(each.at, each.at + max(each.by - 1, 0))
         ]
     except QueryTimeoutError:
-        view.notes.complete = False
-        view.notes.add(
-            "out of time before it was known whether the clock was set: durations are by the clock"
-        )
+        _note_timeout(view)
         return Elapsed()
     for at, by in steps:
         view.notes.add(
@@ -95,6 +97,13 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
             "across that are too short by as much"
         )
     return Elapsed(steps)
+
+
+def _note_timeout(view: View) -> None:
+    view.notes.complete = False
+    view.notes.add(
+        "out of time before it was known whether the clock was set: durations are by the clock"
+    )
 
 
 def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:

@@ -138,7 +138,8 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
     gaps = (part for each in view.gaps(window) for part in _unrecorded(view.snapshot, each, gone))
     for start, end in gaps:
         cause = next((each.by for each in known if each.start < end and start < each.stop), "")
-        if window.overlaps(start, end) and (cause or not explained):
+        may_come = being_written(view.snapshot, TimeWindow(start + 1, end))
+        if window.overlaps(start, end) and (cause or not (explained or may_come)):
             found.setdefault(cause, []).append(_span_text(start, end))
     for by, spans in found.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
