@@ -32,17 +32,16 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
 )
 from ros2_memory.history import transforms as frame_history
+from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import (
     by_remark,
-    deleted_length,
     describe_misdated,
     describe_odd,
     not_covered,
     note_edges,
     note_unread,
     note_unrecorded,
-    recording_gaps,
     unix_text,
 )
 from ros2_memory.history.driven_path import (
@@ -86,12 +85,12 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
-from ros2_memory.insights.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.insights.field_extremes import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
 from ros2_memory.insights.status import (
     bags_with_remarks,
     clock_faults,
+    gaps_with_deleted,
     left_open,
     undecodable_topics,
     undecodable_types,
@@ -461,10 +460,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         latest=snapshot.dating.latest,
         now=memory.now(now, snapshot.latest),
         bags=len(snapshot.bags),
-        gaps=tuple(
-            results.Gap(start, end, deleted_length(view, TimeWindow(start, end)))
-            for start, end in recording_gaps(view)
-        ),
+        gaps=gaps_with_deleted(view, view.gaps(TimeWindow.everything())),
         incomplete=left_open(snapshot),
         active=snapshot.active,
         damaged=snapshot.damaged,

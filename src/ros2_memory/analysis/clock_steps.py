@@ -4,12 +4,12 @@ A clock that is set forward leaves a hole: for so long no topic has a message. S
 that stalls. They differ in where the robot is afterwards: time that never passed moved nothing. So
 a hole is a step where the robot drove on both sides, and is where it would be if the hole were not
 there. And where header stamps of another clock go on in their cadence across it: from then on
-messages are recorded that much later after their stamps.
+messages are recorded that much later after their stamps. What a stalled recorder receives late has
+such stamps, too, but only as long as its queues were.
 """
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -29,7 +29,9 @@ SHORTEST_BY_STAMPS_NS: Final[Ns] = NS_PER_S // 2
 STAMPS_BESIDE_NS: Final[Ns] = 5 * NS_PER_S
 """Delays beside a hole are measured over this long: what stays is no queue that empties."""
 _FEWEST_STAMPS: Final = 5
-_ALIKE_NS: Final[Ns] = NS_PER_S // 10
+_LIVE_NS: Final[Ns] = NS_PER_S
+"""Messages must go on for so long after a hole: the first ones may have waited in a queue."""
+ALIKE_NS: Final[Ns] = NS_PER_S // 10
 """By how much the delays on one side, and the steps by several topics, may differ."""
 _AGREEING: Final = 2
 """Topics that must show a step: the clock of one sensor may be set as well."""
@@ -77,15 +79,6 @@ class Elapsed:
         return sum(max(0, min(stop, end) - max(start, begin)) for begin, end in self.skipped)
 
 
-def holes(times: Iterable[Ns]) -> list[tuple[Ns, Ns]]:
-    """Returns where the log times of all messages of a bag, in any order, are far apart."""
-    return [
-        (before, after)
-        for before, after in pairwise(sorted(set(times)))
-        if after - before >= SHORTEST_BY_STAMPS_NS
-    ]
-
-
 def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> Ns | None:
     """Returns by how much the delays of a topic's messages, from stamp to log time, changed.
 
@@ -102,7 +95,9 @@ def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> 
     sides = [delays[is_before], delays[~is_before]]
     if min(side.size for side in sides) < _FEWEST_STAMPS:
         return None
-    if max(float(np.percentile(side, 90) - np.percentile(side, 10)) for side in sides) > _ALIKE_NS:
+    if log_times.max() - hole[1] < _LIVE_NS:
+        return None
+    if max(float(np.percentile(side, 90) - np.percentile(side, 10)) for side in sides) > ALIKE_NS:
         return None
     passed = int(stamps[~is_before].min()) - int(stamps[is_before].max())
     if not 0 < passed < (hole[1] - hole[0]) // 2:
@@ -113,7 +108,7 @@ def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> 
 
 def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | None:
     """Returns the step that a hole is, by `delay_change` of several topics; None if it is none."""
-    if len(changes) < _AGREEING or max(changes) - min(changes) > _ALIKE_NS:
+    if len(changes) < _AGREEING or max(changes) - min(changes) > ALIKE_NS:
         return None
     by = int(np.median(changes))
     return ClockStep(hole[0], by) if by >= SHORTEST_BY_STAMPS_NS else None

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.pauses import Pauses
+
     IntArray = NDArray[np.int64]
 
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
@@ -74,6 +76,7 @@ class SummarySchema:
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
+    pauses: Pauses = ()
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
@@ -96,7 +99,8 @@ class SummarySchema:
     def to_json(self) -> str:
         """Returns the schema as JSON; equal ones give equal texts."""
         topics = [[*header] for header in self.topics]
-        return json.dumps([topics, self.silent, self.complete, self.notes, self.set_back])
+        stated = [self.silent, self.complete, self.notes, self.set_back, self.pauses]
+        return json.dumps([topics, *stated])
 
     @staticmethod
     def from_json(text: str) -> SummarySchema:
@@ -106,12 +110,19 @@ class SummarySchema:
             ValueError: the text is not valid.
             TypeError: likewise.
         """
-        topics, silent, complete, notes, set_back = json.loads(text)
+        topics, silent, complete, notes, set_back, pauses = json.loads(text)
         headers = tuple(
             TopicHeader(topic, type_name, encoding, bool(latched))
             for topic, type_name, encoding, latched in topics
         )
-        return shared_schema(headers, tuple(silent), bool(complete), tuple(notes), int(set_back))
+        return shared_schema(
+            headers,
+            tuple(silent),
+            bool(complete),
+            tuple(notes),
+            set_back=int(set_back),
+            pauses=tuple((int(start), int(end)) for start, end in pauses),
+        )
 
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"
@@ -159,7 +170,9 @@ def shared_schema(
     silent: tuple[str, ...],
     complete: bool,
     notes: tuple[str, ...],
+    *,
     set_back: Ns = 0,
+    pauses: Pauses = (),
 ) -> SummarySchema:
     """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
@@ -167,7 +180,8 @@ def shared_schema(
         TopicHeader(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
         for each in topics
     )
-    return SummarySchema(headers, tuple(intern(name) for name in silent), complete, notes, set_back)
+    names = tuple(intern(name) for name in silent)
+    return SummarySchema(headers, names, complete, notes, set_back, pauses)
 
 
 class BagSummary:
@@ -180,6 +194,7 @@ class BagSummary:
         notes: sentences on what is wrong with the file.
         set_back: by how much the log times of a topic go back in the order of writing, at most; 0
             where they do so by less than a second.
+        pauses: where no topic has a message for a while, though some usually have.
 
     Attributes:
         schema: the summary without its numbers.
@@ -196,12 +211,16 @@ class BagSummary:
         silent: tuple[str, ...] = (),
         complete: bool = True,
         notes: tuple[str, ...] = (),
+        *,
         set_back: Ns = 0,
+        pauses: Pauses = (),
     ) -> None:
         headers = (
             TopicHeader(each.topic, each.type, each.encoding, each.latched) for each in topics
         )
-        self.schema = shared_schema(tuple(headers), silent, complete, notes, set_back)
+        self.schema = shared_schema(
+            tuple(headers), silent, complete, notes, set_back=set_back, pauses=pauses
+        )
         numbers = (part for each in topics for part in (each.count, each.first, each.last))
         self._numbers = self.schema.numbers.pack(*numbers)
 
@@ -265,7 +284,8 @@ class BagSummary:
             self.silent,
             self.complete if complete is None else complete,
             self.notes if notes is None else notes,
-            self.schema.set_back,
+            set_back=self.schema.set_back,
+            pauses=self.schema.pauses,
         )
 
     @property

@@ -12,6 +12,7 @@ from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
@@ -20,7 +21,6 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.no_data import no_data_between
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.results import Bins, Usual
 
 if TYPE_CHECKING:

@@ -84,11 +84,12 @@ def note_unread(
         # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
+    for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS):
+        view.notes.add(sentence)
     bag_dir = view.memory.index.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
         for sentence in (
             *describe_deleted(view.snapshot, bag_dir, window),
-            *describe_interrupted(view.snapshot, bag_dir, window),
             *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         ):
@@ -124,22 +125,27 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
 
 
-def describe_interrupted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence for each way in which recordings ended unexpectedly before a gap.
+def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) -> Iterator[str]:
+    """Yields a sentence for each reason for which nothing was recorded in a part of a window.
 
-    Only gaps that overlap the window.
+    Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
+    bag_dir = view.memory.index.bag_dir
     known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
+    if explained and not known:
+        return
     found: dict[str, list[str]] = {}
-    gone = deleted_spans(bag_dir) if known else ()
-    gaps = (part for each in snapshot.gaps for part in _unrecorded(snapshot, each, gone))
-    for start, end in gaps if known else ():
-        cause = next((each for each in known if each.start < end and start < each.stop), None)
-        if cause is not None and window.overlaps(start, end):
-            found.setdefault(cause.by, []).append(_span_text(start, end))
+    gone = deleted_spans(bag_dir)
+    gaps = (part for each in view.gaps(window) for part in _unrecorded(view.snapshot, each, gone))
+    for start, end in gaps:
+        cause = next((each.by for each in known if each.start < end and start < each.stop), "")
+        may_come = being_written(view.snapshot, TimeWindow(start + 1, end))
+        if window.overlaps(start, end) and (cause or not (explained or may_come)):
+            found.setdefault(cause, []).append(_span_text(start, end))
     for by, spans in found.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
-        yield f"nothing was recorded from {named}, because {INTERRUPTIONS[by]}"
+        because = f", because {INTERRUPTIONS[by]}" if by else ""
+        yield f"nothing was recorded from {named}{because}"
 
 
 def _span_text(start: Ns, end: Ns) -> str:
@@ -424,15 +430,17 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is None or latest is None:
         return None
-    if any(not is_carried(each.file) for each in snapshot.timeline.overlapping(asked)):
-        return None
+    bags = [each for each in snapshot.timeline.overlapping(asked) if not is_carried(each.file)]
+    if not any(bag.file in snapshot.dating.misdated for bag in bags):
+        for first, last in view.gaps(asked):
+            if first < asked.start and asked.stop <= last:
+                return first, last
     start, end = asked.asked()
+    if bags:
+        return None
     if end < earliest:
         return None, earliest
-    if start > latest:
-        return latest, None
-    gaps = recording_gaps(view)
-    return next((each for each in gaps if each[0] <= start and end <= each[1]), None)
+    return (latest, None) if start > latest else None
 
 
 def note_unrecorded(view: View, asked: TimeWindow) -> None:
@@ -491,15 +499,13 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
-    """Yields where nothing was recorded, by `Snapshot.gaps`; of a window, the parts in it.
+    """Yields where nothing was recorded, by `View.gaps`; of a window, the parts in it.
 
     A part that only the tolerance of its bounds reaches is left out.
     """
     asked = window or TimeWindow.everything()
-    first, last = asked.asked()
-    for start, end in view.snapshot.gaps:
-        if start < last and first < end:
-            yield max(start, asked.start), min(end, asked.stop)
+    for start, end in view.gaps(asked):
+        yield max(start, asked.start), min(end, asked.stop)
 
 
 def unknown_times(view: View, window: TimeWindow, known: Spans, what: str) -> Spans:

@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.bag_groups import groups_of
+from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
@@ -91,6 +92,12 @@ class View:
     def has_poses(self) -> bool:
         """Whether a topic has the robot's poses; else transforms may place it."""
         return has_poses(self)
+
+    def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
+        """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
+        first, last = window.asked()
+        touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
+        return without_steps(self, touched)
 
     def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
         """Returns how many messages the window holds, and `at_most` of them, evenly spaced.

@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.bag_summary import numbers_of
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import bags_with_holes, between, pauses_between
+from ros2_memory.index.holes import pauses_between, pauses_within
 from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
-    from ros2_memory.index.holes import Pause, Rates, SuspectedHole
+    from ros2_memory.index.holes import Pause
     from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -116,7 +116,6 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._suspected: tuple[Rates, tuple[SuspectedHole, ...]] | None = None
 
     @cached_property
     def latest(self) -> Ns:
@@ -306,18 +305,15 @@ class Segment:
         """Which topics the bags hold together, each combination once."""
         return frozenset(frozenset(schema.positions) for schema in self._schemas)
 
-    def suspected_holes(self, rates: Rates) -> tuple[SuspectedHole, ...]:
-        """Returns where no topic may have a message, by the usual rates of some topics."""
-        known = self._suspected
-        if known is None or known[0] != rates:
-            known = rates, (*bags_with_holes(self.bags, rates), *between(self.bags, rates))
-            self._suspected = known
-        return known[1]
-
     @cached_property
     def pauses(self) -> tuple[Pause, ...]:
-        """Where nothing was recorded between the bags, as far as that is noteworthy."""
+        """The pauses between the bags."""
         return tuple(pauses_between(self.bags))
+
+    @cached_property
+    def pauses_within(self) -> tuple[Pause, ...]:
+        """The pauses of each bag."""
+        return tuple(pauses_within(self.bags))
 
     @cached_property
     def silent(self) -> frozenset[str]:

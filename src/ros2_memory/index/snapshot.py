@@ -14,17 +14,13 @@ from ros2_memory.analysis.silences import (
     silences,
     usual_period,
 )
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.index.clock_faults import check_dates
-from ros2_memory.index.holes import (
-    SHORTEST_GAP_NS,
-    between,
-    gaps_of,
-    pauses_between,
-    rates_of,
-    shortest_gap,
-)
+from ros2_memory.index.holes import Rhythm, pauses_between
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
@@ -38,14 +34,14 @@ from ros2_memory.index.timeline import Timeline
 from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.silences import Presence, Silence
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.clock_faults import ClockFault, Dating
-    from ros2_memory.index.holes import Pause, SuspectedHole
+    from ros2_memory.index.holes import Pause
 
 _MAX_PLACED: Final = 500
 
@@ -171,40 +167,61 @@ class Snapshot:
     def gaps(self) -> Sequence[tuple[Ns, Ns]]:
         """Where nothing was recorded: from the last message before to the first after, in order.
 
-        Longer than a second and three periods of the most frequent topic; between two splits of a
-        recording, in which the recorder ran on, also than twice the longer one (at most 20 s).
-        Carried messages and bags that a wrong clock dated do not count.
+        Between bags or within one; see `index.holes`. Carried messages and bags that a wrong clock
+        dated do not count. A step forward of the clock looks alike: see `View.gaps`.
         """
+        return [(pause.start, pause.end) for pause in self._rhythm.gaps(self._pauses)]
+
+    @cached_property
+    def shortest_gap(self) -> Ns:
+        """How long a pause between two recordings may be without being one of `gaps`."""
+        return self._rhythm.shortest_gap
+
+    @cached_property
+    def suspects(self) -> Sequence[Pause]:
+        """Where the clock may have been set forward, as a recorder ran on, in order of time."""
+        return self._rhythm.suspects(self._pauses)
+
+    @cached_property
+    def _rhythm(self) -> Rhythm:
+        return Rhythm(self._presences)
+
+    @cached_property
+    def _pauses(self) -> Sequence[Pause]:
+        """Where no dated bag has a message for a while, in order of time."""
         found: list[Pause] = []
         newest: BagFile | None = None
         for part in self._dated:
             if newest is not None:
                 # Bags of other parts may last into this one.
                 found += pauses_between([newest, part.bags[0]])
+                reach = newest.end
                 found += (
-                    each._replace(start=max(each.start, newest.end))
-                    for each in part.pauses
-                    if each.end - newest.end > SHORTEST_GAP_NS
+                    pause._replace(start=max(pause.start, reach))
+                    for pause in part.pauses
+                    if pause.end - reach > SHORTEST_PAUSE_NS
                 )
             else:
                 found += part.pauses
+            for pause in part.pauses_within:
+                found += self._alone(pause)
             last = max(part.bags, key=lambda bag: bag.end)
             newest = last if newest is None or last.end > newest.end else newest
-        return gaps_of(found, self._presences)
+        return sorted(found, key=lambda pause: (pause.start, pause.end))
 
-    @cached_property
-    def shortest_gap(self) -> Ns:
-        """How long a pause between two recordings may be without being one of `gaps`."""
-        return shortest_gap(self._presences)
-
-    @cached_property
-    def suspected_holes(self) -> tuple[SuspectedHole, ...]:
-        """Where no topic may have a message although a recorder ran, in order of time."""
-        rates = rates_of(self._presences)
-        found = [each for part in self._dated for each in part.suspected_holes(rates)]
-        ends = [bag for part in self._dated for bag in (part.bags[0], part.bags[-1])]
-        found += between(ends, rates)
-        return tuple(sorted(set(found), key=lambda each: (each.first, each.last)))
+    def _alone(self, pause: Pause) -> Iterator[Pause]:
+        """Yields the parts of a bag's pause in which no other bag has a message either."""
+        inside = TimeWindow(pause.start + 1, pause.end)
+        others = united(
+            span
+            for bag in self.timeline.overlapping(inside)
+            if bag not in pause.bags and not is_carried(bag.file)
+            if bag.file not in self.dating.misdated
+            for span in without([(bag.start, bag.end)], bag.summary.schema.pauses)
+        )
+        for start, end in without([(pause.start, pause.end)], others):
+            if end - start > SHORTEST_PAUSE_NS:
+                yield pause._replace(start=start, end=end)
 
     @cached_property
     def unread_spans(self) -> Mapping[SetAside, TimeWindow | None]:

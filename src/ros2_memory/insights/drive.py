@@ -32,6 +32,7 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
+from ros2_memory.history.clock_steps import across_steps, elapsed_in
 from ros2_memory.history.driven_path import (
     blocks_back,
     driven_path,
@@ -41,7 +42,6 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.poses import pose_rows, poses_of_bag, slices_back
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.insights.clock_steps import across_steps, elapsed_in
 from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:

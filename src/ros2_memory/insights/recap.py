@@ -19,6 +19,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     deleted_length,
     note_edges,
@@ -36,7 +37,6 @@ from ros2_memory.insights.changes_before import (
     changes_in,
     is_routine,
 )
-from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times

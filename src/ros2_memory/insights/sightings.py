@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.counts.tested import tested
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.driven_path import body_by_transforms, resolve_path_topic
 from ros2_memory.history.no_data import matching_topics, require_recorded
@@ -41,7 +42,6 @@ from ros2_memory.history.reverse_search import (
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences

@@ -8,9 +8,11 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
+    deleted_length,
     describe_excluded,
-    describe_interrupted,
+    describe_gaps,
     describe_lost,
     unix_text,
     was_forgotten,
@@ -19,15 +21,14 @@ from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import describe_absent
-from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.saved_moments import newest_moments, unlisted
 from ros2_memory.insights.silences import silences_of
 from ros2_memory.recorder.policies import OWN_TOPICS
-from ros2_memory.results import ANOTHER, Budget, SilentTopic, Status, Undecodable
+from ros2_memory.results import ANOTHER, Budget, Gap, SilentTopic, Status, Undecodable
 from ros2_memory.retention.inventory import state_bytes_in
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile
@@ -63,6 +64,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     heard = _heard(snapshot) if live else latest
     mixed = describe_mixed(memory, call)
+    gaps = view.gaps(TimeWindow.everything())
+    stalls = {*gaps} & {(pause.start, pause.end) for pause in snapshot.suspects}
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
@@ -82,6 +85,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
         fell_silent=tuple(_fallen_silent(memory, snapshot)),
         silences=tuple(silences_of(memory, snapshot)),
         clock_steps=clock_steps(view),
+        gaps=gaps_with_deleted(view, gaps),
+        stalled=(len(stalls), sum(end - start for start, end in stalls)),
         damaged=len(snapshot.damaged),
         incomplete=snapshot.timeline.disk_use[1],
         unread=len(snapshot.unread),
@@ -92,7 +97,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *_describe_unheard(heard, latest),
             *missing_data(view),
             *(("robots are mixed (see notes)",) if mixed else ()),
-            *describe_interrupted(snapshot, memory.index.bag_dir, TimeWindow.everything()),
+            *describe_gaps(view, TimeWindow.everything(), explained=True),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),
         notes=(
@@ -101,6 +106,13 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *mixed,
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),
+    )
+
+
+def gaps_with_deleted(view: View, gaps: Iterable[tuple[Ns, Ns]]) -> tuple[Gap, ...]:
+    """Returns gaps, each with how much of it retention deleted."""
+    return tuple(
+        Gap(start, end, deleted_length(view, TimeWindow(start, end))) for start, end in gaps
     )
 
 

@@ -19,12 +19,12 @@ from ros2_memory.analysis.motion.trajectory import (
     joined_lines,
 )
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
 from ros2_memory.history.driven_path import note_known_since, resolve_path_topic, way_in
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.places.scope import times_in_region
 from ros2_memory.places.where import parse_where

@@ -20,9 +20,9 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit

@@ -305,6 +305,7 @@ _BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS
     SECONDS("newest_age_s").in_short,
     OBJECTS("fell_silent").first(_MAX_TOPICS, ""),
     _SILENCES("silences", "newest_silences").first(_MAX_TOPICS, ""),
+    OBJECTS("gaps", "newest_gaps").first(_MAX_TOPICS, ""),
     _CLOCK_STEPS("clock_steps", "newest_clock_steps").first(_MAX_TOPICS, ""),
     PLAIN("never_heard").first(_MAX_TOPICS, ""),
     PLAIN("missing").first(_MAX_TOPICS, ""),
@@ -315,6 +316,7 @@ _BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS
     an_object(_NEWEST_MOMENTS).spread("moments"),
     _BEYOND("fell_silent_count", "fell_silent"),
     _BEYOND("silences_count", "silences"),
+    _BEYOND("gaps_count", "gaps"),
     _BEYOND("clock_steps_count", "clock_steps"),
     _BEYOND("never_heard_count", "never_heard"),
     _BEYOND("missing_count", "missing"),
@@ -338,6 +340,8 @@ class Status(AnswerWithNotes):
         fell_silent: topics that had messages, but not lately.
         silences: when topics with a usual rate were silent although the robot was on.
         clock_steps: when the clock was set by 2 s or more.
+        gaps: when nothing was recorded.
+        stalled: in how many of them the recorder ran on, and for how long in all.
         damaged: files that cannot be read.
         incomplete: bags that a crash left open.
         unread: files of a kind that is not read here.
@@ -364,6 +368,8 @@ class Status(AnswerWithNotes):
     problems: tuple[str, ...]
     silences: tuple[Silence, ...] = ()
     clock_steps: tuple[ClockStep, ...] = ()
+    gaps: tuple[Gap, ...] = ()
+    stalled: tuple[int, Ns] = (0, 0)
     lost: Mapping[str, int] = field(default_factory=dict)
 
     @property
@@ -388,6 +394,11 @@ class Status(AnswerWithNotes):
         return self.silences[::-1]
 
     @property
+    def newest_gaps(self) -> tuple[Gap, ...]:
+        """The gaps, newest first."""
+        return self.gaps[::-1]
+
+    @property
     def newest_clock_steps(self) -> tuple[ClockStep, ...]:
         """The steps of the clock, newest first."""
         return self.clock_steps[::-1]
@@ -402,6 +413,10 @@ class Status(AnswerWithNotes):
         elif topics:
             named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
             yield f"{named} fell silent {len(self.silences)} times (see silences)"
+        count, length = self.stalled
+        if count:
+            times = "once" if count == 1 else f"{count} times"
+            yield f"while the recorder ran, nothing was recorded {times} ({seconds(length):.3g} s)"
         if len(self.clock_steps) == 1:
             [(_, by)] = self.clock_steps
             how = (

@@ -15,8 +15,12 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import moment, seconds
-from ros2_memory.history.context import short_name
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.context import Call, short_name
+from ros2_memory.history.coverage import recording_gaps
+from ros2_memory.history.view import View
 from ros2_memory.insights.status import clock_faults, left_open, problems_of, unrecorded
 from ros2_memory.serving.fair_queue import FairQueue
 
@@ -26,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
 
@@ -38,6 +41,8 @@ NAMED: Final = 3
 _MAX_TOPICS: Final = 20
 _MAX_MISSING: Final = 6
 _MAX_CHARS: Final = 300
+
+_HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 
 log = get_logger(__name__)
 
@@ -172,6 +177,7 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
         "latest": moment(dating.latest),
         "active": len(snapshot.active),
         **{fault: len(files) for fault, files in faulty.items()},
+        "gaps_last_hour": _gaps(memory, now),
         "index_age_s": seconds(now - snapshot.scanned_at),
     }
     foreign = memory.foreign(snapshot)
@@ -192,6 +198,12 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
     if heartbeat is not None:
         shown["recorder"] = _recorder(heartbeat, now)
     return _status(version, problems, shown)
+
+
+def _gaps(memory: Memory, now: Ns) -> JsonObject:
+    """Returns how often nothing was recorded in the last hour, and for how long in all."""
+    gaps = [*recording_gaps(View(memory, Call()), TimeWindow(now - _HOUR_NS, now))]
+    return {"count": len(gaps), "seconds": seconds(sum(end - start for start, end in gaps))}
 
 
 def _stored(backfill: Backfill) -> JsonObject:

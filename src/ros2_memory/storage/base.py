@@ -20,6 +20,7 @@ import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.pauses import noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.pauses import Pauses
 
 T = TypeVar("T")
 IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
@@ -522,6 +524,7 @@ def summarize_channels(
     complete: bool = True,
     notes: tuple[str, ...] = (),
     set_back: Ns = 0,
+    pauses: Pauses = (),
 ) -> BagSummary:
     """Returns the summary of a file; channels of one topic and type count as one."""
     found: dict[tuple[str, str], ChannelTotal] = {}
@@ -536,7 +539,17 @@ def summarize_channels(
     for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
         headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
-    schema = shared_schema(tuple(headers), tuple(sorted(silent)), complete, notes, set_back)
+    if pauses:
+        firsts, lasts = numbers[1::3], numbers[2::3]
+        pauses = noteworthy(pauses, numbers[::3], max(lasts, default=0) - min(firsts, default=0))
+    schema = shared_schema(
+        tuple(headers),
+        tuple(sorted(silent)),
+        complete,
+        notes,
+        set_back=set_back,
+        pauses=pauses,
+    )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 
 

@@ -21,6 +21,7 @@ from operator import eq
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import (
     ROS2_PROFILE,
@@ -63,6 +64,13 @@ _TOTALS: Final = """
            sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
            timestamp IS ? AS impossible
     FROM messages NOT INDEXED GROUP BY topic_id, impossible
+"""
+_PAUSES: Final = """
+    SELECT before, timestamp FROM (
+        SELECT timestamp, lag(timestamp) OVER (ORDER BY timestamp) AS before
+        FROM messages NOT INDEXED
+        WHERE timestamp <= ? AND topic_id IN (SELECT value FROM json_each(?))
+    ) WHERE timestamp - before > ?
 """
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
 _ASCENDING: Final = """
@@ -141,6 +149,8 @@ class SqliteBags:
             found: list[tuple[int, int, int, int, int, int]]
             found = base.execute(_TOTALS, (MAX_NS,)).fetchall()
             right = self._is_indexed_right(base, topics)
+            asked = (MAX_NS - 1, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
+            pauses = base.execute(_PAUSES, asked).fetchall()
         if any(wrong for *_, wrong, _ in found):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
@@ -157,7 +167,8 @@ class SqliteBags:
             notes.append(f"{orphans} messages belong to no topic and were left out")
         if impossible := sum(row[1] for row in found if row[5]):
             notes.append(f"{impossible} messages bear no possible log time")
-        return summarize_channels(totals, topics.channels.values(), notes=tuple(notes))
+        declared = topics.channels.values()
+        return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""

@@ -5,7 +5,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.clock_steps import ClockStep, Elapsed, holes, step_over
+from ros2_memory.analysis.clock_steps import ClockStep, Elapsed, step_over
 from ros2_memory.analysis.motion.odometry import TimedPosition
 
 S = 10**9
@@ -43,15 +43,6 @@ def test_one_pose_has_no_speed() -> None:
     first, second = poses(99.0, 0.0, 0.5), poses(108.0, 0.5, 0.5)
     assert step_over((100 * S, 108 * S), first[-1:], second) is None
     assert step_over((100 * S, 108 * S), first, []) is None
-
-
-def test_holes_are_half_a_second_long_in_whatever_order_times_come() -> None:
-    half = S // 2
-    assert holes([5 * half, 0, half - 1, 3 * half, 5 * half + 9]) == [
-        (half - 1, 3 * half),
-        (3 * half, 5 * half),
-    ]
-    assert holes([0, half - 1]) == []
 
 
 @given(

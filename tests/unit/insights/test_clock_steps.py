@@ -89,15 +89,53 @@ def steps(memory: Memory, folder: Path) -> list[Any]:
 
 def test_a_recorder_that_stalled_while_the_robot_drove_on_is_no_step(tmp_path: Path) -> None:
     memory = recorded(tmp_path, is_on=lambda t: not 52 < t < 57)
-    assert len(memory.index.snapshot().suspected_holes) == 1
+    assert len(memory.index.snapshot().suspects) == 1
     assert steps(memory, tmp_path) == []
+
+
+@pytest.mark.parametrize("queued", [3, 10, 100])
+@pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
+def test_what_queued_up_while_the_recorder_stalled_is_no_step(
+    tmp_path: Path, known: Callable[[Memory], Memory], when: float, queued: int
+) -> None:
+    """Each topic has a queue of so many messages; what is received late was sent in its cadence."""
+
+    def is_kept(t: float) -> bool:
+        return not when < t < when + 3.5 or t < when + queued / HZ
+
+    memory = driven_with_delay(
+        tmp_path, lambda t: max(0.0, when + 3.5 - t) if t > when else 0.0, is_kept
+    )
+    assert steps(known(memory), tmp_path) == []
+
+
+def driven_with_delay(
+    folder: Path, delay: Callable[[float], float], is_kept: Callable[[float], bool]
+) -> Memory:
+    """A robot that drives, whose messages are logged after a delay, or lost."""
+    splits: dict[int, list[Msg]] = {}
+    for beat in range(SPLITS * SPLIT * HZ):
+        t = beat / HZ
+        if is_kept(t):
+            at, logged = (BEGIN * S + round((t + extra) * S) for extra in (0.0, delay(t)))
+            flag = boolean(at, data=False)
+            splits.setdefault(int((t + delay(t)) / SPLIT), []).extend(
+                [
+                    odom(at, SPEED * t, 0.0, 0.0, log_time=logged),
+                    replace(flag, log_time=logged, publish_time=at),
+                ]
+            )
+    for number, messages in splits.items():
+        messages.sort(key=lambda message: message.log_time)
+        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+    return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
 
 def test_where_the_robot_stood_a_step_and_a_pause_are_alike(tmp_path: Path) -> None:
     memory = recorded(
         tmp_path, shown=lambda t: t + 8.0 * (t > 55), driven=lambda t: t if t < 50 else 50.0
     )
-    assert len(memory.index.snapshot().suspected_holes) == 1
+    assert len(memory.index.snapshot().suspects) == 1
     assert steps(memory, tmp_path) == []
 
 
@@ -171,7 +209,7 @@ def test_one_topic_that_pauses_is_no_hole(tmp_path: Path) -> None:
         messages.sort(key=lambda each: each.log_time)
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspected_holes == ()
+    assert memory.index.snapshot().suspects == []
 
 
 def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -> None:
@@ -179,7 +217,7 @@ def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -
         begin = (BEGIN + number * SPLIT) * S
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(begin, 0.0, 0.0, 0.0)])
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspected_holes == ()
+    assert memory.index.snapshot().suspects == []
 
 
 WHEN = 54.95

@@ -31,12 +31,12 @@ from ros2_memory.config import Settings
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.history.view import View
 from ros2_memory.index.recordings import recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.clock_steps import clock_steps
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE

@@ -150,6 +150,7 @@ class McapBags:
             complete=index.complete,
             notes=index.notes,
             set_back=index.set_back,
+            pauses=index.pauses,
         )
 
     def channels(self, path: Path) -> Sequence[Channel]:

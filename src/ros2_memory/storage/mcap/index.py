@@ -13,6 +13,7 @@ from operator import attrgetter, itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.bag_summary import (
@@ -20,6 +21,7 @@ from ros2_memory.core.bag_summary import (
     OUT_OF_ORDER_NS,
     WRONG_STATISTICS,
 )
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, pauses_among
 from ros2_memory.core.timebase import MAX_NS, unix_from_ns
 from ros2_memory.storage.errors import MAX_CHUNKS, MAX_SECTION_BYTES, UnreadableError, reason_of
 from ros2_memory.storage.mcap.chunk import (
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
+    from ros2_memory.core.pauses import Pauses
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel
     from ros2_memory.storage.file_io import OpenFile
@@ -81,6 +84,7 @@ class McapIndex(NamedTuple):
         notes: sentences on what is missing or wrong.
         set_back: by how much the log times of a channel go back from one chunk, or one loose
             message, to a later one, at most; 0 up to `OUT_OF_ORDER_NS`.
+        pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
         contradiction: how the indexes of the file contradict its messages, if that was found after
             they had been used; else empty.
         declared: what the summary section declares; None if the index comes from a scan.
@@ -94,6 +98,7 @@ class McapIndex(NamedTuple):
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
+    pauses: Pauses = ()
     contradiction: str = ""
     declared: Declarations | None = None
 
@@ -162,6 +167,21 @@ def _set_back(file: OpenFile, chunks: Sequence[Chunk]) -> Ns:
             most = max(most, before - extent.first)
             lasts[channel] = max(before, extent.last)
     return beyond_disorder(most)
+
+
+def _pauses(file: OpenFile, chunks: Sequence[Chunk]) -> Pauses:
+    """Returns `McapIndex.pauses`; reads the indexes of those chunks alone that may have one."""
+    firsts = np.array([chunk.start for chunk in chunks], np.int64)
+    lasts = np.array([chunk.end for chunk in chunks], np.int64)
+    is_long = lasts - firsts > SHORTEST_PAUSE_NS
+    inside = [
+        column.times
+        for nth in np.flatnonzero(is_long).tolist()
+        for column in chunk_columns(file, chunks[nth], chunks[nth].channels).values()
+    ]
+    return pauses_among(
+        np.concatenate([firsts[~is_long], *inside]), np.concatenate([lasts[~is_long], *inside])
+    )
 
 
 def beyond_disorder(back: Ns) -> Ns:
@@ -233,6 +253,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         totals,
         notes=notes,
         set_back=back,
+        pauses=_pauses(file, filled),
         declared=declared,
     )
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, pauses_among
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.cache import unshared_bytes
@@ -40,11 +41,15 @@ from ros2_memory.storage.mcap.summary import Chunk
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from mcap.records import Statistics
 
+    from ros2_memory.core.pauses import Pauses
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import IntArray
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.chunk import ChunkContent, Extent
+    from ros2_memory.storage.mcap.chunk import ChunkContent, Column, Extent
     from ros2_memory.storage.mcap.walk import FileRecord
 
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
@@ -87,6 +92,7 @@ class _Scan:
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
     partial: int = 0  # bytes of a last, compressed chunk that was read in part
+    held: list[IntArray] = field(default_factory=list)  # log times, or the bounds of a chunk
     back: Ns = 0  # as `set_back` of `McapIndex`, however little
 
     def add(self, record: FileRecord) -> None:
@@ -164,6 +170,13 @@ class _Scan:
         if columns:
             first = min(int(column.times[0]) for column in columns.values())
             last = max(int(column.times[-1]) for column in columns.values())
+            inside = [column.times for column in columns.values()]
+            is_long = last - first > SHORTEST_PAUSE_NS
+            self.held += (
+                [np.stack([times, times]) for times in inside]
+                if is_long
+                else [np.array([[first], [last]], np.int64)]
+            )
             numbers = frozenset(columns)
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
@@ -195,7 +208,13 @@ class _Scan:
             complete=complete,
             notes=tuple(notes),
             set_back=beyond_disorder(back),
+            pauses=self._pauses(columns.values()),
         )
+
+    def _pauses(self, loose: Iterable[Column]) -> Pauses:
+        held = [*self.held, *(np.stack([column.times, column.times]) for column in loose)]
+        firsts, lasts = np.concatenate([np.empty((2, 0), np.int64), *held], axis=1)
+        return pauses_among(firsts, lasts)
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]

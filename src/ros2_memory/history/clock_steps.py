@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
-from heapq import nlargest
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.analysis.clock_steps import (
+    ALIKE_NS,
     BESIDE_NS,
     SHORTEST_STEP_NS,
     STAMPS_BESIDE_NS,
     ClockStep,
     Elapsed,
     delay_change,
-    holes,
     step_by_delays,
     step_over,
 )
@@ -24,34 +23,29 @@ from ros2_memory.analysis.motion.odometry import GAP_PERIODS, TimedPosition, is_
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    NoDataError,
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.no_data import resolve_pose_topic, seconds
+from ros2_memory.history.no_data import seconds
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import scan
 from ros2_memory.index.clock_faults import FaultyClock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
-    from ros2_memory.index.holes import SuspectedHole
+    from ros2_memory.index.holes import Pause
     from ros2_memory.storage.base import IntArray
 
 _MOST_SUSPECTS: Final = 32
-"""The newest suspected holes are looked at; each costs some milliseconds."""
-_MOST_TOPICS: Final = 32
-_MOST_HOLES: Final = 8
-"""The longest holes of a bag are looked at."""
+"""The newest suspects are looked at; each costs some milliseconds."""
 _MOST_STAMPED: Final = 8
 """Topics of which header stamps are looked at."""
 _STAMP: Final = "header.stamp"
@@ -70,6 +64,20 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     return tuple(each for each in _steps_around(view, window) if window.contains(each.at))
 
 
+def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
+    """Returns those gaps, of a snapshot and in order, that are no step of the clock."""
+    if not gaps:
+        return gaps
+    try:
+        steps = {
+            at for at, by in _steps_around(view, TimeWindow(gaps[0][0], gaps[-1][1])) if by > 0
+        }
+    except QueryTimeoutError:
+        _note_timeout(view)
+        return gaps
+    return [gap for gap in gaps if gap[0] not in steps]
+
+
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     """Returns how much time passed between moments of a window; notes name the steps in it."""
     try:
@@ -79,10 +87,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
             if window.overlaps(each.at, each.at + max(each.by - 1, 0))
         ]
     except QueryTimeoutError:
-        view.notes.complete = False
-        view.notes.add(
-            "out of time before it was known whether the clock was set: durations are by the clock"
-        )
+        _note_timeout(view)
         return Elapsed()
     for at, by in steps:
         view.notes.add(
@@ -92,6 +97,13 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
             "across that are too short by as much"
         )
     return Elapsed(steps)
+
+
+def _note_timeout(view: View) -> None:
+    view.notes.complete = False
+    view.notes.add(
+        "out of time before it was known whether the clock was set: durations are by the clock"
+    )
 
 
 def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
@@ -141,54 +153,40 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         for fault in view.snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
-    suspects = [
-        each for each in view.snapshot.suspected_holes if window.overlaps(each.first, each.last)
-    ]
-    if view.memory.stated is not None and any(each.bag is not None for each in suspects):
-        # A lake has no times of messages to look at.
-        suspects = [each for each in suspects if each.bag is None]
-        view.notes.add("steps of the clock inside of a bag are not seen in the lake")
-    if suspects:
-        try:
-            topic: str | None = resolve_pose_topic(view)
-        except NoDataError:
-            topic = None
-        for suspect in suspects[-_MOST_SUSPECTS:]:
-            steps += _steps_in(view, topic, suspect)
-    return sorted(steps)
+    suspects = [pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])]
+    found = (_step_in(view, pause) for pause in suspects[-_MOST_SUSPECTS:])
+    return sorted([*steps, *filter(None, found)])
 
 
-def _steps_in(view: View, topic: str | None, suspect: SuspectedHole) -> Sequence[ClockStep]:
-    """Returns the steps in a suspected hole, which is looked at once if its bags are closed."""
-    around = TimeWindow(suspect.first, suspect.last + 1).widened(BESIDE_NS)
-    topics = [] if topic is None else [topic]
-    topics += [] if suspect.bag is None else _busiest(suspect.bag)
-    bags = [span.bag for span in view.stream.overlapping_bags(topics, around)]
+def _step_in(view: View, pause: Pause) -> ClockStep | None:
+    """Returns the step that a pause is, which is looked at once if its bags are closed."""
+    around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
+    bags = view.snapshot.timeline.overlapping(around)
+    topic = view.pose_topic if view.pose_topic in view.snapshot.timeline.topics() else None
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
-    key = (topic, suspect.first, suspect.last, *states)
+    key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
-    kept = None if scanner is None else scanner.clock_steps.get(key)
-    if kept is not None:
-        return kept
-    with view.notes.isolated():
-        steps = tuple(_read_steps(view, topic, suspect))
-        is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
-    if scanner is not None and is_final:
-        scanner.clock_steps.put(key, steps, _STEPS_BYTES)
-    return steps
+    known = None if scanner is None else scanner.clock_steps.get(key)
+    if known is None:
+        with view.notes.isolated():
+            step = _read_step(view, topic, (pause.start, pause.end))
+            is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
+        known = () if step is None else (step,)
+        if scanner is not None and is_final:
+            scanner.clock_steps.put(key, known, _STEPS_BYTES)
+    return next(iter(known), None)
 
 
-def _read_steps(view: View, topic: str | None, suspect: SuspectedHole) -> Iterator[ClockStep]:
-    for hole in _holes_in(view, suspect):
-        step = _step_by_stamps(view, hole)
-        if step is None and hole[1] - hole[0] >= SHORTEST_STEP_NS and topic is not None:
-            step = step_over(
-                hole,
-                _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
-                _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
-            )
-        if step is not None:
-            yield step
+def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep | None:
+    step = _step_by_stamps(view, hole)
+    is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
+    if step is not None or not is_long or topic is None or _is_late(view, topic, hole):
+        return step
+    return step_over(
+        hole,
+        _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
+        _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
+    )
 
 
 def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
@@ -209,6 +207,16 @@ def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
     return step_by_delays(hole, changes)
 
 
+def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
+    """Returns whether messages that follow a hole were sent in it: the recorder had stalled."""
+    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+    first = view.stream.first((topic,), after)
+    sent = [] if first is None else [first.record.publish_time]
+    for _, stamps in _stamps(view, topic, after).values():
+        sent += stamps.tolist()
+    return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
+
+
 def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
     found: dict[Path, tuple[IntArray, IntArray]] = {}
@@ -226,20 +234,6 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntA
             np.concatenate([known[1], stamps]),
         )
     return found
-
-
-def _holes_in(view: View, suspect: SuspectedHole) -> list[tuple[Ns, Ns]]:
-    bag = suspect.bag
-    if bag is None:
-        return [(suspect.first, suspect.last)]
-    window = TimeWindow.everything()
-    found = holes(at for name in _busiest(bag) for at in view.bags.log_times(bag, name, window))
-    return sorted(nlargest(_MOST_HOLES, found, key=lambda hole: hole[1] - hole[0]))
-
-
-def _busiest(bag: BagFile) -> list[str]:
-    rows = sorted(bag.summary.topics, key=lambda each: (-each.count, each.topic))
-    return [*dict.fromkeys(each.topic for each in rows[:_MOST_TOPICS])]
 
 
 def _poses(view: View, topic: str, window: TimeWindow) -> list[TimedPosition]:

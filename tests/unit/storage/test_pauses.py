@@ -1,0 +1,77 @@
+"""Where no topic has a message for a while, as the summary of a bag states it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import McapLayout, Msg, boolean, odom, write_db3, write_mcap
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.core.pauses import Pauses
+
+S = 10**9
+BEGIN = 1_784_000_000 * S
+KINDS = ["mcap", "large chunks", "no chunks", "no summary", "db3"]
+
+
+def every(hz: float, seconds: float, *, but: tuple[tuple[float, float], ...] = ()) -> list[float]:
+    times = [n / hz for n in range(round(hz * seconds))]
+    return [t for t in times if not any(start < t < stop for start, stop in but)]
+
+
+def bag_of(odometry: list[float], flags: list[float]) -> list[Msg]:
+    messages = [odom(BEGIN + round(t * S), 0.0, 0.0) for t in odometry]
+    messages += [boolean(BEGIN + round(t * S) + 1, data=True) for t in flags]
+    return sorted(messages, key=lambda message: message.log_time)
+
+
+def pauses(folder: Path, kind: str, messages: list[Msg]) -> Pauses:
+    if kind == "db3":
+        path = write_db3(folder / "bag.db3", messages)
+        return Rosbag2Reader().summarize(path).schema.pauses
+    path = folder / "bag.mcap"
+    if kind == "large chunks":
+        write_mcap(path, messages, McapLayout(chunk_size=1 << 20))
+    elif kind == "no chunks":
+        write_mcap(path, messages, McapLayout(chunk_size=None))
+    else:
+        write_mcap(path, messages, McapLayout(chunk_size=1 << 12))
+    if kind == "no summary":
+        path.write_bytes(path.read_bytes()[: -path.stat().st_size // 50])
+    return McapReader().summarize(path).schema.pauses
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_pause_of_all_topics_is_found_wherever_its_messages_lie(
+    tmp_path: Path, kind: str
+) -> None:
+    off = ((3.0, 3.7), (5.0, 5.4), (6.0, 8.0))
+    messages = bag_of(every(50, 10, but=off), every(10, 10, but=off))
+    assert pauses(tmp_path, kind, messages) == (
+        (BEGIN + 3 * S + 1, BEGIN + round(3.7 * S)),
+        (BEGIN + 6 * S + 1, BEGIN + 8 * S),
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_slower_topic_that_goes_on_leaves_no_pause(tmp_path: Path, kind: str) -> None:
+    assert pauses(tmp_path, kind, bag_of(every(50, 10, but=((3, 5),)), every(10, 10))) == ()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_published_seldom_leaves_no_pause(tmp_path: Path, kind: str) -> None:
+    assert pauses(tmp_path, kind, bag_of(every(1, 60), every(0.5, 60))) == ()
+
+
+def test_messages_that_are_written_out_of_order_leave_no_pause(tmp_path: Path) -> None:
+    messages = bag_of(every(50, 10), every(10, 10))
+    late = [message for message in messages if 3 * S < message.log_time - BEGIN < 5 * S]
+    rest = [message for message in messages if message not in late]
+    assert pauses(tmp_path, "mcap", [*rest, *(replace(message) for message in late)]) == ()
