@@ -90,7 +90,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "copy a time window to MCAP or Parquet",
         {
             0: "the whole window was copied",
-            1: "part of it could not be read (stderr names it)",
+            1: "part of it could not be read, or has no definition (stderr names it)",
         },
     ),
     "forget": CommandEntry(
