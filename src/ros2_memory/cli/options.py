@@ -40,6 +40,7 @@ from ros2_memory.core.timebase import (
     Ns,
     WallClock,
     ns_from_unix,
+    rest_of_text_s,
     unix_from_ns,
     unix_from_text,
 )
@@ -66,9 +67,6 @@ _LARGEST_UNIX_S: Final = 1e11
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
-_WHOLE_MS: Final = re.compile(r".*:\d\d\.\d{3}")
-"""A time as this program prints it: rounded down to the millisecond."""
-_REST_OF_MS: Final = 0.000_999
 
 _PIPE_WIDTH: Final = 160
 """Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
@@ -380,9 +378,9 @@ def parse_window(
     now = unix_from_ns(present(memory))
     if last is None:
         first = unix_from_ns(MIN_NS) if start is None else parse_time(start, now)
-        until = unix_from_ns(MAX_NS) if end is None else parse_time(end, now)
-        if end is not None and _WHOLE_MS.fullmatch(end.strip()):
-            until += _REST_OF_MS  # or what was printed would lie just after it
+        until = unix_from_ns(MAX_NS)
+        if end is not None:
+            until = parse_time(end, now) + rest_of_text_s(end)
         return TimeWindow.from_unix(first, until)
     if start is not None or end is not None:
         raise InvalidArgumentsError("give --last, or --start and --end, not both")
