@@ -99,7 +99,8 @@ def ask(
     if tool is not None and _SETTING.fullmatch(tool):
         tool, words = None, [tool, *words]
     if tool is not None and is_folder(tool) and tool not in complete(tool):
-        tool, words = None, [tool, *words]
+        path, (tool, *words) = tool, words or [None]
+        words.append(path)
     of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)

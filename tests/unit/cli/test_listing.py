@@ -144,12 +144,6 @@ class TestPaths:
         assert cli.main(["cat", "/\x1b[31m", str(folder)]) == 2
         assert "\x1b" not in capsys.readouterr().err
 
-    def test_a_topic_after_the_folder_is_told_its_place(
-        self, folder: Path, capsys: Capture
-    ) -> None:
-        assert cli.main(["cat", str(folder), "/odom"]) == 2
-        assert f"ros2-memory cat /odom {folder}" in capsys.readouterr().err
-
     def test_bags_of_others_need_no_recorder_and_no_preset(
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -437,8 +431,24 @@ def test_where_the_topic_is_forgotten_the_command_is_named(folder: Path, capsys:
     for words in (["cat"], ["plot", "signal", "-o", "x.svg"]):
         assert cli.main([*words, str(folder / "a")]) == 2
         command = " ".join(words[:2] if words[0] == "plot" else words)
-        expected = f"is a folder, not a topic; write `ros2-memory {command} TOPIC {folder / 'a'}`"
+        expected = f"is a folder, not a topic; write `ros2-memory {command} {folder / 'a'} TOPIC`"
         assert expected in capsys.readouterr().err
+
+
+def test_a_path_may_come_first(folder: Path, capsys: Capture, tmp_path: Path) -> None:
+    bags = folder / "a"
+    for first, last in (
+        (["cat", bags, "/odom"], ["cat", "/odom", bags]),
+        (["ask", bags, "data_time_range"], ["ask", "data_time_range", bags]),
+    ):
+        assert cli.main([*map(str, first)]) == 0
+        shown = capsys.readouterr().out
+        assert cli.main([*map(str, last)]) == 0
+        assert shown == capsys.readouterr().out
+    for words in ([bags], [bags, "timeline"], [bags, "signal", "/odom"]):
+        picture = tmp_path / "picture.svg"
+        assert cli.main(["plot", *map(str, words), "-o", str(picture)]) == 0
+        picture.unlink()
 
 
 def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, capsys: Capture) -> None:
