@@ -341,12 +341,12 @@ def find_last_match(
         note_unread(view, _searched(view, found, until, now), search=True)
         # What the view shows may be some days of long ago.
         newest_known = memory.index.published or view.snapshot
-        counted_from = now if memory.limits.now == "wall" else newest_known.latest
-        if counted_from is not None and found.time > counted_from + FUTURE_NS:
+        counted_from = memory.now(now, newest_known.latest, call)
+        is_future = found.time > counted_from + FUTURE_NS
+        if is_future:
             after = seconds(found.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-            counted_from = None
-        value_found = _value(view, found, fields, counted_from)
+        value_found = _value(view, found, fields, None if is_future else counted_from)
         return results.Match(value_found, notes=view.notes.sentences())
 
     reach = min(now, until)
@@ -458,7 +458,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
-        now=memory.now(now, snapshot.latest),
+        now=memory.now(now, snapshot.latest, call),
         bags=len(snapshot.bags),
         gaps=gaps_with_deleted(view, view.gaps(TimeWindow.everything())),
         incomplete=left_open(snapshot),

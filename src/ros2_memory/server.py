@@ -47,6 +47,8 @@ _THREADS_END_S: Final = 0.2
 _LAKE_LOOKED_AT_S: Final = 30.0
 """Twice as often as a question would look itself."""
 
+_DISPLAYS: Final = ("DISPLAY", "WAYLAND_DISPLAY")
+
 log = get_logger("ros2_memory.server")
 
 
@@ -56,20 +58,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: stopped by SIGTERM, SIGINT or the end of stdin; 1: the address cannot be listened on; 2: the
     configuration or the command line is refused, or a token is missing where there must be one.
     """
-    overrides: list[str] = _parser().parse_args(argv).overrides
+    given = _parser().parse_args(argv)
     gc.disable()  # until the server is built: imports make many objects, and no garbage
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))
     try:
-        _run(overrides)
+        _run(given.overrides, given.page)
     except CannotListenError as error:
         sys.stderr.write(f"{PROGRAM}: {error}\n")
         return _end_threads(CANNOT_LISTEN)
     return _end_threads(0)
 
 
-def _run(overrides: Sequence[str]) -> None:
+def _run(overrides: Sequence[str], page: str | None = None) -> None:
     """Loads the configuration, builds the server, and serves.
+
+    `page`: whether the address of the page is to `print`, or also to `open`.
 
     Raises:
         CannotListenError: the address cannot be listened on.
@@ -132,13 +136,24 @@ def _run(overrides: Sequence[str]) -> None:
                 page=parts.page,
                 limited=limited,
             )
-            serve_http(server, app, address)
+            serve_http(server, app, address, partial(_show_page, page) if page else None)
     except SystemExit:
         log.info("stopped")
     finally:
         server.dispatcher.stop()
         health.stop()
         telemetry.stop()
+
+
+def _show_page(how: str, site: str) -> None:
+    """Prints the address of the page; opens it where somebody sits at a display."""
+    sys.stdout.write(f"the page of this memory: {site}/\n")
+    sys.stdout.flush()
+    has_display = sys.platform in {"darwin", "win32"} or any(map(os.environ.get, _DISPLAYS))
+    if how == "open" and has_display and sys.stdout.isatty():
+        import webbrowser
+
+        threading.Thread(target=webbrowser.open, args=(f"{site}/",), daemon=True).start()
 
 
 class _Parts(NamedTuple):
@@ -222,6 +237,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="key=value",
         help="settings that take precedence over the configuration, e.g. server.transport=sse",
     )
+    parser.add_argument("--page", choices=("print", "open"), help=argparse.SUPPRESS)
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {package_version()}")
     return parser
 

@@ -19,6 +19,7 @@ from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
+from ros2_memory.server import _show_page
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ANSWERED, CALLS, REFUSED, T0_S, ask, ask_everything, write_run
 from tests.timing import in_time
@@ -54,7 +55,7 @@ def environment(bag_dir: Path, **more: str) -> dict[str, str]:
 
 @dataclass
 class Served:
-    process: subprocess.Popen[bytes]
+    process: subprocess.Popen[Any]
     port: int
     log: Path
 
@@ -103,6 +104,48 @@ def serving(
     finally:
         process.kill()
         process.communicate()
+
+
+def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> None:
+    env = environment(tmp_path / "elsewhere", MCP_PORT="0", DISPLAY=":99", BROWSER="false")
+    del env["MEMORY_BAG_DIR"]
+    program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir)]
+    with (tmp_path / "log").open("wb") as log:
+        process = subprocess.Popen(program, env=env, stdout=subprocess.PIPE, stderr=log, text=True)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line.startswith("the page of this memory: http://127.0.0.1:")
+        served = Served(process, int(line.rstrip("/\n").rpartition(":")[2]), tmp_path / "log")
+        status, page = served.get("/")
+        assert (status, b"<html" in page) == (200, True)
+        (starting,) = (each for each in served.events() if each["event"] == "starting")
+        assert starting["bag_dir"] == str(bag_dir)
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("how", "display", "is_terminal", "opened"),
+    [
+        ("open", ":0", True, 1),
+        ("open", ":0", False, 0),
+        ("open", "", True, 0),
+        ("print", ":0", True, 0),
+    ],
+)
+def test_the_browser_opens_where_somebody_sits_at_a_display(
+    monkeypatch: pytest.MonkeyPatch, how: str, display: str, is_terminal: bool, opened: int
+) -> None:
+    seen: list[str] = []
+    monkeypatch.setattr("webbrowser.open", seen.append)
+    monkeypatch.setattr("threading.Thread.start", lambda thread: thread.run())
+    monkeypatch.setattr("sys.stdout.isatty", lambda: is_terminal, raising=False)
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    _show_page(how, "http://127.0.0.1:1")
+    assert seen == ["http://127.0.0.1:1/"] * opened
 
 
 async def test_everything_is_answered_over_stdio(bag_dir: Path, tmp_path: Path) -> None:

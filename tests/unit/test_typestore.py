@@ -9,6 +9,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.storage.base import Definition
 from ros2_memory.typestore import (
     MAX_CACHED_BYTES,
     MAX_MEMBERS,
@@ -17,6 +18,7 @@ from ros2_memory.typestore import (
     MAX_TEXT_BYTES,
     MessageType,
     Typestores,
+    text_of,
 )
 from tests.support.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
 
@@ -44,6 +46,12 @@ def reason(found: MessageType | str) -> str:
 
 def oracle(message: Msg) -> str:
     return repr(typestore().deserialize_cdr(message.payload, message.type))
+
+
+def spelled_out(kind: str | Definition) -> object:
+    if isinstance(kind, str):
+        return kind
+    return [(each.name, spelled_out(each.kind), each.length) for each in kind.fields]
 
 
 def lookup(name: str, definition_text: str, encoding: str = "ros2msg") -> MessageType | str:
@@ -136,6 +144,15 @@ class TestTexts:
         for name in names:
             whole = standard.generate_msgdef(name, ros_version=2)[0]
             assert isinstance(lookup(name, whole), MessageType), name
+
+    def test_every_standard_type_is_the_same_after_its_text_was_written(self) -> None:
+        stores = Typestores()
+        for name in get_typestore(Stores.LATEST).fielddefs:
+            standard = stores.lookup(name, "", b"")
+            assert isinstance(standard, MessageType)
+            written = stores.lookup(name, "ros2msg", text_of(standard.fields).encode())
+            assert isinstance(written, MessageType)
+            assert spelled_out(written.fields) == spelled_out(standard.fields), name
 
     def test_windows_line_ends_a_byte_order_mark_and_odd_bytes_do_no_harm(self) -> None:
         whole = "\ufeff# caf\u00e9\r\nuint8 x # \u00e9\r\nOther other\r\n"

@@ -90,7 +90,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "copy a time window to MCAP or Parquet",
         {
             0: "the whole window was copied",
-            1: "part of it could not be read (stderr names it)",
+            1: "part of it could not be read, or has no definition (stderr names it)",
         },
     ),
     "forget": CommandEntry(
@@ -136,6 +136,8 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     ),
     "config": CommandEntry("config.config", "show the configuration in force", {0: "it was shown"}),
 }
+_PICTURES: Final = ("path", "signal", "timeline", "recap")
+"""What `plot` draws; the first unless another is named."""
 COMMON_EXIT_CODES: Final[Mapping[int, str]] = {
     2: "the command could not run (stderr gives the reason)",
     INTERRUPTED: "interrupted before it finished",
@@ -192,6 +194,9 @@ class LazyCommand(TyperCommand):
             args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if each in _HELP else each for each in args]
+        if self._name == "plot" and args and args[0] not in _PICTURES and Path(args[0]).exists():
+            picture = args.pop(1) if args[1:] and args[1] in _PICTURES else _PICTURES[0]
+            args = [picture, *args]
         return command.make_context(info_name, args, parent, **extra)
 
     def _load(self) -> "Command":

@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Annotated, Final
 
 import anyio
@@ -32,7 +33,7 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import unix_from_ns, unix_from_text
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
@@ -98,7 +99,8 @@ def ask(
     if tool is not None and _SETTING.fullmatch(tool):
         tool, words = None, [tool, *words]
     if tool is not None and is_folder(tool) and tool not in complete(tool):
-        tool, words = None, [tool, *words]
+        path, (tool, *words) = tool, words or [None]
+        words.append(path)
     of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
     loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)
@@ -207,7 +209,12 @@ def _in_seconds(value: object, schema: object, now: float) -> object:
         return _in_seconds(value, items, now)
     if isinstance(value, str) and kind == "number":
         return parse_duration(value) or value
-    return parse_time(value, now) if isinstance(value, str) and kind == [*TIME_KINDS] else value
+    if not isinstance(value, str) or kind != [*TIME_KINDS]:
+        return value
+    with suppress(ValueError):
+        unix_from_text(value)
+        return value  # the tool knows whether all of its last decimal counts
+    return parse_time(value, now)
 
 
 def _from_json(text: str, otherwise: str | None) -> JsonValue:

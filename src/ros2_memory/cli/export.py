@@ -3,6 +3,8 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import cache
 from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
@@ -34,14 +36,15 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.text import counted, match_topics
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.view import View
-from ros2_memory.storage.base import ROS2_PROFILE, Record
+from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.typestore import text_of
 
 _REPORT_EVERY: Final = 512
 
@@ -116,17 +119,25 @@ def export(
                 + ("" if first else "; no message is in the window")
             )
         messages = _reported(chain(earlier, first, within), report)
+        undefined: list[str] = []
         if mcap is not None:
+            messages = _with_definitions(messages, memory.reader, undefined)
             done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
         elif parquet is not None:
             done = _write_parquet(parquet, messages, memory, robot)
+    if undefined:
+        view.notes.add(
+            f"{listed(undefined)} {'has' if len(undefined) == 1 else 'have'} no definition in "
+            "the bags, in reader.custom_msg_paths or among the standard types, and none in the "
+            "file: other programs cannot read such messages"
+        )
     if as_json:
         print_line(json.dumps({**done.as_object(), "notes": [*view.notes.sentences()]}))
     else:
         print_line(str(done))
     for note in view.notes.sentences():
         typer.echo(f"note: {with_local_times(note)}", err=True)
-    if not view.notes.complete or lost_in(view.snapshot, window):
+    if undefined or not view.notes.complete or lost_in(view.snapshot, window):
         raise typer.Exit(EXIT_NEGATIVE)
 
 
@@ -193,6 +204,27 @@ def _profile(
         with suppress(BagError):
             profiles.add(view.memory.reader.profile(path))
     return profiles.pop() if len(profiles) == 1 else ""
+
+
+def _with_definitions(
+    messages: Iterator[StoredMessage], reader: BagReader, undefined: list[str]
+) -> Iterator[StoredMessage]:
+    """Yields the messages with the definitions that their bags lack; collects unknown types."""
+
+    @cache
+    def defined(channel: Channel) -> Channel:
+        schema = channel.schema
+        if channel.encoding != "cdr" or schema.text.strip():
+            return channel
+        definition = reader.definition(channel)
+        if definition is None:
+            undefined.extend({schema.name} - {*undefined})
+            return channel
+        text = text_of(definition).encode()
+        return replace(channel, schema=replace(schema, encoding="ros2msg", text=text))
+
+    for each in messages:
+        yield each._replace(record=each.record._replace(channel=defined(each.record.channel)))
 
 
 class Exported(NamedTuple):

@@ -40,6 +40,7 @@ from ros2_memory.core.timebase import (
     Ns,
     WallClock,
     ns_from_unix,
+    rest_of_text_s,
     unix_from_ns,
     unix_from_text,
 )
@@ -66,9 +67,6 @@ _LARGEST_UNIX_S: Final = 1e11
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
-_WHOLE_MS: Final = re.compile(r".*:\d\d\.\d{3}")
-"""A time as this program prints it: rounded down to the millisecond."""
-_REST_OF_MS: Final = 0.000_999
 
 _PIPE_WIDTH: Final = 160
 """Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
@@ -211,26 +209,39 @@ def load_to_look(
         ConfigError: the configuration is refused.
         InvalidArgumentsError: there is no such file or folder, or more than one is named.
     """
-    path, overrides = _path_and_settings(words or ())
-    if path is not None and bag_dir is not None:
-        raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
-    chosen: list[str] = []
-    if path is not None and path.is_file():
-        path, recording = _folder_of(path, recording)
-    if recording is not None:
-        chosen.append(f"data.recording={quoted(recording)}")
-    named = bag_dir if path is None else path
-    given = [*overrides, *chosen]
-    is_chosen = is_deployment_chosen(overrides)
-    if named is not None and not is_chosen:
-        # To compose it takes a tenth of a second: once, where nothing else is to be known first.
-        return load_for(named, given if _is_recorded_now(named) else [*_LOOKING, *given])
+    named, given = settings_to_look(bag_dir, words, recording)
+    is_chosen = is_deployment_chosen(given)
     settings = load_for(named, given)
-    by_words = any(each.partition("=")[0] in GROUPS for each in overrides)
-    of_path = None if path is None else named
+    by_words = any(each.partition("=")[0] in GROUPS for each in given)
+    of_path = named if bag_dir is None else None
     if by_words or not _is_of_others(settings, of_path, is_chosen=is_chosen):
         return settings
     return load_for(named, [*_LOOKING, *given])
+
+
+def settings_to_look(
+    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
+) -> tuple[Path | None, list[str]]:
+    """Returns the folder that the words or an option name, and the settings for it.
+
+    They are those for bags of others, unless a recorder is at work there, or somebody chose a
+    recorder, a storage or a deployment.
+
+    Raises:
+        ConfigError: a variable or a setting is refused.
+        InvalidArgumentsError: there is no such file or folder, or more than one is named.
+    """
+    path, given = _path_and_settings(words or ())
+    if path is not None and bag_dir is not None:
+        raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
+    if path is not None and path.is_file():
+        path, recording = _folder_of(path, recording)
+    named = bag_dir if path is None else path
+    if named is not None and not is_deployment_chosen(given) and not _is_recorded_now(named):
+        given = [*_LOOKING, *given]
+    if recording is not None:
+        given.append(f"data.recording={quoted(recording)}")
+    return named, given
 
 
 def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
@@ -380,9 +391,9 @@ def parse_window(
     now = unix_from_ns(present(memory))
     if last is None:
         first = unix_from_ns(MIN_NS) if start is None else parse_time(start, now)
-        until = unix_from_ns(MAX_NS) if end is None else parse_time(end, now)
-        if end is not None and _WHOLE_MS.fullmatch(end.strip()):
-            until += _REST_OF_MS  # or what was printed would lie just after it
+        until = unix_from_ns(MAX_NS)
+        if end is not None:
+            until = parse_time(end, now) + rest_of_text_s(end)
         return TimeWindow.from_unix(first, until)
     if start is not None or end is not None:
         raise InvalidArgumentsError("give --last, or --start and --end, not both")
@@ -445,19 +456,22 @@ def day_of(memory: "Memory", day: str | None) -> TimeWindow:
     return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
 
 
-def require_topic(topic: str, words: Sequence[str] | None, command: str) -> None:
-    """Checks that the first argument of a command is a topic, and no path of a bag.
+def topic_and_words(first: str, words: Sequence[str] | None, command: str) -> tuple[str, list[str]]:
+    """Returns the topic of a command and its other words: a path may stand before the topic.
 
     Raises:
-        InvalidArgumentsError: it is a path.
+        InvalidArgumentsError: there is a path, and no topic.
     """
-    if not Path(topic).exists() or any(Path(each).exists() for each in words or ()):
-        return
-    kind = "folder" if Path(topic).is_dir() else "file"
-    name = words[0] if words and "=" not in words[0] else "TOPIC"
-    raise InvalidArgumentsError(
-        f"{topic} is a {kind}, not a topic; write `ros2-memory {command} {name} {topic}`"
-    )
+    others = [*(words or ())]
+    if not Path(first).exists() or any(map(is_folder, others)):
+        return first, others
+    topic = next((each for each in others if "=" not in each), None)
+    if topic is None:
+        kind = "folder" if Path(first).is_dir() else "file"
+        raise InvalidArgumentsError(
+            f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
+        )
+    return topic, [first, *(each for each in others if each != topic)]
 
 
 @contextmanager

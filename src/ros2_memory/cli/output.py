@@ -33,7 +33,7 @@ _NO_AGE_BELOW_S: Final = 0.05
 _MAX_FLATTENED_KEYS: Final = 8
 _MAX_COLUMNS: Final = 9
 _COLUMN_GAP: Final = 2
-_TIME_OF_DAY_WIDTH: Final = 12
+_TIME_OF_DAY_WIDTH: Final = 15
 _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
 _ALL: Final = "all"
@@ -292,12 +292,12 @@ def _is_time(value: JsonValue) -> bool:
 
 
 def format_time(unix_s: float) -> str:
-    """Formats a time in this machine's zone, rounded down to the millisecond.
+    """Formats a time in this machine's zone, to the microsecond.
 
     Every option that takes a time reads it, and it is one word for a shell.
     """
     local = datetime.fromtimestamp(unix_s, tz=UTC).astimezone()
-    return f"{local:%Y-%m-%dT%H:%M:%S}.{local.microsecond // 1000:03d}"
+    return f"{local:%Y-%m-%dT%H:%M:%S.%f}"
 
 
 def format_duration(seconds: float) -> str:

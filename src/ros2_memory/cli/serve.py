@@ -2,17 +2,35 @@
 
 import os
 import sys
+from typing import Annotated
 
-from ros2_memory.cli.options import BagDir, Overrides
+import typer
+
+from ros2_memory.cli.options import BagDir, Words, settings_to_look
 from ros2_memory.config_sources import quoted
 
 
-def serve(overrides: Overrides = None, bag_dir: BagDir = None) -> None:
+def serve(
+    words: Words = None,
+    *,
+    bag_dir: BagDir = None,
+    no_open: Annotated[
+        bool, typer.Option("--no-open", help="Open no browser; print the page's address only.")
+    ] = False,
+) -> None:
     """Answer questions over MCP, like ros2-memory-server.
 
-    Over stdio, or over HTTP with server.transport=sse. Stop it with Ctrl-C, or close stdin.
+    With a PATH over HTTP, and the page of the memory opens in the browser. Otherwise over stdio, or
+    over HTTP with server.transport=sse. Stop it with Ctrl-C, or close stdin.
     """
-    chosen = [] if bag_dir is None else [f"recording.bag_dir={quoted(str(bag_dir.absolute()))}"]
-    program = [sys.executable, "-m", "ros2_memory.server", *(overrides or ()), *chosen]
+    folder, given = settings_to_look(bag_dir, words)
+    if folder is not None:
+        given.append(f"recording.bag_dir={quoted(str(folder.absolute()))}")
+    options: list[str] = []
+    if folder is not None and bag_dir is None:
+        options = ["--page", "print" if no_open else "open"]
+        if "MCP_TRANSPORT" not in os.environ:
+            given.insert(0, "server.transport=sse")
+    program = [sys.executable, "-m", "ros2_memory.server", *options, *given]
     # In place of this process, whose signals and garbage collection are those of a short command.
     os.execv(sys.executable, program)  # noqa: S606 - there is nothing for a shell to do

@@ -14,7 +14,7 @@ import re
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ _WEEKDAYS: Final = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 _DIGITS: Final = re.compile(r"[0-9]{9,}(\.[0-9]+)?")
 # Not every text that `datetime` reads: it takes 17840232 for a day of the year 1784.
 _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
+_SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
 _LONGEST_TIME: Final = 64
 
 MIN_NS: Final[Ns] = -(2**63)
@@ -71,9 +72,14 @@ def ms_from_ns(ns: Ns) -> float:
 
 
 def iso_local(ns: Ns) -> str | None:
-    """Returns ISO 8601 local time with offset; None for years that the calendar does not have."""
+    """Returns ISO 8601 local time with offset; None for years that the calendar does not have.
+
+    Rounded up to microseconds, as `unix_rounded_up`; whole seconds have no decimals.
+    """
+    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
     try:
-        return datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone().isoformat()
+        whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
+        return (whole + fraction).astimezone().isoformat()
     except (OverflowError, ValueError, OSError):
         return None
 
@@ -115,6 +121,19 @@ def unix_from_text(text: str) -> float:
     if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
         raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
     return seconds
+
+
+def rest_of_text_s(text: str) -> float:
+    """Returns how long a time as text lasts after its first moment (s, whole microseconds).
+
+    Its last decimal is all part of it: 14:05:03.74 lasts 9.999 ms longer, to 14:05:03.749999. A
+    time with a weekday is rounded down to seconds (`local_text`). Any other is exact.
+    """
+    weekday, written = _without_weekday(text.strip())
+    found = _SECONDS.search(written)
+    if found is None or (found[1] is None and weekday is None):
+        return 0.0
+    return max(10.0 ** -len(found[1] or "") - 1e-6, 0.0)
 
 
 def _without_weekday(text: str) -> tuple[str | None, str]:

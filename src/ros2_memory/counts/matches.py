@@ -78,7 +78,7 @@ def count_matches(
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
-    asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest)))
+    asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest, call)))
     topics = matching_topics(view, topic)
     binned = BinnedWindow(view, asked, by, topics)
     note_robots_on(view, topics, binned.counted)

@@ -162,9 +162,16 @@ class Memory:
             return None
         return self.index.heartbeat()
 
-    def now(self, wall: Ns, latest: Ns | None) -> Ns:
-        """Returns what ages count from: the wall clock, or the newest recorded time."""
-        return wall if self.limits.now == "wall" or latest is None else latest
+    def now(self, wall: Ns, latest: Ns | None, call: Call | None = None) -> Ns:
+        """Returns what ages count from: the wall clock, or the newest recorded time.
+
+        A `call` that has ages in its answer notes the latter.
+        """
+        if self.limits.now == "wall" or latest is None:
+            return wall
+        if call is not None:
+            call.now = latest
+        return latest
 
 
 class _StageTimer:
@@ -216,6 +223,7 @@ class Call:
         robots: those of a fleet that it may ask about; None for all.
         rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
             count all the same. None for all.
+        now: what the answer's ages count from, where that is not the wall clock.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
@@ -223,6 +231,7 @@ class Call:
     used_active: bool = False
     robots: frozenset[str] | None = None
     rows_in: TimeWindow | None = None
+    now: Ns | None = None
 
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""

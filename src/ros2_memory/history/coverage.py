@@ -44,6 +44,7 @@ from ros2_memory.core.timebase import (
     MAX_NS,
     MIN_NS,
     NS_PER_S,
+    NS_PER_US,
     START_SLACK_NS,
     unix_from_ns,
     unix_rounded_up,
@@ -236,18 +237,23 @@ def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
 def note_edges(view: View, window: TimeWindow) -> None:
     """Adds a note if a window reaches past the begin or the end of the recorded data."""
     snapshot = view.snapshot
-    asked_from, asked_to = window.asked()
+    asked_from, _ = window.asked()
     earliest = snapshot.earliest
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
         if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
             view.notes.add(f"the memory begins at {unix_text(earliest)}")
-    if snapshot.latest is None or asked_to <= snapshot.latest:
+    if snapshot.latest is None or not _ends_after(window, snapshot.latest):
         return
     if snapshot.active:
         view.notes.add(_nothing_after(snapshot.active, snapshot.latest))
     else:
         view.notes.add(f"the memory ends at {unix_text(snapshot.latest)}")
+
+
+def _ends_after(window: TimeWindow, latest: Ns) -> bool:
+    """Whether a window was asked to end after the newest data, whose time replies round up."""
+    return window.asked()[1] >= latest + NS_PER_US
 
 
 def unix_text(at: Ns) -> str:
@@ -364,7 +370,7 @@ def _touches(span: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> b
 
 def _describe_active(snapshot: Snapshot, active: Sequence[SetAside], window: TimeWindow) -> str:
     latest = snapshot.latest
-    if latest is not None and window.stop - 1 - AT_OR_BEFORE_SLACK_NS > latest:
+    if latest is not None and _ends_after(window, latest):
         return _nothing_after(snapshot.active, latest)
     excluded = [
         short_name(each.path) for each in active if not each.answers and each.reason != HELD_BACK

@@ -350,4 +350,4 @@ def _open_now(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
     """Returns the view for a moment before now, and now."""
     wall = memory.clock.now()
     view = open_view(memory, call, None if memory.limits.now == "latest" else wall - ago)
-    return view, memory.now(wall, view.snapshot.latest)
+    return view, memory.now(wall, view.snapshot.latest, call)

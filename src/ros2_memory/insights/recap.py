@@ -185,7 +185,7 @@ def recap(
     answer = Recap(
         start=start,
         end=end,
-        now=memory.now(memory.clock.now(), view.snapshot.latest),
+        now=memory.now(memory.clock.now(), view.snapshot.latest, view.call),
         distance_m=None,
         max_speed=None,
         stood=stood,

@@ -161,7 +161,8 @@ def _now(memory: Memory, call: Call) -> Ns:
     """Returns what "ago" counts from."""
     wall = memory.clock.now()
     relative = memory.limits.now == "latest"
-    return memory.now(wall, View(memory, call, wall).snapshot.latest if relative else None)
+    latest = View(memory, call, wall).snapshot.latest if relative else None
+    return memory.now(wall, latest, call)
 
 
 def _require_recorder(memory: Memory) -> None:

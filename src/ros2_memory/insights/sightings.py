@@ -139,7 +139,7 @@ def find_matches(
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    now = memory.now(wall, view.snapshot.latest)
+    now = memory.now(wall, view.snapshot.latest, call)
     asked = search_window(span, now)
     require_recorded(view, asked)
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)

@@ -58,7 +58,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
     view.bags.track_all_sources()
     snapshot, heartbeat = view.snapshot, memory.heartbeat()
     latest = snapshot.dating.latest
-    now = memory.now(wall, latest)
+    now = memory.now(wall, latest, call)
     live = heartbeat is not None and heartbeat.is_live(wall)
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)

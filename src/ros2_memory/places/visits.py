@@ -94,7 +94,7 @@ def visits(
     asked = frame_id if named_frame is None else named_frame
     own_frame = pose_frame(view, topic)
     placement = map_placement(view, own_frame, topic, asked)
-    now = memory.now(wall, view.snapshot.latest)
+    now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
         placed = places_in(view, memory.limits.places, placement, window)
         elapsed = elapsed_in(view, window)

@@ -289,7 +289,7 @@ class Dispatcher:
                 found = question(self._memory, call)
             except GoneError:  # the store has changed since, and is looked at anew
                 found = question(self._memory, call)
-            return self._replies.answer(found, from_active=call.used_active)
+            return self._replies.answer(found, from_active=call.used_active, now=call.now)
 
         return self._asked(answer, wait)
 

@@ -16,6 +16,7 @@ from ros2_memory.serving.web_app import STREAM_PATH
 
 if TYPE_CHECKING:
     import socket
+    from collections.abc import Callable
 
     from ros2_memory.serving.listen import Address
     from ros2_memory.serving.mcp_server import EpisodicServer
@@ -24,8 +25,13 @@ if TYPE_CHECKING:
 log = get_logger("ros2_memory.server")
 
 
-def serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
-    """Serves over HTTP until a signal comes.
+def serve_http(
+    server: EpisodicServer,
+    app: WebApp,
+    at: Address,
+    when_listening: Callable[[str], None] | None = None,
+) -> None:
+    """Serves over HTTP until a signal comes; `when_listening` is called with the site's address.
 
     Raises:
         CannotListenError: the address cannot be listened on.
@@ -43,14 +49,21 @@ def serve_http(server: EpisodicServer, app: WebApp, at: Address) -> None:
         timeout_graceful_shutdown=1,
     )
     listening = bound(at)
-    anyio.run(_Listener(config, server, app).serve, [listening])
+    anyio.run(_Listener(config, server, app, when_listening).serve, [listening])
 
 
 class _Listener(uvicorn.Server):
     """Runs uvicorn, and ends the event streams and the queries when it stops."""
 
-    def __init__(self, config: uvicorn.Config, server: EpisodicServer, app: WebApp) -> None:
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server: EpisodicServer,
+        app: WebApp,
+        when_listening: Callable[[str], None] | None,
+    ) -> None:
         super().__init__(config)
+        self._when_listening = when_listening
         self._server = server
         self._app = app
 
@@ -69,6 +82,8 @@ class _Listener(uvicorn.Server):
                 host=host,
                 port=port,
             )
+            if self._when_listening is not None:
+                self._when_listening(site)
         notify(READY)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

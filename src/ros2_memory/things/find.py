@@ -71,7 +71,7 @@ def find_things(
     span = TimeRange(start_s, end_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    now = memory.now(wall, view.snapshot.latest)
+    now = memory.now(wall, view.snapshot.latest, call)
     asked_for = search_window(span, now)
     require_recorded(view, asked_for)
     window = clamped(view, asked_for)

@@ -29,7 +29,7 @@ from pydantic import (
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import unix_from_text
+from ros2_memory.core.timebase import rest_of_text_s, unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.places.scope import WhileCondition
 
@@ -87,6 +87,14 @@ def _read_time(value: object) -> object:
     if seconds > LATEST_UNIX_S:
         raise ValueError("is after the year 2262, up to which times are recorded")
     return seconds
+
+
+def _read_until(value: object) -> object:
+    """Returns a time as `_read_time` does; of a text the end of its last decimal."""
+    seconds = _read_time(value)
+    if not isinstance(value, str) or not isinstance(seconds, float):
+        return seconds
+    return seconds + rest_of_text_s(value)
 
 
 def _as_times(value: object) -> object:
@@ -203,7 +211,15 @@ _Time: TypeAlias = Annotated[
     BeforeValidator(_read_time),
     WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
-_Times: TypeAlias = Annotated[tuple[_Time, ...], BeforeValidator(_as_times)]
+# Up to which messages count: a text that a reply printed, pasted back, finds its message.
+_Until: TypeAlias = Annotated[
+    float,
+    Field(strict=True, allow_inf_nan=False),
+    AfterValidator(_check_unix),
+    BeforeValidator(_read_until),
+    WithJsonSchema({"type": [*TIME_KINDS]}),
+]
+_Times: TypeAlias = Annotated[tuple[_Until, ...], BeforeValidator(_as_times)]
 _Tolerance: TypeAlias = _Duration
 _Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
@@ -298,7 +314,7 @@ class At(TimeArgument):
     replaces = "moment"
     text = "at a time"
     either = ("timestamp", "timestamps")
-    at_s: _Time | None = Field(default=None, alias="timestamp", examples=[1784023200.5])
+    at_s: _Until | None = Field(default=None, alias="timestamp", examples=[1784023200.5])
     each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES} times.")] = Field(
         default=(), alias="timestamps"
     )
@@ -319,7 +335,7 @@ class Between(TimeArgument):
     replaces = "span"
     text = "between two times"
     start_s: Annotated[_Time, Field(examples=[1784023200], alias="start")]
-    end_s: Annotated[_Time, Field(examples=[1784023260], alias="end")]
+    end_s: Annotated[_Until, Field(examples=[1784023260], alias="end")]
 
 
 class RecapTime(TimeArgument):
@@ -330,8 +346,8 @@ class RecapTime(TimeArgument):
     either = ("last_s", "start", "around")
     last_s: Annotated[_Positive, Field(examples=[60])] | None = None
     start_s: _Time | None = Field(default=None, alias="start", examples=[1784023200])
-    end_s: _Time | None = Field(default=None, alias="end", examples=[1784023260])
-    around_s: _Time | None = Field(
+    end_s: _Until | None = Field(default=None, alias="end", examples=[1784023260])
+    around_s: _Until | None = Field(
         default=None,
         alias="around",
         description="A moment: what changed shortly before and after it.",
@@ -422,7 +438,7 @@ class LastMatchArguments(ConditionArguments):
     """A condition on a topic; the last match is returned."""
 
     fields: _Fields = ()
-    before_s: _Time | None = Field(default=None, alias="before", description="Up to this time.")
+    before_s: _Until | None = Field(default=None, alias="before", description="Up to this time.")
 
 
 class ValueWhenArguments(Arguments):
@@ -437,7 +453,7 @@ class ValueWhenArguments(Arguments):
     field: _SearchField | None = None
     min_score: _Score | None = None
     fields: _Fields = ()
-    before_s: _Time | None = Field(default=None, alias="before", description="Up to this time.")
+    before_s: _Until | None = Field(default=None, alias="before", description="Up to this time.")
 
 
 class TrajectoryArguments(Arguments):
@@ -493,7 +509,7 @@ class VisitsArguments(Arguments):
     y: _Coordinate | None = None
     where: _Where | None = None
     start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Time | None = Field(default=None, alias="end")
+    end_s: _Until | None = Field(default=None, alias="end")
     frame_id: Annotated[_Name, Field(description="Frame of x and y; default: the map.")] | None = (
         None
     )
@@ -523,7 +539,7 @@ class MatchesArguments(ConditionArguments):
         default=None, alias="seconds"
     )
     start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Time | None = Field(default=None, alias="end")
+    end_s: _Until | None = Field(default=None, alias="end")
     oldest_first: Annotated[
         bool, Field(strict=True, description="Oldest sightings first, with total.")
     ] = False
@@ -540,7 +556,7 @@ class ThingsArguments(Arguments):
     labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
     where: _Where | None = None
     start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Time | None = Field(default=None, alias="end")
+    end_s: _Until | None = Field(default=None, alias="end")
     min_score: _Score | None = None
     limit: _Limit = 12
 
@@ -549,7 +565,7 @@ class CompareArguments(Arguments):
     """Two windows to compare."""
 
     start_s: Annotated[_Time, Field(alias="start", examples=[1784023200])]
-    end_s: Annotated[_Time, Field(alias="end", examples=[1784023260])]
+    end_s: Annotated[_Until, Field(alias="end", examples=[1784023260])]
     with_start_s: Annotated[_Time, Field(alias="with_start", examples=[1783936800])]
-    with_end_s: Annotated[_Time, Field(alias="with_end", examples=[1783936860])]
+    with_end_s: Annotated[_Until, Field(alias="with_end", examples=[1783936860])]
     where: _Where | None = None

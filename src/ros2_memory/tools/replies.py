@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
+    from ros2_memory.core.timebase import Ns
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""
@@ -54,11 +55,14 @@ class Replies:
     bag_dir: Path
     max_chars: int
 
-    def answer(self, answer: results.Answer, *, from_active: bool = False) -> Reply:
+    def answer(
+        self, answer: results.Answer, *, from_active: bool = False, now: Ns | None = None
+    ) -> Reply:
         """Returns an answer in the shape that the tool's description promises.
 
         `from_active`: whether messages of a split that is still being written were read, which a
-        reply that is an object shows.
+        reply that is an object shows. `now`: what its ages count from, where that is not the wall
+        clock (`data.now=latest`).
         """
         name: str | None = None
         notes: tuple[str, ...] = ()
@@ -79,6 +83,8 @@ class Replies:
             value = {**value, "notes": [*(known if isinstance(known, list) else ()), *notes]}
         if from_active:
             value = {**value, "from_active": True}
+        if now is not None:
+            value = {"now": unix_rounded_up(now), **value}
         return Reply(fit_reply(value, self.max_chars))
 
     def _topics(self, rows: tuple[results.TopicRow, ...], name: JsonObject) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -62,6 +63,76 @@ class TestAsk:
         assert "std_msgs/msg/String" in shown
         assert "2023-11-1" in shown
         assert "1700000001" not in shown
+
+    def test_a_time_that_a_command_or_a_reply_prints_finds_its_message_when_pasted_back(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        newest = T0 + 7200 * NS_PER_S + 745_616_123
+        messages = [odom(newest - 600_000, 6.0, 0.0), odom(newest, 7.0, 0.0)]
+        write_mcap(bag_dir / "rec" / "rec_9.mcap", messages)
+
+        def printed(*words: str) -> str:
+            assert cli.main([*words]) == 0
+            return capsys.readouterr().out
+
+        times = [printed("cat", "/odom", "--start", str(newest / NS_PER_S)).split()[0]]
+        asked = json.loads(printed("ask", "data_time_range", "--json"))
+        times.append(asked["latest_local"])
+        shown = printed("ask", "get_position_seconds_ago", "seconds_ago=0")
+        times += re.findall(r"20\d\d-\S+", shown)
+        times.append(times[0][: -len("616")])
+        assert len(times) >= 4
+        for each in times:
+            reply = printed("ask", "get_position_at", f"timestamp={each}", "--json")
+            assert json.loads(reply)["x"] == 7.0, each
+            assert "7" in printed("cat", "/odom", "--end", each).splitlines()[-1]
+        before = f"timestamp={newest / NS_PER_S - 0.0003:.6f}"
+        assert json.loads(printed("ask", "get_position_at", before, "--json"))["x"] == 6.0
+
+    def test_a_window_up_to_the_newest_time_has_no_note_on_the_end(
+        self, bag_dir: Path, capsys: Capture
+    ) -> None:
+        newest = T0 + 7200 * NS_PER_S + 745_616_123
+        write_mcap(bag_dir / "rec" / "rec_9.mcap", [odom(newest, 7.0, 0.0)])
+
+        def asked(*words: str) -> dict[str, JsonValue]:
+            cli.main(["ask", *words, "--json"])
+            reply = json.loads(capsys.readouterr().out)
+            assert isinstance(reply, dict)
+            return reply
+
+        latest = asked("data_time_range")["latest"]
+        assert isinstance(latest, float)
+        window = ("get_topic_in_range", "topic=/odom", f"start={latest - 1}")
+        assert "the memory ends" not in str(asked(*window, f"end={latest}"))
+        assert "the memory ends at" in str(asked(*window, f"end={latest + 2e-6:.6f}")["notes"])
+
+    @pytest.mark.parametrize("now", ["latest", "wall"])
+    def test_a_reply_with_an_age_says_what_it_counts_from_unless_that_is_the_clock(
+        self, capsys: Capture, now: str
+    ) -> None:
+        aged = 0
+        for tool, *words in (
+            ("get_position_seconds_ago", "seconds_ago=0"),
+            ("get_topic_seconds_ago", "topic=/odom", "seconds_ago=0"),
+            ("get_topic_in_last", "topic=/odom", "seconds=5"),
+            ("find_last_match", "topic=/chatter", "condition_type=contains", "value=sciss"),
+            ("find_matches", "topic=/chatter", "condition_type=contains", "value=sciss"),
+            ("visits", "x=1", "y=2", "radius_m=3"),
+            ("recap",),
+            ("recap", "last_s=9000"),
+            ("memory_status",),
+        ):
+            cli.main(["ask", tool, *words, "--json", f"data.now={now}"])
+            reply = capsys.readouterr().out
+            if re.search(r'"(\w+_)?(ago|age)_s"', reply):
+                aged += 1
+                stated = json.loads(reply).get("now")
+                if now == "latest":
+                    assert stated == T0 / NS_PER_S + 3609.9, tool
+                elif tool != "memory_status":
+                    assert stated is None, tool
+        assert aged > 2
 
     def test_what_was_recorded_cannot_command_the_terminal(self, capsys: Capture) -> None:
         assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import duckdb
 import pytest
 from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import cli
@@ -53,6 +54,7 @@ if TYPE_CHECKING:
 T0 = 1_700_000_000 * NS_PER_S
 NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()
 Capture = pytest.CaptureFixture[str]
+EMPTY = "std_msgs/msg/Empty"
 Row = tuple[str, int, bytes]
 
 
@@ -312,6 +314,34 @@ class TestMcap:
         words = ["export", "--mcap", str(out), "--bag-dir", str(tmp_path / "bags")]
         assert cli.main([*words, "deployment=replay"]) == 0
         assert len(read(out)) == 110
+
+    @pytest.mark.parametrize("kind", ["db3", "mcap"])
+    def test_definitions_that_the_bag_lacks_are_written(self, tmp_path: Path, kind: str) -> None:
+        messages = [odom(T0, 1.5, 0.0), text(T0, "x"), Msg("/bell", EMPTY, T0, b"\0\1\0\0\0")]
+        file = tmp_path / "bags" / "rec" / f"rec_0.{kind}"
+        if kind == "db3":
+            write_db3(file, messages, definitions=False)
+        else:
+            write_mcap(file, messages, McapLayout(definitions=False))
+        out = exported(tmp_path / "bags", tmp_path / "out.mcap")
+        with AnyReader([out]) as reader:
+            values = {
+                connection.topic: reader.deserialize(raw, connection.msgtype)
+                for connection, _, raw in reader.messages()
+            }
+        assert values.keys() == {"/odom", "/chatter", "/bell"}
+        assert "x=1.5," in repr(values["/odom"])
+
+    def test_types_without_any_definition_are_named_and_the_exit_code_is_1(
+        self, tmp_path: Path, capsys: Capture
+    ) -> None:
+        odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\0\1\0\0\0")
+        write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [odd, odd], definitions=False)
+        words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--bag-dir"]
+        assert cli.main([*words, str(tmp_path / "bags"), "deployment=replay"]) == 1
+        err = capsys.readouterr().err
+        assert err.count("nobody_msgs/msg/Knows has no definition") == 1
+        assert "reader.custom_msg_paths" in err
 
     def test_a_file_is_never_overwritten(
         self, bag_dir: Path, tmp_path: Path, capsys: Capture

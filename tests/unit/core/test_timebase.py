@@ -21,6 +21,7 @@ from ros2_memory.core.timebase import (
     local_text,
     ms_from_ns,
     ns_from_unix,
+    rest_of_text_s,
     unix_from_ns,
     unix_from_text,
     unix_rounded_up,
@@ -106,12 +107,12 @@ def test_milliseconds_are_for_log_events() -> None:
 
 
 @given(moments)
-def test_a_local_time_names_the_same_second_with_its_offset(moment: int) -> None:
+def test_a_local_time_names_the_same_microsecond_with_its_offset(moment: int) -> None:
     text = iso_local(moment)
     assert text is not None
     local = datetime.fromisoformat(text)
     assert local.tzinfo is not None
-    assert local.timestamp() == moment // NS_PER_S
+    assert local.timestamp() == pytest.approx(unix_rounded_up(moment), abs=1e-6)
 
 
 @pytest.mark.parametrize("seconds", [10**15, -(10**15)])
@@ -154,11 +155,31 @@ def test_a_time_with_an_offset_is_read_as_it_was_written(moment: int, zone: time
 @given(moments)
 def test_local_times_of_replies_are_read_as_they_were_written(moment: int) -> None:
     whole = moment // NS_PER_S
-    assert unix_from_text(iso_local(moment) or "") == whole
+    microsecond = unix_from_text(iso_local(moment) or "")
+    assert microsecond == pytest.approx(unix_rounded_up(moment), abs=1e-6)
     # Without an offset an hour that occurs twice is the first of the two.
     again = unix_from_text(local_text(moment) or "")
     assert whole - again in {0, 3600}
     assert local_text(ns_from_unix(again)) == local_text(moment)
+
+
+@pytest.mark.parametrize(
+    ("text", "rest_s"),
+    [
+        ("2026-11-20T14:05:03.745", 0.000_999),
+        ("2026-11-20 14:05:03,7+01:00", 0.099_999),
+        ("14:05:03.745616", 0.0),
+        ("2026-11-20T14:05:03.745616001", 0.0),
+        ("2026-11-20T14:05:03", 0.0),
+        ("Tue 2026-11-17 14:05:03", 0.999_999),
+        ("Tue 2026-11-17 14:05", 0.0),
+        ("2026-11-20", 0.0),
+        ("1784023200.745", 0.0),
+        ("now", 0.0),
+    ],
+)
+def test_the_last_decimal_of_a_text_is_all_part_of_it(text: str, rest_s: float) -> None:
+    assert rest_of_text_s(text) == pytest.approx(rest_s, abs=1e-9)
 
 
 def test_a_local_time_has_its_weekday(berlin: str) -> None:

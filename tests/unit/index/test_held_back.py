@@ -16,6 +16,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.things.find import find_things
 from ros2_memory.tools.instructions import instructions
@@ -140,7 +141,7 @@ def test_a_search_for_things_names_what_is_held_back(tmp_path: Path) -> None:
 def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
     bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
-    limits = QuerySettings(screened=True, include_active=True)
+    limits = QuerySettings(screened=True, include_active=True, kept=RetentionLimits(10**9, 0))
     memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 12 * S), limits=limits)
     with pytest.raises(NoDataError, match="in 25 s or less"):
         queries.topic_value(memory, Call(), "/chatter", AtTime(T0 // S + 5))

@@ -23,7 +23,7 @@ from ros2_memory.cli.options import (
     load_to_look,
     open_memory,
     parse_window,
-    require_topic,
+    topic_and_words,
 )
 from ros2_memory.cli.output import format_time, format_value, with_local_times
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -89,7 +89,7 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
-    require_topic(topic, words, "cat")
+    topic, words = topic_and_words(topic, words, "cat")
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
     view = View(memory, Call())
     name = _one_topic(view, topic)

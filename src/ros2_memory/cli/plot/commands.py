@@ -24,8 +24,8 @@ from ros2_memory.cli.options import (
     parse_window,
     print_line,
     reported_errors,
-    require_topic,
     spinner,
+    topic_and_words,
 )
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
@@ -135,7 +135,7 @@ def plot_signal(
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     _check(out)
-    require_topic(topic, words, "plot signal")
+    topic, words = topic_and_words(topic, words, "plot signal")
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
     memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
