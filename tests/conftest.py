@@ -47,6 +47,9 @@ if os.environ.pop("PYTHONDONTWRITEBYTECODE", None):
     sys.dont_write_bytecode = False
 
 
+NEEDS_SHARED = "needs_shared_bags"
+"""A property of reports, which reach the summary from every worker."""
+
 # A shell starts what runs in its background with these ignored, and children inherit that.
 for _number, _handler in (
     (signal.SIGINT, signal.default_int_handler),
@@ -83,8 +86,34 @@ def pytest_unconfigure() -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The longest first, so that the others are done meanwhile."""
+    """The longest first, so that the others are done meanwhile.
+
+    Tests that are marked `shared(PATH)` are skipped where that is not beside this checkout.
+    """
     items.sort(key=lambda item: place(item.nodeid))
+    for item in items:
+        needed: list[Path] = [mark.args[0] for mark in item.iter_markers("shared")]
+        absent = [path for path in needed if not path.exists()]
+        if needed:
+            item.user_properties.append((NEEDS_SHARED, True))
+        if absent:
+            reason = f"{absent[0].name} of the shared bags is not beside this checkout"
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Counts the tests that need the shared bags, so that nobody takes skipped ones for passed."""
+    reports = [
+        report
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if isinstance(report, pytest.TestReport) and (NEEDS_SHARED, True) in report.user_properties
+    ]
+    if needing := {report.nodeid for report in reports}:
+        skipped = {report.nodeid for report in reports if report.skipped}
+        terminalreporter.write_line(
+            f"{len(needing)} tests need the shared bags: {len(skipped)} skipped"
+        )
 
 
 @pytest.hookimpl(wrapper=True)

@@ -506,6 +506,25 @@ def test_recorder_none_says_so_and_touches_nothing(site: Site) -> None:
     }
 
 
+def test_recorder_none_names_what_set_it_and_is_no_failure_to_the_service_manager(
+    site: Site,
+) -> None:
+    address = site.folder / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(PATIENCE_S)
+        site.env |= {
+            "NOTIFY_SOCKET": str(address),
+            "MEMORY_DEPLOYMENT": "robot",
+            "MEMORY_CONFIG_OVERRIDES": "recorder=none",
+        }
+        code, message = site.refusal()
+        # An exit with 0 before it is ready would be a failure that is tried again for ever.
+        assert (code, manager.recv(100)) == (0, b"READY=1")
+    assert "set by MEMORY_CONFIG_OVERRIDES" in message
+    assert "such as robot" not in message
+
+
 def test_a_handover_names_both_recordings(site: Site) -> None:
     daemon = site.run("recording.session_duration_s=1")
     daemon.wait_for("rotated")

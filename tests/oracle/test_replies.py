@@ -24,7 +24,11 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.xdist_group("heavy")
 
-ASKED: Final = [name for name, world in WORLDS.items() if LONG or not world.long]
+ASKED: Final = [
+    pytest.param(name, marks=[pytest.mark.shared(world.needs)] if world.needs else [])
+    for name, world in WORLDS.items()
+    if LONG or not world.long
+]
 FOR_EACH_WORLD: Final = 2
 """Calls of each world that a short run asks at least."""
 
@@ -43,8 +47,6 @@ def short_sample() -> Mapping[str, set[int]]:
 
 def held(name: str, *, stored: bool) -> None:
     world, comparison = WORLDS[name], Comparison()
-    if world.absent is not None:
-        pytest.skip(world.absent)
     if name not in records():
         pytest.skip(
             f"not recorded yet: python -m tests.oracle.replies record --world {name} --long"

@@ -13,7 +13,7 @@ import yaml
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bootstrap import build_memory
-from ros2_memory.config import Ros2BagNode, load_settings
+from ros2_memory.config import NullRecorderNode, Ros2BagNode, load_settings
 from ros2_memory.serving.auth import CREDENTIAL
 from tests.support.bags import odom, write_db3
 
@@ -21,7 +21,8 @@ DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
 RECORDER = DEPLOY / "ros2-memory-recorder.service"
 SERVER = DEPLOY / "ros2-memory-server.service"
 SHIP = DEPLOY / "ros2-memory-ship.service"
-BOTH = pytest.mark.parametrize("unit", [RECORDER, SERVER, SHIP], ids=lambda unit: unit.stem)
+QUERY = DEPLOY / "ros2-memory-query.service"
+EACH = pytest.mark.parametrize("unit", [RECORDER, SERVER, QUERY, SHIP], ids=lambda unit: unit.stem)
 
 
 def settings_of(unit: Path) -> dict[str, list[str]]:
@@ -54,12 +55,14 @@ needs_sysusers = pytest.mark.skipif(
 
 
 @needs_analyze
-@pytest.mark.parametrize(("unit", "limit"), [(RECORDER, 3.0), (SERVER, 2.0), (SHIP, 2.0)])
+@pytest.mark.parametrize(
+    ("unit", "limit"), [(RECORDER, 3.0), (SERVER, 2.0), (QUERY, 2.0), (SHIP, 2.0)]
+)
 def test_a_unit_is_exposed_by_less_than_its_limit(unit: Path, limit: float) -> None:
     assert exposure(unit) < limit
 
 
-@BOTH
+@EACH
 def test_a_unit_is_ready_when_it_says_so_and_is_started_again_when_it_fails(unit: Path) -> None:
     settings = settings_of(unit)
     assert (settings["Type"], settings["NotifyAccess"]) == (["notify"], ["main"])
@@ -68,11 +71,12 @@ def test_a_unit_is_ready_when_it_says_so_and_is_started_again_when_it_fails(unit
     assert settings["TasksMax"]
 
 
-@BOTH
+@EACH
 def test_a_unit_takes_the_settings_of_the_machine_over_its_own(unit: Path) -> None:
     lines = unit.read_text().splitlines()
     own = max(n for n, line in enumerate(lines) if line.startswith("Environment="))
-    assert lines.index("EnvironmentFile=-/etc/ros2-memory/environment") > own
+    name = "query-environment" if unit == QUERY else "environment"
+    assert lines.index(f"EnvironmentFile=-/etc/ros2-memory/{name}") > own
 
 
 def test_the_recorder_is_watched_and_tried_for_ever() -> None:
@@ -101,14 +105,19 @@ def test_the_recorder_hears_publishers_of_another_user() -> None:
     assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in settings_of(RECORDER)["Environment"]
 
 
-def test_the_environment_file_is_understood_by_the_program() -> None:
+def environment_of(file: Path) -> dict[str, str]:
     env: dict[str, str] = {}
-    for line in (DEPLOY / "environment").read_text().splitlines():
+    for line in file.read_text().splitlines():
         # The lines that are commented out are to be right when they are not.
         text = re.sub(r"^#(?=[A-Z_]+=)", "", line)
         if text and not text.startswith("#"):
             name, _, value = text.partition("=")
             env[name] = "".join(shlex.split(value))
+    return env
+
+
+def test_the_environment_file_is_understood_by_the_program() -> None:
+    env = environment_of(DEPLOY / "environment")
     assert {"ROS_DOMAIN_ID", "RMW_IMPLEMENTATION", "FASTDDS_BUILTIN_TRANSPORTS"} <= set(env)
     env.pop("ROS_VISION_INTERFACES_PATH")
     recorder = load_settings((), env).recorder
@@ -130,7 +139,24 @@ def test_the_server_writes_where_it_asks_the_recorder_and_nowhere_else_in_the_ba
     asks = f"/var/lib/ros2-memory/bags/{REQUESTS_FOLDER}"
     assert settings["ReadWritePaths"] == [f"-{asks}"]
     assert settings["ReadOnlyPaths"] == ["-/var/lib/ros2-memory"]
-    assert f"d {asks} " in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text()
+
+
+def test_the_query_server_alone_listens_whatever_its_settings_say() -> None:
+    settings = settings_of(QUERY)
+    program, *given = settings["ExecStart"][0].split()
+    assert program.endswith("/ros2-memory-server")
+    env = {"MEMORY_DEPLOYMENT": "query_only", "MCP_TRANSPORT": "stdio"}
+    loaded = load_settings(given, env)
+    assert loaded.server.transport == "sse"
+    assert isinstance(loaded.recorder, NullRecorderNode)
+    assert "ReadWritePaths" not in settings
+    assert settings["Conflicts"] == [SERVER.name]
+
+
+def test_the_settings_of_the_query_server_alone_are_understood() -> None:
+    env = {"MEMORY_DEPLOYMENT": "query_only"} | environment_of(DEPLOY / "query-environment")
+    env.pop("ROS_VISION_INTERFACES_PATH")
+    assert load_settings((), env).data.now == "latest"
 
 
 def test_the_container_is_published_on_the_loopback_address_and_needs_a_token() -> None:
@@ -164,15 +190,3 @@ def test_the_user_of_the_units_is_made() -> None:
     )
     assert ran.returncode == 0, ran.stderr
     assert "ros2-memory" in (DEPLOY / "ros2-memory.sysusers.conf").read_text().split()
-
-
-def test_every_directory_of_the_units_is_made_and_no_bag_is_ever_deleted() -> None:
-    lines = [
-        line.split()
-        for line in (DEPLOY / "ros2-memory.tmpfiles.conf").read_text().splitlines()
-        if not line.startswith("#")
-    ]
-    made = {line[1]: line for line in lines}
-    assert made["/var/lib/ros2-memory/bags"][3:5] == ["ros2-memory", "ros2-memory"]
-    assert {line[0] for line in lines} == {"d"}
-    assert {line[5] for line in lines} == {"-"}  # no age

@@ -140,14 +140,46 @@ class TestGates:
         steps = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["steps"]
         assert [step["run"] for step in steps if "pytest" in step.get("run", "")] == [command]
 
-    def test_the_workflow_runs_each_on_both_pythons_for_every_change(self) -> None:
+    def test_the_workflow_runs_each_on_every_python_for_every_change(self) -> None:
         workflow = read_yaml(".github/workflows/ci.yml")
         job = workflow["jobs"]["gates"]
         steps = [*job["steps"], *workflow["jobs"]["bare"]["steps"]]
         commands = "\n".join(step.get("run", "") for step in steps)
         assert [gate for gate in GATES if gate not in commands] == []
-        assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12"]
+        assert job["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13", "3.14"]
         assert set(workflow[True]) == {"pull_request", "push"}  # YAML 1.1 reads the key "on" so
+
+    def test_the_workflow_tries_every_python_that_the_package_claims(self) -> None:
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+        claimed = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
+        tried = read_yaml(".github/workflows/ci.yml")["jobs"]["gates"]["strategy"]["matrix"]
+        assert project["requires-python"] == f">={claimed[0]}"
+        assert set(claimed) <= set(tried["python"])
+
+    @pytest.mark.parametrize("gates", [".ci/run", ".github/workflows/ci.yml"])
+    def test_what_every_extra_installs_is_audited(self, gates: str) -> None:
+        assert "--all-extras" in (ROOT / gates).read_text()
+        assert "pip-audit --strict" in (ROOT / gates).read_text()
+
+    def test_no_text_file_of_ours_ends_without_a_newline(self) -> None:
+        (hook,) = [
+            hook
+            for repo in read_yaml(".pre-commit-config.yaml")["repos"]
+            for hook in repo["hooks"]
+            if hook["id"] == "end-of-file-fixer"
+        ]
+        tracked = subprocess.run(
+            ["git", "ls-files"], cwd=ROOT, check=True, capture_output=True, text=True
+        )
+        wrong = []
+        for name in tracked.stdout.split():
+            path = ROOT / name
+            if re.search(hook["exclude"], name) or path.is_symlink() or not path.is_file():
+                continue
+            content = path.read_bytes()
+            if b"\0" not in content and content and not re.search(rb"[^\n]\n\Z", content):
+                wrong.append(name)
+        assert wrong == []
 
     def test_every_room_stands_in_the_import_contracts(self) -> None:
         contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]

@@ -21,6 +21,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import (
     driven_path,
@@ -30,7 +31,6 @@ from ros2_memory.history.driven_path import (
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
-from ros2_memory.insights.clock_steps import elapsed_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import (
     WHEREABOUTS,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import ctypes
-import os
 import signal
 import sys
 import time
@@ -27,7 +26,7 @@ from ros2_memory.bootstrap import (
     claim,
     exclusions_of,
 )
-from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_settings
+from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_explained
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.sd_notify import (
@@ -44,7 +43,7 @@ from ros2_memory.retention.clear import clear_bags, refuse_homes
 from ros2_memory.retention.policy import SMALL_BUDGET_GB, small_budget
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.config import Settings
@@ -73,10 +72,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     overrides: list[str] = _parser().parse_args(argv).overrides
     with exit_on_config_error(PROGRAM):
-        settings = load_settings(overrides)
+        settings, sources = load_explained(overrides)
         configure_logging(settings.logging.level, settings.logging.format)
         if isinstance(settings.recorder, NullRecorderNode):
-            _log.info("nothing_to_record", reason=_nothing_to_record(os.environ))
+            _, chosen_by = sources.choice("recorder")
+            _log.info(
+                "nothing_to_record",
+                reason=f"recorder=none: bags come from elsewhere (set {chosen_by})",
+            )
+            # To a service manager an end before this is a failure, to be tried again for ever.
+            notify(READY)
             return 0
         try:
             _return_freed_memory()
@@ -91,16 +96,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             # It came while the bag directory was put in order, which can be interrupted.
             return INTERRUPTED
     return 0
-
-
-def _nothing_to_record(env: Mapping[str, str]) -> str:
-    preset = env.get("MEMORY_DEPLOYMENT")
-    if not preset:
-        return "recorder=none: bags come from elsewhere"
-    return (
-        f"MEMORY_DEPLOYMENT={preset} records nothing (recorder=none): unset it, or set another, "
-        "such as robot"
-    )
 
 
 def _return_freed_memory() -> None:
