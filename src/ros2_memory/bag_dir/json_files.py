@@ -1,8 +1,9 @@
 """JSON files that the two programs share, and that another version, or a person, may have written.
 
 A log is one object a line. Rows are appended and flushed, all of them or none, so a power cut
-leaves at most a part of the last line, which the next append ends. A line that is damaged, or of
-another version, spoils no other. A document is one object, which is replaced by rename.
+leaves at most a part of the last line, which the next append ends. A line ends with a check, so that a
+flipped bit makes no other number; older versions wrote none. A line that is damaged, or of another
+version, spoils no other. A document is one object, which is replaced by rename.
 
 They stay files, not a database: a person reads them, and so does a server that may not write here,
 while the recorder is killed; SQLite needs to write before it can read what a kill left.
@@ -23,6 +24,7 @@ from typing import (
     TypeGuard,
     TypeVar,
 )
+from zlib import crc32
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -50,6 +52,7 @@ READABLE: Final = 0o644
 
 _MOST_BYTES: Final = 64 << 20
 _FORMAT: Final = 1  # of each document
+_CHECK: Final = b', "crc32": "'
 
 
 class Line(NamedTuple, Generic[_T]):
@@ -100,7 +103,9 @@ class JsonLog(Generic[_T]):
                 text = line.strip()
                 if text:
                     try:
-                        yield Line(number, text, parsed(self._adapter, text), None)
+                        row = parsed(self._adapter, text)
+                        _require_check(text)
+                        yield Line(number, text, row, None)
                     except ValueError as error:
                         yield Line(number, text, None, error)
 
@@ -119,7 +124,8 @@ class JsonLog(Generic[_T]):
     def text(self, rows: Iterable[_T]) -> str:
         """Returns rows as lines."""
         dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)
-        return "".join(f"{json.dumps(fields)}\n" for fields in dumped)
+        begun = (json.dumps(fields).removesuffix("}").encode() for fields in dumped)
+        return "".join(f"{_with_check(each).decode()}\n" for each in begun)
 
     def append(self, bag_dir: Path, rows: Iterable[_T]) -> int:
         """Appends rows durably; returns how many bytes the file has then.
@@ -240,6 +246,18 @@ def parsed(adapter: TypeAdapter[_T], text: str | bytes, version: int | None = No
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         raise ValueError(f"{key}: {first['msg']}") from error
+
+
+def _with_check(begun: bytes) -> bytes:
+    """Returns the line that begins so, closed by the CRC-32 of that."""
+    return b'%b%b%08x"}' % (begun, _CHECK, crc32(begun))
+
+
+def _require_check(line: bytes) -> None:
+    """Raises ValueError where a line has a check, and that fails."""
+    begun, has_check, _ = line.rpartition(_CHECK)
+    if has_check and line != _with_check(begun):
+        raise ValueError("its check (crc32) fails: the line is damaged, or was edited")
 
 
 def is_integer(value: object) -> TypeGuard[int]:

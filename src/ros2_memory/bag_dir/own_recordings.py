@@ -142,6 +142,16 @@ class OwnRecordings:
             self._read()
             return self._list.entries.keys()
 
+    def in_order(self) -> Sequence[str]:
+        """Returns the listed recordings in the order in which they began; no adopted ones.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        with self._lock:
+            self._read()
+            return [name for name, entry in self._list.entries.items() if not entry.adopted]
+
     def owns(self, directory: Path) -> bool:
         """Returns whether a directory is a recording of this bag directory's recorder.
 
