@@ -40,7 +40,7 @@ from ros2_memory.bag_dir.durable_write import (
 )
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Int64, JsonLog
+from ros2_memory.bag_dir.json_files import Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import LIST_FILE, bag_kind, has_own_name
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
@@ -316,15 +316,13 @@ class OwnRecordings:
 
     def _read(self) -> bool:
         """Reads the file if it has changed; returns whether there is one."""
-        if self._path.parent.is_symlink():
-            raise OSError(f"{self._path.parent} is a symbolic link, which is not followed")
         try:
-            status = os.lstat(self._path)
+            status = os.lstat(state_path(self._bag_dir, LIST_FILE))
             stamp = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
             if stamp == self._stamp:
                 return True
             lines = [*LIST.lines(self._bag_dir)]
-        except (FileNotFoundError, NotADirectoryError):
+        except FileNotFoundError:
             self._stamp = None
             return False
         except ValueError as error:

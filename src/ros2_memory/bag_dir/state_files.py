@@ -334,7 +334,7 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
     found: dict[Forgetting, None] = {}
     try:
         lines = [*FORGOTTEN.lines(bag_dir)]
-    except (FileNotFoundError, NotADirectoryError):
+    except FileNotFoundError:
         return []
     for line in lines:
         if isinstance(line.error, json.JSONDecodeError):

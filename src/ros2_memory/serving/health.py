@@ -16,6 +16,7 @@ import anyio.to_thread
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.reply import moment, seconds
+from ros2_memory.core.text import encodable
 from ros2_memory.history.context import short_name
 from ros2_memory.insights.status import clock_faults, left_open, problems_of
 from ros2_memory.serving.fair_queue import FairQueue
@@ -252,4 +253,5 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
 
 
 def _short(text: str) -> str:
+    text = encodable(text)
     return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 3]}..."

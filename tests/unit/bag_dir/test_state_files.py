@@ -202,7 +202,7 @@ class TestLogs:
         for bit in range(8 * len(row)):
             flipped = bytearray(row)
             flipped[bit // 8] ^= 1 << bit % 8
-            laid(tmp_path, log, b"%b\n%b\n" % (flipped, row))
+            laid(tmp_path, log, bytes(flipped) + b"\n" + row)
             assert {*map(str, log.rows(tmp_path))} == {str(right)}
 
     @pytest.mark.parametrize("is_checked", [False, True])

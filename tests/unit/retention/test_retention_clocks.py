@@ -128,7 +128,7 @@ def test_a_clock_that_was_behind_ages_nothing_young(
     drawn: list[tuple[int, bool, int, bool]], limit_days: int
 ) -> None:
     limits, now = RetentionLimits(PLENTY, limit_days * DAY), T0
-    bags, true_ends = [], dict[str, int]()
+    bags, true_ends = list[StoredBag](), dict[str, int]()
     for nth, (off_days, is_behind, by_days, is_empty) in enumerate(drawn):
         now += off_days * DAY
         newest = max((each.end for each in bags if each.has_dates), default=now)
