@@ -17,11 +17,12 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
-from pydantic import Field, TypeAdapter
+from pydantic import AfterValidator, Field, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import Count, Int64, parsed
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
 HEARTBEAT_FILE: Final = "recorder.json"
@@ -35,6 +36,7 @@ _ENDED: Final = frozenset("ZX")
 """States of processes that have ended and were not waited for yet."""
 _MIN_LIVE_NS: Final[Ns] = 15 * NS_PER_S
 
+_Text: TypeAlias = Annotated[str, AfterValidator(encodable)]
 _Pid: TypeAlias = Annotated[int, Field(strict=True, ge=1, le=MAX_NS)]
 _Interval: TypeAlias = Annotated[float, Field(strict=True, gt=0, le=MAX_INTERVAL_S)]
 
@@ -94,25 +96,25 @@ class Heartbeat:
     pid: _Pid
     updated: Int64
     state: RecorderState
-    recordings: tuple[str, ...]
+    recordings: tuple[_Text, ...]
     since: Int64
     bytes_written: Count
-    subscribed: tuple[str, ...]
-    silent: tuple[str, ...]
-    last_error: str | None
+    subscribed: tuple[_Text, ...]
+    silent: tuple[_Text, ...]
+    last_error: _Text | None
     interval_s: _Interval
     # Older recorders did not write these.
     restarts: Count = 0
-    missing: tuple[str, ...] = ()
-    age_held: str | None = None
-    lost: dict[str, Count] = field(default_factory=dict)
-    cut_short: tuple[str, ...] = ()
-    waiting_for: str | None = None
-    held_back: str | None = None
-    failing_rules: tuple[str, ...] = ()
-    unshipped: str | None = None
-    listed: tuple[str, ...] = ()
-    process: str | None = None
+    missing: tuple[_Text, ...] = ()
+    age_held: _Text | None = None
+    lost: dict[_Text, Count] = field(default_factory=dict)
+    cut_short: tuple[_Text, ...] = ()
+    waiting_for: _Text | None = None
+    held_back: _Text | None = None
+    failing_rules: tuple[_Text, ...] = ()
+    unshipped: _Text | None = None
+    listed: tuple[_Text, ...] = ()
+    process: _Text | None = None
     counted_bytes: Count | None = None
     state_bytes: Count = 0
     last_error_at: Int64 | None = None
@@ -249,4 +251,4 @@ _HEARTBEAT: Final = TypeAdapter(Heartbeat)
 # Read for every question about the present, and written every few seconds.
 @lru_cache(4)
 def _parse(text: str) -> Heartbeat:
-    return parsed(_HEARTBEAT, text)
+    return parsed(_HEARTBEAT, text, has_paths=False)

@@ -1,7 +1,8 @@
 """JSON files that the two programs share, and that another version, or a person, may have written.
 
 A log is one object a line. Rows are appended and flushed, all of them or none, so a power cut
-leaves at most a part of the last line, which the next append ends. A line that is damaged, or of
+leaves at most a part of the last line, which the next append ends. A line ends with a check, so
+that a flipped bit makes no other number; older versions wrote none. A line that is damaged, or of
 another version, spoils no other. A document is one object, which is replaced by rename.
 
 They stay files, not a database: a person reads them, and so does a server that may not write here,
@@ -10,8 +11,10 @@ while the recorder is killed; SQLite needs to write before it can read what a ki
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import re
 from functools import lru_cache, wraps
 from typing import (
     TYPE_CHECKING,
@@ -23,6 +26,7 @@ from typing import (
     TypeGuard,
     TypeVar,
 )
+from zlib import crc32
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -50,6 +54,8 @@ READABLE: Final = 0o644
 
 _MOST_BYTES: Final = 64 << 20
 _FORMAT: Final = 1  # of each document
+_SURROGATE: Final = re.compile(r"\\ud[89a-f]", re.IGNORECASE)
+_CHECK: Final = b', "crc32": "'
 
 
 class Line(NamedTuple, Generic[_T]):
@@ -89,7 +95,7 @@ class JsonLog(Generic[_T]):
             OSError: the file cannot be read, or there is none.
             ValueError: it is not a regular file.
         """
-        with open_plain(bag_dir / self.name) as stream:
+        with open_plain(state_path(bag_dir, self.name)) as stream:
             if stream.seek(0, os.SEEK_END) > self._most_bytes:
                 yield Line(0, b"", None, ValueError(f"it is larger than {self._most_bytes} bytes"))
                 stream.seek(-self._most_bytes, os.SEEK_END)
@@ -100,7 +106,9 @@ class JsonLog(Generic[_T]):
                 text = line.strip()
                 if text:
                     try:
-                        yield Line(number, text, parsed(self._adapter, text), None)
+                        row = parsed(self._adapter, text)
+                        _require_check(text)
+                        yield Line(number, text, row, None)
                     except ValueError as error:
                         yield Line(number, text, None, error)
 
@@ -113,13 +121,14 @@ class JsonLog(Generic[_T]):
         """
         try:
             return [line.row for line in self.lines(bag_dir) if line.row is not None]
-        except (FileNotFoundError, NotADirectoryError):
+        except FileNotFoundError:
             return []
 
     def text(self, rows: Iterable[_T]) -> str:
         """Returns rows as lines."""
         dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)
-        return "".join(f"{json.dumps(fields)}\n" for fields in dumped)
+        begun = (json.dumps(fields).removesuffix("}").encode() for fields in dumped)
+        return "".join(f"{_with_check(each).decode()}\n" for each in begun)
 
     def append(self, bag_dir: Path, rows: Iterable[_T]) -> int:
         """Appends rows durably; returns how many bytes the file has then.
@@ -165,8 +174,8 @@ class JsonDocument(Generic[_T]):
             ValueError: it is damaged, or of another format.
         """
         try:
-            text = read_small_file(bag_dir / self.name)
-        except (FileNotFoundError, NotADirectoryError):
+            text = read_small_file(state_path(bag_dir, self.name))
+        except FileNotFoundError:
             return None
         return parsed(self._adapter, text, _FORMAT)
 
@@ -217,17 +226,27 @@ def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path]
     return decorate
 
 
-def parsed(adapter: TypeAdapter[_T], text: str | bytes, version: int | None = None) -> _T:
+def parsed(
+    adapter: TypeAdapter[_T],
+    text: str | bytes,
+    version: int | None = None,
+    *,
+    has_paths: bool = True,
+) -> _T:
     """Returns the value that a JSON object describes; keys of other versions are ignored.
 
     Its `format` must be the version, where one is given.
 
     Raises:
         ValueError: it is none, or of another format, or a key is missing or wrong; the sentence
-            names the first one.
+            names the first one. Or it has a lone surrogate that is no byte of a path.
     """
     try:
+        # Of bytes json.loads accepts what is no UTF-8.
+        text = text if isinstance(text, str) else text.decode()
         value: object = json.loads(text)
+        if has_paths and _SURROGATE.search(text):
+            os.fsencode(json.dumps(value, ensure_ascii=False))
     except RecursionError as error:
         raise ValueError("it is nothing but brackets") from error
     if not isinstance(value, dict):
@@ -240,6 +259,30 @@ def parsed(adapter: TypeAdapter[_T], text: str | bytes, version: int | None = No
         first = error.errors(include_url=False)[0]
         key = ".".join(map(str, first["loc"]))
         raise ValueError(f"{key}: {first['msg']}") from error
+
+
+def state_path(bag_dir: Path, name: str) -> Path:
+    """Returns the path of a file in the bag directory.
+
+    Raises:
+        OSError: its folder is a symbolic link, so that nothing shows whether there is a file.
+    """
+    path = bag_dir / name
+    if path.parent != bag_dir and path.parent.is_symlink():
+        raise OSError(errno.ELOOP, "it is a symbolic link, which is not followed", str(path.parent))
+    return path
+
+
+def _with_check(begun: bytes) -> bytes:
+    """Returns the line that begins so, closed by the CRC-32 of that."""
+    return b'%b%b%08x"}' % (begun, _CHECK, crc32(begun))
+
+
+def _require_check(line: bytes) -> None:
+    """Raises ValueError where a line has a check, and that fails."""
+    begun, has_check, _ = line.rpartition(_CHECK)
+    if has_check and line != _with_check(begun):
+        raise ValueError("its check (crc32) fails: the line is damaged, or was edited")
 
 
 def is_integer(value: object) -> TypeGuard[int]:

@@ -41,7 +41,7 @@ from ros2_memory.bag_dir.durable_write import (
     write_durably,
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog
+from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
     CARRY_FILE,
     CARRY_FOLDER,
@@ -189,6 +189,16 @@ class OwnRecordings:
         with self._lock:
             self._read()
             return self._list.entries.keys()
+
+    def in_order(self) -> Sequence[str]:
+        """Returns the listed recordings in the order in which they began; no adopted ones.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        with self._lock:
+            self._read()
+            return [name for name, entry in self._list.entries.items() if not entry.adopted]
 
     def owns_bag(self, path: Path) -> bool:
         """Returns whether a bag file is the recorder's: see `judge`.
@@ -432,15 +442,13 @@ class OwnRecordings:
 
     def _read(self) -> bool:
         """Reads the file if it has changed; returns whether there is one."""
-        if self._path.parent.is_symlink():
-            raise OSError(f"{self._path.parent} is a symbolic link, which is not followed")
         try:
-            status = os.lstat(self._path)
+            status = os.lstat(state_path(self._bag_dir, LIST_FILE))
             stamp = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
             if stamp == self._stamp:
                 return True
             lines = [*LIST.lines(self._bag_dir)]
-        except (FileNotFoundError, NotADirectoryError):
+        except FileNotFoundError:
             self._stamp = None
             return False
         except ValueError as error:

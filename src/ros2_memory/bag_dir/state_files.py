@@ -334,12 +334,13 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
     found: dict[Forgetting, None] = {}
     try:
         lines = [*FORGOTTEN.lines(bag_dir)]
-    except (FileNotFoundError, NotADirectoryError):
+    except FileNotFoundError:
         return []
     for line in lines:
         if isinstance(line.error, json.JSONDecodeError):
-            # A whole line ends with the list of bags; of one that was cut, nothing was deleted.
-            if line.text.startswith(b"{") and not line.text.endswith(b"]}"):
+            # A whole line ends with its check, or before there was one with the list of bags; of
+            # one that was cut, nothing was deleted.
+            if line.text.startswith(b"{") and not line.text.endswith((b"]}", b'"}')):
                 continue
             raise ValueError(f"line {line.number}: it is damaged: {line.error}")
         if line.row is None:

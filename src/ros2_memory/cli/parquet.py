@@ -22,6 +22,7 @@ import pyarrow.parquet as pq
 
 from ros2_memory.analysis.bulk_decode import JsonRows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
@@ -187,13 +188,8 @@ def _row(record: Record, found: JsonRow | UndecodableError) -> Row:
     row = (channel.topic, channel.type, record.log_time, record.publish_time)
     if isinstance(found, UndecodableError):
         return (*row, None, found.reason, None, *_NO_POSE)
-    pose, text = found.pose, _without_surrogates(found.text)
+    pose, text = found.pose, encodable(found.text)
     if pose is None:
         return (*row, text, None, None, *_NO_POSE)
-    frame = _without_surrogates(pose.frame_id) or None
+    frame = encodable(pose.frame_id) or None
     return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
-
-
-def _without_surrogates(text: str) -> str:
-    """Returns the text with lone surrogates, which UTF-8 cannot hold, escaped as in JSON."""
-    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()

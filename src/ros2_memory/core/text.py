@@ -39,6 +39,11 @@ def shortened(text: str, max_chars: int = _MAX_NAME_CHARS) -> str:
     return text if len(text) <= max_chars else text[: max_chars - 1] + _ELLIPSIS
 
 
+def encodable(text: str) -> str:
+    """Returns the text with lone surrogates, which UTF-8 cannot hold, escaped as in JSON."""
+    return text if text.isascii() else text.encode("utf-8", "backslashreplace").decode()
+
+
 @dataclass(frozen=True, slots=True)
 class Reason:
     """A fault that several things can share, reported in one sentence.

@@ -140,7 +140,8 @@ class IndexManager:
             return Collected()
         with self._lock:
             snapshot = self._scan()
-            named = read_heartbeat(self.bag_dir).recordings
+            heartbeat = read_heartbeat(self.bag_dir).heartbeat
+            named = self._collector.begun_last if heartbeat is None else heartbeat.recordings
             collected = self._collector.apply(
                 self._table.known(named, snapshot.scanned_at), snapshot, free_bytes_wanted
             )

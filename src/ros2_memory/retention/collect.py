@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
+_WRITTEN_AT_ONCE: Final = 2
+"""Recordings, during a rotation."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -141,6 +143,7 @@ class GarbageCollector:
         self._bag_dir = bag_dir
         self._limits = limits
         self._carrier = carrier
+        self._own = own
         self._recorded = recorded
         self._is_synchronised = is_synchronised
         self._inventory = Inventory(bag_dir, static_topics, own if limits.keeps_foreign else None)
@@ -152,6 +155,15 @@ class GarbageCollector:
         self._reported: set[str] = set()
         self._emptied: set[Path] = set()
         self._unwritten: list[Deleted] = []
+
+    @property
+    def begun_last(self) -> Sequence[str]:
+        """The recordings that are being written, or were last, by the list of all.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        return self._own.in_order()[-_WRITTEN_AT_ONCE:]
 
     def apply(
         self, known: KnownBags, snapshot: Snapshot, free_bytes_wanted: int | None = None
@@ -214,12 +226,17 @@ class GarbageCollector:
     def _with_clocks(
         self, stock: RetentionStock, limits: RetentionLimits, run: _Pass
     ) -> RetentionStock:
-        """Adds how long was recorded after each bag, and whether the clock is synchronised."""
+        """Adds how long was recorded after each, their order, and whether the clock is right."""
         names = {
             bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
         }
         since = self._recorded.since(names.values())
-        stock = replace(stock, recorded_since={path: since[name] for path, name in names.items()})
+        order = {name: place for place, name in enumerate(self._own.in_order())}
+        stock = replace(
+            stock,
+            recorded_since={path: since[name] for path, name in names.items()},
+            places={path: order[name] for path, name in names.items() if name in order},
+        )
         old = ages(stock, limits)
         # Asking starts a program, so only where it matters.
         if old.by_dates != old.by_recording and run.synchronised is None:

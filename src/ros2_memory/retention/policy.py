@@ -14,6 +14,9 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
   undated: it makes no other bag old, and is itself as old as its file.
 - A pause longer than both `max_age_ns` and a day is a robot that was off or a clock that was set,
   and nothing distinguishes the two. It separates two eras; a bag ages only against its own era.
+- Nothing is older than what was recorded before it: a bag that is dated before the newest of an
+  earlier recording has a wrong date, and counts as recorded with the next that has a right one.
+  Likewise no more was recorded after a recording than after any that was listed before it.
 
 The budget deletes the oldest first: a dated bag of the present era by its newest message, any other
 by the time of its file. A file dated further ahead of now than history is kept goes first, since
@@ -25,7 +28,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import accumulate, islice
 from operator import attrgetter, eq
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -134,6 +137,8 @@ class RetentionStock:
         synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
         state_bytes: how much of `other_bytes` is no recording: `.episodic` and logs.
+        places: the place of each recording in the list of those that the recorder made; one that
+            is missing was adopted, and its order is unknown.
         needed: bags that rules may still need; no age deletes them.
         unshipped: bags that must be shipped, and are in no lake; no age deletes them.
     """
@@ -148,6 +153,7 @@ class RetentionStock:
     synchronised: bool = False
     foreign_bytes: int = 0
     state_bytes: int = 0
+    places: Mapping[str, int] = field(default_factory=dict)
     needed: frozenset[str] = frozenset()
     unshipped: frozenset[str] = frozenset()
 
@@ -180,6 +186,7 @@ class DeletionPlan(NamedTuple):
 
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
     """Returns the bags that are too old by either clock."""
+    stock = _in_order(stock, limits)
     return _ages(stock, _eras(stock, limits), limits.max_age_ns)
 
 
@@ -189,11 +196,15 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
     that: it would cost all history, and recording would still have to pause.
     """
-    found, free = _planned(stock, limits)
-    if found.fits or free is None or free >= limits.min_free_bytes:
+    ordered = _in_order(stock, limits)
+    found, free = _planned(ordered, limits)
+    if not (found.fits or free is None or free >= limits.min_free_bytes):
+        found, _ = _planned(replace(ordered, free_bytes=None), limits)
+        found = found._replace(fits=False, most_free=free)
+    if not found.to_delete or ordered is stock:
         return found
-    within, _ = _planned(replace(stock, free_bytes=None), limits)
-    return within._replace(fits=False, most_free=free)
+    given = {bag.path: bag for bag in stock.bags}
+    return found._replace(to_delete=tuple(given[bag.path] for bag in found.to_delete))
 
 
 def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPlan, int | None]:
@@ -282,18 +293,57 @@ def _may_share(stock: RetentionStock) -> bool:
     return several or any(map(eq, inodes, islice(inodes, 1, None)))
 
 
+def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
+    """Returns the stock without ages that contradict the order of the recordings.
+
+    A bag whose date does, by its messages or else by its file, gets the newest date of the next
+    recording that has a right one; of the newest of all, if there is none.
+    """
+    if not stock.places:
+        return stock
+    newest: dict[str, Ns] = {}
+    for bag in _dated(stock, limits):
+        if bag.end > newest.get(bag.recording, MIN_NS):
+            newest[bag.recording] = bag.end
+    names = sorted(stock.places, key=stock.places.__getitem__)
+    latest = [newest.get(name, MIN_NS) for name in names]
+    reached = dict(zip(names, accumulate(latest, max, initial=MIN_NS), strict=False))
+    instead: dict[str, Ns] = {}
+    following = max(latest)
+    for name in reversed(names):
+        if reached[name] <= newest.get(name, MIN_NS):
+            following = newest.get(name, following)
+        instead[name] = following
+    bags = [
+        _dated_anew(bag, instead[bag.recording])
+        if _date_of(bag) < reached.get(bag.recording, MIN_NS)
+        else bag
+        for bag in stock.bags
+    ]
+    since = stock.recorded_since
+    counted = [name for name in names if name in since]
+    least = accumulate((since[name] for name in counted), min)
+    return replace(
+        stock, bags=bags, recorded_since={**since, **dict(zip(counted, least, strict=True))}
+    )
+
+
+def _date_of(bag: StoredBag) -> Ns:
+    """Returns the log time of the last message that dates a bag, else when its file was written."""
+    return bag.end if bag.has_dates else bag.written
+
+
+def _dated_anew(bag: StoredBag, at: Ns) -> StoredBag:
+    return bag._replace(start=at, end=at) if bag.has_dates else bag._replace(written=at)
+
+
 _Era: TypeAlias = "list[StoredBag]"
 
 
 def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
     """Splits the dated bags where a pause is too long; the last era is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    latest = stock.now + FUTURE_NS
-    dated = [
-        bag
-        for bag in stock.bags
-        if FIRST_BAGS_NS <= bag.start <= bag.end <= latest and bag.end - bag.start <= longest
-    ]
+    dated = _dated(stock, limits)
     if not dated:
         return []
     reach, end = min(bag.start for bag in dated), max(bag.end for bag in dated)
@@ -307,6 +357,17 @@ def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
         eras[-1].append(bag)
         reach = max(reach, bag.end)
     return eras
+
+
+def _dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
+    """Returns the bags whose dates are believed."""
+    longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
+    latest = stock.now + FUTURE_NS
+    return [
+        bag
+        for bag in stock.bags
+        if FIRST_BAGS_NS <= bag.start <= bag.end <= latest and bag.end - bag.start <= longest
+    ]
 
 
 def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:

@@ -3,7 +3,8 @@
 The monotonic clock starts again at every boot, so recorded time is added up and stored in
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
 with the total recorded time when it last grew. The last line of a recording counts. A recording
-without a line counts as recorded when it is first asked about: nothing shows that it is older.
+without a line counts as recorded when it is first asked about: nothing shows that it is older. A
+damaged line is ignored, and named in the log.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ SAVE_S: Final = 60.0
 LONGEST_SILENCE_S: Final = 60.0
 """A pause in which nothing reached the disk counts as recorded for at most so long."""
 _MOST_LINES: Final = 20_000
+_MAX_NAMED: Final = 5
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -98,13 +100,8 @@ class RecordedTime:
         if self._loaded:
             return
         self._loaded = True
-        try:
-            rows = RECORDED.rows(self._bag_dir)
-        except (OSError, ValueError) as error:
-            _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
-            rows = []
-        self._last_grew_s = {row.recording: row.recorded_s for row in rows}
-        if not rows:
+        self._last_grew_s = {row.recording: row.recorded_s for row in self._read()}
+        if not self._last_grew_s:
             return
         self._total_s = max(self._last_grew_s.values())
         # The greatest is the total: it stays even if its recording is gone.
@@ -115,6 +112,24 @@ class RecordedTime:
             if name == newest or (self._bag_dir / name).is_dir()
         }
         self._lines = _MOST_LINES  # so that the next save leaves out what is gone
+
+    def _read(self) -> list[Recorded]:
+        try:
+            lines = [*RECORDED.lines(self._bag_dir)]
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
+            return []
+        if damaged := [line for line in lines if line.row is None]:
+            _log.warning(
+                "recorded_time_damaged",
+                path=str(self._path),
+                lines=[line.number for line in damaged[:_MAX_NAMED]],
+                damaged=len(damaged),
+                reason=str(damaged[0].error),
+            )
+        return [line.row for line in lines if line.row is not None]
 
     def _save(self) -> None:
         names = sorted(self._unsaved)

@@ -23,7 +23,6 @@ import stat
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-from urllib.parse import urlsplit
 
 from pydantic import SecretStr
 from starlette.datastructures import Headers
@@ -74,6 +73,8 @@ _WRONG: Final = "The token is not the one of this server.\n"
 _HOW: Final = "make one with `openssl rand -hex 32`"
 # The characters of a bearer token: RFC 6750, section 2.1 (b64token).
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~+/-]+=*")
+# A name or an IPv4 address, or an IPv6 address in brackets; then perhaps a port (RFC 9110, 7.2).
+_HOST: Final = re.compile(r"(?:([A-Za-z0-9._-]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]*)?")
 
 log = get_logger(__name__)
 
@@ -226,7 +227,7 @@ class ForgeryGuard:
     def _refusal(self, scope: Scope) -> PlainTextResponse | None:
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        name = _host_name(f"//{host}")
+        name = _host_name(host)
         if name not in self._names and not (self._is_reachable and _is_address(name)):
             self._log_refused("the host name of another site")
             return PlainTextResponse(
@@ -257,11 +258,13 @@ def _is_visit(scope: Scope, headers: Headers) -> bool:
     )
 
 
-def _host_name(url: str) -> str:
-    try:
-        return (urlsplit(url).hostname or "").lower()
-    except ValueError:
+def _host_name(host: str) -> str:
+    """Returns the name or address in a Host header, in lower case; empty if that is malformed."""
+    found = _HOST.fullmatch(host)
+    if found is None:
         return ""
+    name, address = found[1], found[2]
+    return name.lower() if name else address.lower() if _is_address(address) else ""
 
 
 def _is_address(name: str) -> bool:

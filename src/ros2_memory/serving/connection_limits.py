@@ -5,15 +5,18 @@ hundred clients that do neither would use up all file descriptors.
 
 A connection is unknown until a request on it is admitted: it showed the token, or passed the
 `ForgeryGuard` where there is no token. Unknown connections have a small pool of their own, in which
-a new one replaces the oldest. However many there are, a client that shows the token is served.
+a new one replaces the oldest of the address that has most: a flood from one machine replaces its
+own. However many there are, a client that shows the token is served.
 """
 
 from __future__ import annotations
 
 import socket
+from collections import Counter
 from contextlib import suppress
 from typing import TYPE_CHECKING, ClassVar, Final, Literal
 
+import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ros2_memory.core.logging_setup import LogThrottle, get_logger
@@ -21,6 +24,9 @@ from ros2_memory.serving.auth import is_admitted
 
 if TYPE_CHECKING:
     import asyncio
+
+    import uvicorn
+    from uvicorn.server import ServerState
 
 HEAD_S: Final = 10.0
 """From the connection, or the previous reply, to the last byte of a request's headers."""
@@ -33,6 +39,9 @@ SEND_BUFFER_BYTES: Final = 128 << 10
 LINGER_S: Final = 1.0
 MAX_CONNECTIONS: Final = 256
 MAX_UNKNOWN: Final = 128
+MIN_CHUNKS: Final = 256
+CHUNK_BYTES: Final = 64
+"""Beyond so many chunks the body must have so many bytes for each."""
 ACCEPTED_AT_ONCE: Final = 16
 """In one turn of the event loop. A new connection is first read three turns later, so fewer are
 accepted by then than there is room for, and none is replaced before its first bytes were read."""
@@ -42,12 +51,38 @@ log = get_logger(__name__)
 _Phase = Literal["head", "body", "reply"]
 
 
+class _Connection(h11.Connection):
+    """HTTP/1.1 of a client, where a body in too many chunks for its size is an error.
+
+    A chunk takes as long to parse as a hundred bytes, however small it is.
+    """
+
+    _chunks = 0
+    _chunk_bytes = 0
+
+    def next_event(self) -> type[h11.NEED_DATA | h11.PAUSED] | h11.Event:
+        """Returns the next event of a request.
+
+        Raises:
+            h11.RemoteProtocolError: it is no HTTP, or has too many chunks.
+        """
+        event = super().next_event()
+        if isinstance(event, h11.Request):
+            self._chunks = self._chunk_bytes = 0
+        elif isinstance(event, h11.Data):
+            self._chunks += event.chunk_start
+            self._chunk_bytes += len(event.data)
+            if self._chunks > MIN_CHUNKS + self._chunk_bytes // CHUNK_BYTES:
+                raise h11.RemoteProtocolError("too many chunks")
+        return event
+
+
 class BoundedConnection(H11Protocol):
     """Uvicorn's HTTP/1.1 over one connection, which is closed when the client takes too long.
 
     A request that is not completed is answered with 408, a connection too many with 503. A reply
-    that is not read aborts the connection, and with it the call or the event stream. The oldest
-    unknown connection too many is aborted without a reply.
+    that is not read aborts the connection, and with it the call or the event stream. Of unknown
+    connections too many, the oldest of the address that has most is aborted without a reply.
     """
 
     _refusals: ClassVar[LogThrottle] = LogThrottle()
@@ -66,6 +101,16 @@ class BoundedConnection(H11Protocol):
             self._is_admitted = is_admitted(self.scope)
         return not self._is_admitted
 
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server_state: ServerState,
+        app_state: dict[str, object],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, app_state, _loop)
+        self.conn = _Connection(h11.SERVER)
+
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]  # as uvicorn
         """Handles a new connection."""
         super().connection_made(transport)
@@ -79,8 +124,13 @@ class BoundedConnection(H11Protocol):
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
         if len(unknown) > MAX_UNKNOWN:
-            min(unknown, key=lambda each: each._made_s)._abort()
+            held = Counter(each._address for each in unknown)
+            min(unknown, key=lambda each: (-held[each._address], each._made_s))._abort()
         self._watch()
+
+    @property
+    def _address(self) -> str:
+        return self.client[0] if self.client else ""
 
     def _unknown(self) -> list[BoundedConnection]:
         return [

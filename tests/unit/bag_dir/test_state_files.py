@@ -10,6 +10,7 @@ import os
 import stat
 from pathlib import Path
 from typing import Any, TypeAlias
+from zlib import crc32
 
 import pytest
 from hypothesis import given, settings
@@ -90,6 +91,12 @@ DOCUMENTS: list[tuple[Document, str]] = [
 ]
 
 
+def checked(text: str) -> str:
+    """The lines of a log with their checks."""
+    begun = [line.removesuffix("}") for line in text.splitlines()]
+    return "".join(f'{each}, "crc32": "{crc32(each.encode()):08x}"}}\n' for each in begun)
+
+
 def name_of(value: object) -> str:
     return Path(value.name).name if isinstance(value, JsonLog | JsonDocument) else ""
 
@@ -120,7 +127,7 @@ class TestEveryFile:
         value = read(file, tmp_path)
         path.unlink()
         replace(file, tmp_path, value)
-        assert path.read_text() == text
+        assert path.read_text() == (checked(text) if isinstance(file, JsonLog) else text)
 
     def test_it_is_on_the_disk_before_it_gets_its_name_and_stands_where_the_disk_is_full(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, file: Log | Document, text: str
@@ -135,13 +142,14 @@ class TestEveryFile:
 
         monkeypatch.setattr(os, "fsync", fsync)
         replace(file, tmp_path, value)
+        written = path.read_text()
         assert flushed == [f".{path.name}.tmp", ".episodic"]
         with pytest.raises(OSError, match="No space left"):
             replace(file, tmp_path, value)
         if isinstance(file, JsonLog):
             with pytest.raises(OSError, match="No space left"):
                 file.append(tmp_path, value * 9)
-        assert path.read_text() == text
+        assert path.read_text() == written
         assert [*path.parent.iterdir()] == [path]
 
     def test_nothing_is_read_or_written_behind_a_link(
@@ -182,12 +190,26 @@ class TestLogs:
         rows = log.rows(tmp_path)
         path.unlink()
         sizes = [log.append(tmp_path, [row]) for row in rows]
-        assert path.read_text() == text
+        assert path.read_text() == checked(text)
         assert sizes[-1] == path.stat().st_size
 
-    def test_a_line_that_a_crash_cut_anywhere_costs_itself_alone(
+    def test_a_flipped_bit_in_a_line_costs_itself_alone(
         self, tmp_path: Path, log: Log, text: str
     ) -> None:
+        row = checked(text).splitlines()[-1].encode()
+        laid(tmp_path, log, row)
+        [right] = log.rows(tmp_path)
+        for bit in range(8 * len(row)):
+            flipped = bytearray(row)
+            flipped[bit // 8] ^= 1 << bit % 8
+            laid(tmp_path, log, bytes(flipped) + b"\n" + row)
+            assert {*map(str, log.rows(tmp_path))} == {str(right)}
+
+    @pytest.mark.parametrize("is_checked", [False, True])
+    def test_a_line_that_a_crash_cut_anywhere_costs_itself_alone(
+        self, tmp_path: Path, log: Log, text: str, is_checked: bool
+    ) -> None:
+        text = checked(text) if is_checked else text
         first, last = text.splitlines()[0], text.splitlines()[-1]
         for length in range(1, len(last), 5):
             laid(tmp_path, log, f"{first}\n{last[:length]}")
@@ -328,13 +350,17 @@ def test_where_a_file_cannot_be_read_nothing_is_lost_or_shipped_and_all_is_held_
 class TestForgotten:
     """The lake deletes by this file: no line of it may be passed over in silence."""
 
-    def test_a_line_is_cut_or_an_error(self, tmp_path: Path) -> None:
-        whole, last = (f"{line}\n" for line in FORGOTTEN_ROWS)
+    @pytest.mark.parametrize("is_checked", [False, True])
+    def test_a_line_is_cut_or_an_error(self, tmp_path: Path, is_checked: bool) -> None:
+        rows = "".join(f"{line}\n" for line in FORGOTTEN_ROWS)
+        whole, last = (checked(rows) if is_checked else rows).splitlines(keepends=True)
         laid(tmp_path, FORGOTTEN, whole + last + last)
         topics, _ = read_forgettings(tmp_path)
         for length in range(len(last) - 1):
             laid(tmp_path, FORGOTTEN, whole + last[:length])
-            if last[:length].endswith("]}"):  # within a name that looks like the end of a line
+            if last[:length].endswith(
+                ("]}", '"}')
+            ):  # within a name that looks like the end of a line
                 with pytest.raises(ValueError, match="line 2: it is damaged"):
                     read_forgettings(tmp_path)
                 continue
@@ -347,6 +373,7 @@ class TestForgotten:
             ('{"start" 1, "stop": 2, "topics": [], "bags": []}', "it is damaged: "),
             ("[]", "it is not a JSON object"),
             ('{"start": "1", "stop": 2}', "start: "),
+            ('{"start": 1, "stop": 2, "topics": ["/a"], "crc32": "00000000"}', "its check"),
             ('{"start": 1, "stop": 2}', "it names no topics and no bags"),
         ],
     )

@@ -42,9 +42,10 @@ def at_rates(
     ]
     for hz, off in ((50, fast), (10, stalls)):
         times = [n / hz + 0.001 for n in range(int(hz * length))]
-        make = boolean if hz == 50 else text
         messages += [
-            make(at(t), True) if hz == 50 else text(at(t), "here") for t in times if is_on(t, off)
+            boolean(at(t), True) if hz == 50 else text(at(t), "here")
+            for t in times
+            if is_on(t, off)
         ]
     return sorted(messages, key=lambda message: message.log_time)
 
@@ -73,7 +74,8 @@ def stalled(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
 
 
 def ask(memory: Memory, tool: str, **arguments: Any) -> dict[str, Any]:
-    return asked(memory, memory.index.bag_dir, tool, **arguments)
+    reply: dict[str, Any] = asked(memory, memory.index.bag_dir, tool, **arguments)
+    return reply
 
 
 def gaps(memory: Memory) -> list[tuple[float, float]]:

@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory import queries
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import odom, tf, transform, write_mcap
@@ -59,6 +60,23 @@ class TestRetention:
         assert not (tmp_path / A).exists()
         assert [ask() for ask in questions] == before
         assert all(path.exists() for path in young)
+
+    @pytest.mark.parametrize("behind_h", [169, 300])
+    def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
+        own = OwnRecordings(tmp_path)
+        own.claim(lambda _: {})
+        made = []
+        for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
+            own.begin(name)
+            odometry = [odom(T0 + hours * 3600 * S + n * S, n, 0) for n in range(9)]
+            made.append(write_mcap(tmp_path / name / f"{name}_0.mcap", odometry))
+            own.complete(name)
+        clock = SettableClock(T0 + 2 * 3600 * S)
+        house_of(tmp_path, max_age_h=168, clock=clock, keeps_foreign=True).apply()
+        assert all(path.exists() for path in made)
+        small = size_of(tmp_path) * 6 // 10
+        house_of(tmp_path, max_bytes=small, clock=clock, keeps_foreign=True).apply()
+        assert [path.exists() for path in made] == [False, False, True, True]
 
     def test_a_kept_bag_is_one_bag_wherever_it_is_counted(self, tmp_path: Path) -> None:
         made = recording(tmp_path, A, 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import structlog
 
-from ros2_memory.retention.recorded_time import RecordedTime
+from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 
 S = 10**9
@@ -93,6 +93,29 @@ def test_lines_that_mean_nothing_are_passed_by(tmp_path: Path) -> None:
     assert time.since(["a", "b", "c"]) == {"a": 50 * S, "b": 0, "c": 0}
 
 
+def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b", "c")
+    time = RecordedTime(tmp_path)
+    end = recorded(time, "a", 90)
+    end = recorded(time, "b", 90, since_s=end)
+    recorded(time, "c", 120, since_s=end)
+    path = tmp_path / FILE
+    right, whole = RecordedTime(tmp_path).since("abc"), path.read_bytes()
+    assert right["a"] > right["b"] > right["c"] == 0
+    for bit in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        with structlog.testing.capture_logs() as captured:
+            found = RecordedTime(tmp_path).since("abc")
+        # A flipped line end spoils two lines, and the one before these is two minutes older.
+        assert all(found[name] <= right[name] + 2 * SAVE_S * S for name in "abc")
+        if found != right:
+            [told] = captured
+            assert told["event"] == "recorded_time_damaged"
+            assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
+
+
 def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:
     folders(tmp_path, "b", "c")
     (tmp_path / ".episodic").mkdir()
@@ -113,7 +136,8 @@ def test_a_link_in_place_of_its_folder_or_file_is_not_followed(tmp_path: Path) -
     (bag_dir / ".episodic").symlink_to(elsewhere)
     with structlog.testing.capture_logs() as captured:
         recorded(RecordedTime(bag_dir), "a", 200)
-    assert [each["event"] for each in captured] == ["recorded_time_not_kept"]
+    told = [each["event"] for each in captured]
+    assert told == ["recorded_time_not_read", "recorded_time_not_kept"]
     (bag_dir / ".episodic").unlink()
     (bag_dir / ".episodic").mkdir()
     (bag_dir / FILE).symlink_to(elsewhere / "recorded.jsonl")

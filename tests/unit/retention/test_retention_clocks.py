@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
@@ -76,6 +78,70 @@ class TestAForwardStep:
         held = self.stock(synchronised=False)
         found = plan_deletions(held, RetentionLimits(500, 168 * HOUR))
         assert (len(found.to_delete), found.fits) == (31, True)
+
+
+class TestAClockThatWasBehind:
+    """160 h of bags, 3 h of a clock that is behind, and the clock is right again."""
+
+    WEEK = RetentionLimits(PLENTY, 168 * HOUR)
+
+    def stock(self, behind_h: int, *, synchronised: bool = True) -> RetentionStock:
+        begun = T0 - behind_h * HOUR
+        wrong = [bag(f"wrong{n}", 500 + n, begun + n * S, begun + (n + 1) * S) for n in range(18)]
+        after = bag("new", 999, T0 + 3 * HOUR, T0 + 3 * HOUR + S)
+        bags = (*hourly(160, until=T0), *wrong, after)
+        names = [each.recording for each in bags]
+        since = {name: (len(names) - n) * HOUR for n, name in enumerate(names)}
+        return RetentionStock(
+            bags,
+            T0 + 4 * HOUR,
+            recorded_since=since,
+            synchronised=synchronised,
+            places={name: place for place, name in enumerate(names)},
+        )
+
+    @pytest.mark.parametrize("behind_h", [1, 150, 169, 200, 300, 400, 10_000, T0 // HOUR])
+    def test_nothing_young_goes_by_age_or_first_by_the_budget(self, behind_h: int) -> None:
+        held = self.stock(behind_h)
+        assert expired(held, self.WEEK) == ()
+        found = expired(held, RetentionLimits(1000, 168 * HOUR))
+        assert found == held.bags[: len(found)]
+        assert len(found) == 79
+
+    def test_a_recording_whose_count_is_wrong_is_no_older_than_those_before_it(self) -> None:
+        held = self.stock(0, synchronised=False)
+        held = replace(held, recorded_since={**held.recorded_since, "wrong3": 10**6 * HOUR})
+        assert {each.recording for each in expired(held, self.WEEK)} == {
+            f"rec_{n}" for n in range(11)
+        }
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(1, 9), st.booleans(), st.integers(0, 60), st.booleans()),
+        min_size=1,
+        max_size=40,
+    ),
+    st.integers(1, 40),
+)
+def test_a_clock_that_was_behind_ages_nothing_young(
+    drawn: list[tuple[int, bool, int, bool]], limit_days: int
+) -> None:
+    limits, now = RetentionLimits(PLENTY, limit_days * DAY), T0
+    bags, true_ends = list[StoredBag](), dict[str, int]()
+    for nth, (off_days, is_behind, by_days, is_empty) in enumerate(drawn):
+        now += off_days * DAY
+        newest = max((each.end for each in bags if each.has_dates), default=now)
+        # A clock that shows a time after the newest before it cannot be told from a right one.
+        end = newest - S - by_days * DAY if is_behind and bags else now
+        span = (MAX_NS, MIN_NS) if is_empty and bags else (end - S, end)
+        bags.append(bag(f"rec_{nth}", nth, *span)._replace(written=end))
+        true_ends[bags[-1].path] = now
+    places = {each.recording: place for place, each in enumerate(bags)}
+    stock = RetentionStock(bags, now, places=places, synchronised=True)
+    aged = expired(stock, limits)
+    assert all(now - true_ends[each.path] > limits.max_age_ns for each in aged)
+    assert set(aged) <= set(bags)
 
 
 def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:

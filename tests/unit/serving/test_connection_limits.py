@@ -282,6 +282,49 @@ async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
         to_known.close()
 
 
+async def test_a_flood_of_one_address_does_not_drop_who_speaks_late_from_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(connection_limits, "MAX_UNKNOWN", 8)
+    async with serving() as served:
+        reader, writer = await served.connect()
+        with ExitStack() as stack:
+            for _ in range(40):
+                each = stack.enter_context(socket.socket())
+                each.bind(("127.0.0.2", 0))
+                each.connect(("127.0.0.1", served.port))
+                await asyncio.sleep(0.01)  # it is accepted meanwhile
+            writer.write(GET)
+            async with asyncio.timeout(BOUND_S):
+                assert b" 200 " in await reader.readuntil(b"ok")
+        writer.close()
+
+
+CHUNKED = b"POST %b HTTP/1.1\r\nhost: a\r\ntransfer-encoding: chunked\r\n\r\n"
+
+
+@pytest.mark.parametrize("path", [b"/", b"/early"])
+async def test_a_body_in_tiny_chunks_ends_the_connection_soon(path: bytes) -> None:
+    async with serving() as served:
+        with suppress(ConnectionError):  # an early answer is not followed by another
+            shown = await served.reply(CHUNKED % path, b"1\r\nx\r\n" * 5000)
+            assert path == b"/early" or b" 400 " in shown
+        await served.gone()
+
+
+@pytest.mark.parametrize("size", [1, 64, 4096])
+async def test_a_body_in_chunks_that_are_few_or_large_enough_is_taken(size: int) -> None:
+    chunks = 250 if size == 1 else 4000
+    async with serving() as served:
+        body = (b"%x\r\n" % size + b"x" * size + b"\r\n") * chunks + b"0\r\n\r\n"
+        reader, writer = await served.connect()
+        for _ in range(2):
+            writer.write(CHUNKED % b"/" + body)
+            async with asyncio.timeout(BOUND_S):
+                assert b" 200 " in await reader.readuntil(b"ok")
+        writer.close()
+
+
 async def test_a_request_that_was_not_admitted_leaves_a_stranger() -> None:
     async with serving() as served:
         reader, writer = await served.connect()

@@ -202,11 +202,19 @@ async def test_the_background_runs_from_start_to_end() -> None:
     assert events == ["begun", "ended"]
 
 
+FOREIGN = [
+    *("evil.example", "localhost.evil.example:9203", "127.0.0.1.nip.io", "localhost:80.evil.com"),
+    *("[::1].evil.com", "[::1].evil.com:9203", "[::1]evil.com", "[::1]:80.evil.com", "[localhost]"),
+    *("evil@localhost", "localhost/evil.com", "localhost?", "localhost#", "evil.com\\@localhost"),
+    *("localhost\n", " localhost", "::1", "[::1", "[", "", ":9203", "localhost:80:80"),
+]
+
+
 @pytest.mark.parametrize("path", ["/health", "/sse", "/mcp", "/messages/"])
 @pytest.mark.parametrize("host", ["127.0.0.1", EVERYWHERE, "192.168.7.20", "robot.lan"])
 async def test_every_path_refuses_the_host_names_of_other_sites(path: str, host: str) -> None:
     async with client(app(host)) as http:
-        for name in ("evil.example", "localhost.evil.example:9203", "", "[", "127.0.0.1.nip.io"):
+        for name in FOREIGN:
             response = await http.get(path, headers={"host": name})
             assert response.status_code == 421, name
 
