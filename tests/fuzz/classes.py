@@ -57,7 +57,9 @@ CLASSES: Final[dict[str, MutationClass]] = {
     "message_indexes": MutationClass(
         (indexes.flip_message_index, indexes.wrong_message_index), mcaps
     ),
-    "chunk_indexes": MutationClass((indexes.wrong_chunk_index, indexes.wrong_chunk_head), mcaps),
+    "chunk_indexes": MutationClass(
+        (indexes.wrong_chunk_index, indexes.wrong_chunk_head, indexes.one_lie), mcaps
+    ),
     "statistics": MutationClass((indexes.wrong_statistics,), mcaps),
     "sqlite_indexes": MutationClass((indexes.wrong_order, indexes.flip_index_page), sqlites),
     "foreign_metadata": MutationClass((around.foreign_metadata,)),

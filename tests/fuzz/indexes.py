@@ -16,6 +16,7 @@ from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import as_it_was, pieces, with_summary_sealed
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from random import Random
 
     from tests.fuzz.good import Good
@@ -135,6 +136,43 @@ def wrong_chunk_head(rng: Random, good: Good) -> Mutant:
     body[rng.randrange(16)] ^= 1 << rng.randrange(8)
     records[number] = replace(records[number], body=bytes(body))
     return mutant_of(good, as_it_was(good.plain, records))
+
+
+def one_lie(rng: Random, good: Good) -> Mutant:
+    """All that points to one chunk agrees on other times than its messages have."""
+    chunks = sum(each.opcode == Opcode.CHUNK for each in pieces(good.plain))
+    if not chunks:
+        return mutant_of(good, good.plain)
+    moved = rng.choice((-1, 1)) * rng.choice((1, 1_000_000, 50_000_000, 600_000_000))
+    return mutant_of(good, agreed(good.plain, rng.randrange(chunks), lambda time: time + moved))
+
+
+def agreed(plain: bytes, nth: int, told: Callable[[int], int]) -> bytes:
+    """Returns the bag with one chunk whose message indexes, head and chunk index tell times anew.
+
+    Every checksum is right, and every message as it was.
+    """
+    records = pieces(plain)
+    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK][nth]
+    whole = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK_INDEX][nth]
+    after = at + 1
+    while records[after].opcode == Opcode.MESSAGE_INDEX:
+        body = bytearray(records[after].body)
+        for pair in range(6, len(body), _PAIR):
+            _retell(body, pair, told)
+        records[after] = replace(records[after], body=bytes(body))
+        after += 1
+    for number in (at, whole):
+        body = bytearray(records[number].body)
+        _retell(body, 0, told)
+        _retell(body, 8, told)
+        records[number] = replace(records[number], body=bytes(body))
+    return with_summary_sealed(as_it_was(plain, records))
+
+
+def _retell(body: bytearray, at: int, told: Callable[[int], int]) -> None:
+    (time,) = struct.unpack_from("<Q", body, at)
+    struct.pack_into("<Q", body, at, max(told(time), 0) % (1 << 64))
 
 
 def wrong_order(_rng: Random, good: Good) -> Mutant:

@@ -166,6 +166,8 @@ MAX_CHANNELS: Final = 5_000
 """The largest robots have some hundred topics; every list and search goes through all of them."""
 MAX_NAMES_CHARS: Final = 1 << 20
 """Names of all topics and types of one file, which stay in memory as long as the bag exists."""
+MAX_TEXTS_BYTES: Final = 32 << 20
+"""All texts of one table of a `.db3`: names, definitions, the QoS that publishers offer."""
 MAX_DEFINITION_BYTES: Final = 1 << 20
 """A longer definition is not used; one byte more of it is kept, so that this shows."""
 MAX_CHUNK_DECLARATIONS: Final = 20_000

@@ -38,7 +38,7 @@ from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
-    MAX_SECTION_BYTES,
+    MAX_TEXTS_BYTES,
     ContradictionError,
     UnreadableError,
 )
@@ -60,10 +60,12 @@ JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
 _PROOF_BYTES: Final = 200
 _TOTALS: Final = """
-    SELECT topic_id, count(*), min(timestamp), max(timestamp),
+    SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END AS topic, count(*),
+           min(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
+           max(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
            sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
            timestamp IS ? AS impossible
-    FROM messages NOT INDEXED GROUP BY topic_id, impossible
+    FROM messages NOT INDEXED GROUP BY topic, impossible
 """
 _PAUSES: Final = """
     SELECT before, timestamp FROM (
@@ -91,9 +93,12 @@ _METADATA: Final = (
     ("type_description_hash", "topic_type_hash"),
 )
 """Columns of the table of topics, and what an MCAP file calls them in a channel's metadata."""
-_SIZE_OF_DEFINITIONS: Final = (
-    "SELECT total(length(encoded_message_definition)) FROM message_definitions"
-)
+_TOPIC_TEXTS: Final = ("name", "type", "serialization_format", *dict(_METADATA))
+_DEFINITION_TEXTS: Final = ("topic_type", "encoding", "encoded_message_definition")
+_DEFINITIONS: Final = """
+    SELECT topic_type, encoding, substr(encoded_message_definition, 1, ?)
+    FROM message_definitions LIMIT ?
+"""
 _PAYLOAD: Final = "SELECT data, timestamp, topic_id FROM messages WHERE rowid = ?"
 
 
@@ -289,12 +294,15 @@ class SqliteBags:
         have = _columns(base, "topics")
         if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
+        texts = [name for name in _TOPIC_TEXTS if name in have]
+        require_short_texts(base, "topics", texts)
         definitions = _definitions(base)
-        rows = base.execute("SELECT * FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,))
-        names = [column[0] for column in rows.description]
+        # From a list of names above.
+        query = f"SELECT id, {', '.join(texts)} FROM topics ORDER BY id LIMIT ?"  # noqa: S608
+        rows = base.execute(query, (MAX_CHANNELS + 1,))
         channels: dict[int, Channel] = {}
         for row in rows:
-            value = dict(zip(names, row, strict=True))
+            value = dict(zip(("id", *texts), row, strict=True))
             raw_type = str(value["type"])
             schema = definitions.get(raw_type, Schema(full_name(raw_type)))
             channels[int(value["id"])] = shared(
@@ -355,16 +363,10 @@ def _columns(base: sqlite3.Connection, table: str) -> set[str]:
 
 def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
     """Returns the definitions in the file, by type name; none before schema version 4."""
-    needed = {"topic_type", "encoding", "encoded_message_definition"}
-    if not needed <= _columns(base, "message_definitions"):
+    if not _columns(base, "message_definitions") >= set(_DEFINITION_TEXTS):
         return {}
-    (size,) = base.execute(_SIZE_OF_DEFINITIONS).fetchone()
-    if size > MAX_SECTION_BYTES:
-        raise UnreadableError("damaged: its message definitions are larger than any can be")
-    rows = base.execute(
-        "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?",
-        (MAX_CHANNELS,),
-    )
+    require_short_texts(base, "message_definitions", _DEFINITION_TEXTS)
+    rows = base.execute(_DEFINITIONS, (MAX_DEFINITION_BYTES + 1, MAX_CHANNELS))
     return {
         str(name): Schema(
             full_name(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]
@@ -455,3 +457,16 @@ def require_plain_tables(base: sqlite3.Connection) -> None:
     if odd or computed:
         name = odd[0][0] if odd else computed[0]
         raise UnreadableError(f"not a rosbag2 file: its {name} is not a plain table")
+
+
+def require_short_texts(base: sqlite3.Connection, table: str, columns: Sequence[str]) -> None:
+    """Refuses a table whose texts take more than any recorder writes, before they are read.
+
+    Raises:
+        UnreadableError: they do.
+    """
+    # As blobs, since the length of a text is that up to its first NUL.
+    sizes = " + ".join(f"ifnull(length(CAST({name} AS BLOB)), 0)" for name in columns)
+    (size,) = base.execute(f"SELECT total({sizes}) FROM {table}").fetchone()  # noqa: S608
+    if size > MAX_TEXTS_BYTES:
+        raise UnreadableError(f"the texts of its table {table} are longer than any can be")

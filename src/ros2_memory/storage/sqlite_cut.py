@@ -16,7 +16,12 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError
 from ros2_memory.storage.file_io import open_regular
-from ros2_memory.storage.sqlite_bag import JOURNALS, guard, require_plain_tables
+from ros2_memory.storage.sqlite_bag import (
+    JOURNALS,
+    guard,
+    require_plain_tables,
+    require_short_texts,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
@@ -69,6 +74,7 @@ def cut_sqlite(
         base.execute("PRAGMA journal_mode = DELETE")
         base.execute("PRAGMA journal_mode = MEMORY")
         base.execute("PRAGMA secure_delete = ON")
+        require_short_texts(base, "topics", ("name",))
         topics = dict(base.execute("SELECT id, name FROM topics").fetchall())
         going: list[tuple[int]] = []
         for row, number, at in base.execute("SELECT rowid, topic_id, timestamp FROM messages"):
@@ -80,6 +86,7 @@ def cut_sqlite(
         base.execute("BEGIN")
         base.executemany("DELETE FROM messages WHERE rowid = ?", going)
         if base.execute(_HAS_METADATA).fetchone()[0]:
+            require_short_texts(base, "metadata", ("metadata",))
             rows = base.execute("SELECT rowid, metadata FROM metadata").fetchall()
             base.executemany(
                 "UPDATE metadata SET metadata = ? WHERE rowid = ?",

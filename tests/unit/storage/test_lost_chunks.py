@@ -8,20 +8,21 @@ from __future__ import annotations
 import json
 import struct
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 from mcap.opcode import Opcode
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.core.errors import BagError
+from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.fuzz.indexes import agreed
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked as asked_tool
@@ -39,6 +40,13 @@ S = 10**9
 T0 = 1_700_000_000 * S
 LATCHED = McapLayout(chunk_size=1, latched=frozenset({"/dock"}))
 EVERYTHING = TimeWindow.everything()
+LIES: Final[dict[str, Callable[[int], int]]] = {
+    "later": lambda time: time + 3 * S // 10,
+    "earlier": lambda time: time - 3 * S // 10,
+    "much later": lambda time: time + 2 * S,
+    "much earlier": lambda time: time - 12 * S // 10,
+    "a little later": lambda time: time + S // 50,
+}
 
 
 def damaged_bag(path: Path) -> tuple[Path, range]:
@@ -255,6 +263,55 @@ class TestAnIndexThatContradictsItsMessages:
         assert "contradicts itself" in found
         assert same == right.pop("notes")
         assert wrong == right
+
+
+class TestAChunkOfWhichAllIndexesTellOneLie:
+    """Its messages, whose checksum is right, are in no window in which they are looked for."""
+
+    CHUNK = 3
+
+    def driven(self, bag_dir: Path, told: Callable[[int], int]) -> list[int]:
+        """A drive at 1 m/s and a lie about one chunk; returns the times of its messages."""
+        moving = [odom(T0 + n * S // 100, n / 100, 0.0) for n in range(500)]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=40_000))
+        chunk = chunks_of(path)[self.CHUNK]
+        path.write_bytes(agreed(path.read_bytes(), self.CHUNK, told))
+        return list(range(chunk.message_start_time, chunk.message_end_time + 1, S // 100))
+
+    @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+    @pytest.mark.parametrize("lie", LIES)
+    @pytest.mark.parametrize("tool", ["get_position_at", "get_topic_at_time", "get_topic_in_range"])
+    def test_a_first_answer_is_what_its_messages_say(
+        self, tmp_path: Path, tool: str, lie: str, share: float
+    ) -> None:
+        times = self.driven(tmp_path, LIES[lie])
+        at = times[int(share * len(times))]
+        asks = {"topic": "/odom", "timestamp": at / S + 0.001}
+        if tool == "get_topic_in_range":
+            asks = {"topic": "/odom", "start": at / S - 0.055, "end": at / S + 0.055}
+        reply = asked_tool(memory_of(tmp_path), tmp_path, tool, **asks)
+        assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
+        if tool == "get_topic_in_range":
+            found = [sample["value"]["position"]["x"] for sample in reply["samples"]]
+            assert found == pytest.approx([(at - T0) / S + n / 100 for n in range(-5, 6)])
+        else:
+            x = reply["x"] if "x" in reply else reply["value"]["position"]["x"]
+            assert x == pytest.approx((at - T0) / S, abs=1e-6)
+
+    def test_a_range_around_a_chunk_that_says_it_lies_elsewhere_has_its_messages(
+        self, tmp_path: Path
+    ) -> None:
+        times = self.driven(tmp_path, lambda time: time + 2 * S)
+        window = TimeWindow(times[0] - S // 10, times[-1] + S // 10)
+        for newest_first in (False, True):
+            reader, found = McapReader(), []
+            records = reader.records(
+                tmp_path / "rec" / "rec_0.mcap", ["/odom"], window, newest_first=newest_first
+            )
+            with pytest.raises(BagContradictionError):
+                next(records)
+            found = sorted(each.log_time for each in records)
+            assert found == list(range(window.start, window.stop, S // 100))
 
 
 class TestASummarySectionThatDeclaresOtherThanItsChunks:

@@ -230,11 +230,14 @@ class TestIndexesThatAreWrong:
         wrong = chunks_of(path)[1]
         first = wrong.message_start_time
         change_index(path, wrong, at, first + value if at == 0 else value)
-        reason = "damaged: a message is not where its index says; its messages were read without"
+        fault = "a message is not where its index says"
+        if at == 0:
+            fault = "a chunk states other times than its messages have"
+        note = f"damaged: {fault}; its messages were read without its indexes"
         for newest_first in (False, True):
             found, notes = read_on(McapReader(), path, newest_first=newest_first)
             assert found == sorted(range(count), reverse=newest_first)
-            assert notes == [f"{reason} its indexes"]
+            assert notes == [note]
         reader = McapReader()
         with pytest.raises(BagContradictionError):
             next(reader.records(path, ["/chatter"], TimeWindow(first, first + 1)))

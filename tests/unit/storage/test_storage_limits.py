@@ -327,7 +327,7 @@ class TestSqlite:
                 ((n, text_of_mb) for n in range(10, 80)),
             )
             base.commit()
-        with pytest.raises(BagError, match="definitions are larger"):
+        with pytest.raises(BagError, match="texts of its table message_definitions are longer"):
             Rosbag2Reader().summarize(path)
         with closing(sqlite3.connect(path)) as base:
             base.execute("DELETE FROM message_definitions")
@@ -338,6 +338,58 @@ class TestSqlite:
             base.commit()
         with pytest.raises(BagError, match="declares more than 5000 topics"):
             Rosbag2Reader().summarize(path)
+
+    @pytest.mark.parametrize(
+        ("change", "table"),
+        [
+            ("UPDATE topics SET offered_qos_profiles = ?", "topics"),
+            ("UPDATE topics SET name = ?", "topics"),
+            (
+                "UPDATE message_definitions SET encoded_message_definition = ?",
+                "message_definitions",
+            ),
+            ("UPDATE message_definitions SET topic_type = ?", "message_definitions"),
+        ],
+    )
+    def test_texts_longer_than_any_robot_has_are_refused_before_they_are_read(
+        self, tmp_path: Path, change: str, table: str
+    ) -> None:
+        path = self.edited(
+            tmp_path,
+            "INSERT INTO topics SELECT 9, '/t', 'a/msg/B', 'cdr', '', ''",
+            "INSERT INTO message_definitions SELECT 9, 'a/msg/B', 'ros2msg', '', ''",
+        )
+        with closing(sqlite3.connect(path)) as base:
+            base.execute(change, ("\0" + "x" * 33 * MB,))
+            base.commit()
+        tracemalloc.start()
+        try:
+            with pytest.raises(BagError, match=f"texts of its table {table} are longer than"):
+                Rosbag2Reader().summarize(path)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak < MB
+
+    def test_columns_that_no_bag_has_and_values_of_other_types_are_not_read(
+        self, tmp_path: Path
+    ) -> None:
+        path = self.edited(
+            tmp_path,
+            "ALTER TABLE topics ADD COLUMN more TEXT",
+            "UPDATE topics SET more = CAST(zeroblob(30000000) AS TEXT)",
+            "INSERT INTO messages(topic_id, timestamp, data)"
+            " VALUES (CAST(zeroblob(30000000) AS TEXT), 5, x'00')",
+        )
+        tracemalloc.start()
+        try:
+            summary = Rosbag2Reader().summarize(path)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert summary.count == 5
+        assert "1 messages belong to no topic" in summary.notes[0]
+        assert peak < MB
 
     def test_a_message_larger_than_allowed_is_named(self, tmp_path: Path) -> None:
         messages = [text(1, "x"), Msg("/chatter", "std_msgs/msg/String", 2, bytes(2 * MB))]

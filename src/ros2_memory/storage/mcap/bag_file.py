@@ -13,6 +13,7 @@ from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
 from io import BytesIO
+from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -93,6 +94,11 @@ _LARGE_BYTES: Final = 8 << 20
 _REASONS_BYTES: Final = 1 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
+_NAMED: Final = -1
+_COMPARED: Final = -2
+"""In place of a channel: the channels of a chunk, or all its indexes, were found right."""
+_YES: Final = NO_MESSAGES
+_NEXT_BUT_ONE: Final = 2
 
 
 class _ContradictedError(UnreadableError):
@@ -233,9 +239,11 @@ class McapBags:
         """Divides the chunks with wanted messages by how they are read.
 
         Raises:
-            _ContradictedError: a chunk index names other channels than its chunk has.
+            _ContradictedError: a chunk index names other channels or times than its chunk has.
         """
         divided = _Divided([], [], [])
+        if wanted:
+            self._require_beside(file, index, window)
         for chunk in index.chunks if wanted else ():
             if not _overlaps(chunk, window):
                 continue
@@ -356,7 +364,9 @@ class McapBags:
     def _newest_in_chunks(
         self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
     ) -> Record | None:
-        chunks = [each for each in index.chunks if _overlaps(each, window)] if wanted else []
+        if not wanted:
+            return None
+        chunks = [each for each in index.chunks if _overlaps(each, window)]
         chunks.sort(key=attrgetter("end"), reverse=True)
         best: tuple[Ns, int, int, bytes] | None = None
         for chunk in chunks:
@@ -370,6 +380,10 @@ class McapBags:
                 if times.size:
                     found = int(times[-1]), chunk.offset, int(places[-1]), data
                     best = found if best is None else max(best, found)
+        is_covered = best is not None and best[1] == chunks[0].offset
+        if not is_covered or chunks[0].end < window.stop - 1:
+            since = window.start if best is None else best[0]
+            self._require_beside(file, index, TimeWindow(since, window.stop))
         if best is None:
             return None
         time, _, place, data = best
@@ -496,8 +510,10 @@ class McapBags:
         """Yields the chunks that overlap the window and have messages of one of the channels.
 
         Raises:
-            _ContradictedError: a chunk index names other channels than its chunk has.
+            _ContradictedError: a chunk index names other channels or times than its chunk has.
         """
+        if wanted:
+            self._require_beside(file, index, window)
         for chunk in index.chunks if wanted else ():
             if _overlaps(chunk, window) and self._has_any(file, chunk, wanted):
                 yield chunk
@@ -512,13 +528,13 @@ class McapBags:
             _ContradictedError: the chunk index names other channels than the message indexes.
         """
         if chunk.index_places is not None and not chunk.channels.issuperset(wanted):
-            key = file.key, chunk.offset, -1
+            key = file.key, chunk.offset, _NAMED
             if self._indexes.get(key) is None:
                 try:
                     require_channels(file, chunk)
                 except (UnreadableError, struct.error) as error:
                     raise _ContradictedError(reason_of(error)) from error
-                self._indexes.put(key, NO_MESSAGES, NO_MESSAGES.memory_bytes)
+                self._indexes.put(key, _YES, _YES.memory_bytes)
         return not chunk.channels.isdisjoint(wanted)
 
     def _chunk_columns(
@@ -556,6 +572,33 @@ class McapBags:
             self._indexes.put((file.key, chunk.offset, channel), found, found.memory_bytes)
         return [*columns, *(read[channel] for channel in missing)]
 
+    def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
+        """Compares the chunks beside a window with their records, each once.
+
+        Raises:
+            _ContradictedError: the indexes of one of them do not agree with its records.
+        """
+        for chunk in _beside(index.chunks, window):
+            if chunk.index_places is None or self._indexes.get((file.key, chunk.offset, _COMPARED)):
+                continue
+            data = self._readable_data(file, chunk)
+            if data is None:
+                continue
+            try:
+                self._compared(file, chunk, data)
+            except _ContradictedError as error:
+                raise _ContradictedError(str(error)) from error
+
+    def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> list[Column]:
+        """Returns all messages of a chunk, compared with its records.
+
+        Raises:
+            _ContradictedError: the indexes do not agree with the records.
+        """
+        columns = self._chunk_columns(file, chunk, chunk.channels, data)
+        self._indexes.put((file.key, chunk.offset, _COMPARED), _YES, _YES.memory_bytes)
+        return columns
+
     def _readable_data(self, file: OpenFile, chunk: Chunk) -> bytes | None:
         """Returns the records of a chunk; None if they cannot be read."""
         try:
@@ -570,12 +613,14 @@ class McapBags:
         A bag is chosen for a question by these times: a wrong one would hide its messages.
         """
         ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
+        outer = (*index.chunks[:1], *index.chunks[-1:])
         left = _VERIFIED_BYTES
         try:
             for chunk in index.chunks:
                 self._has_any(file, chunk, index.channels)
                 nth = bisect_left(ends, chunk.start)
-                if chunk.index_places is None or nth == len(ends) or ends[nth] > chunk.end:
+                is_end = chunk in outer or (nth < len(ends) and ends[nth] <= chunk.end)
+                if chunk.index_places is None or not is_end:
                     continue
                 left -= chunk.length
                 if left < 0:
@@ -583,7 +628,7 @@ class McapBags:
                 data = self._readable_data(file, chunk)
                 if data is None:
                     continue
-                columns = self._chunk_columns(file, chunk, chunk.channels, data)
+                columns = self._compared(file, chunk, data)
                 if index.declared is not None:
                     _require_declared(index.declared, data, columns)
         except _ContradictedError as error:
@@ -650,6 +695,24 @@ def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
 
 def _overlaps(chunk: Chunk, window: TimeWindow) -> bool:
     return chunk.start < window.stop and chunk.end >= window.start
+
+
+def _beside(chunks: Sequence[Chunk], window: TimeWindow) -> list[Chunk]:
+    """Returns the chunks that may hold messages of a window of which their indexes know nothing.
+
+    In the order of the file the times of chunks ascend, mostly, and one follows the other. Where
+    all indexes of a chunk agree on wrong times, no chunk has the times of its messages: such a
+    hole is looked for at both ends of the window, and between two chunks that overlap it.
+    """
+    start, last = window.start, window.stop - 1
+    inside = [n for n, chunk in enumerate(chunks) if chunk.start <= last and chunk.end >= start]
+    found = {one + 1 for one, other in pairwise(inside) if other - one == _NEXT_BUT_ONE}
+    for at in (start, last):
+        if not any(chunks[n].start <= at <= chunks[n].end for n in inside):
+            before = [(chunk.end, n) for n, chunk in enumerate(chunks) if chunk.end < at]
+            nth = max(before)[1] if before else -1
+            found.update((nth, nth + 1))
+    return [chunks[n] for n in sorted(found) if 0 <= n < len(chunks)]
 
 
 def _split_window(

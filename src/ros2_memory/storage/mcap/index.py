@@ -61,7 +61,7 @@ _CHUNK: Final = int(Opcode.CHUNK)
 _INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
 _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
 OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
-_OUTSIDE: Final = "damaged: a chunk holds messages outside its stated times"
+_OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
@@ -117,11 +117,12 @@ def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict
         UnreadableError: the indexes are damaged, or disagree with the times that the chunk states.
     """
     offsets = {number: at for number, at in chunk.index_offsets.items() if number in wanted}
-    columns = columns_from_index(_index_region(file, chunk), offsets, chunk.offset + chunk.length)
-    for times, _ in columns.values():
-        if times.size and not chunk.start <= int(times[0]) <= int(times[-1]) <= chunk.end:
-            raise UnreadableError(_OUTSIDE)
-    return columns
+    region, base = _index_region(file, chunk), chunk.offset + chunk.length
+    every = extents_from_index(region, chunk.index_offsets, base).values()
+    first, last = min([each.first for each in every]), max([each.last for each in every])
+    if (first, last) != (chunk.start, chunk.end):
+        raise UnreadableError(_OUTSIDE)
+    return columns_from_index(region, offsets, base)
 
 
 def require_channels(file: OpenFile, chunk: Chunk) -> None:
