@@ -38,6 +38,7 @@ class TestDefaults:
                 "topics_file": ROOT / "config/topics.yaml",
                 "keep_when": ROOT / "config/triggers.yaml",
                 "exclude_when": ROOT / "config/exclusions.yaml",
+                "required": (),
             },
             "data": {
                 "recording": None,
@@ -119,6 +120,7 @@ class TestDefaults:
                 "setup_files": (),
                 "latched_topics": ("/tf_static",),
                 "repeat_latched": (),
+                "required": (),
                 "chunk_bytes": 16384,
             },
         }

@@ -41,6 +41,14 @@ NEWER = frozenset(
         "process",
         "counted_bytes",
         "state_bytes",
+        "last_error_at",
+        "recovered",
+        "unknown_types",
+        "unheard",
+        "fell_silent",
+        "required_missing",
+        "advice",
+        "list_refused",
     }
 )
 """Keys that older recorders did not write."""

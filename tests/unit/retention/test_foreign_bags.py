@@ -335,7 +335,7 @@ class TestReports:
         (bag_dir / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
         memory = self.memory(bag_dir)
         budget = memory_status(memory, Call()).budget
-        assert budget.used == sum(path.stat().st_size for path in mine)
+        assert budget.used - budget.state == sum(path.stat().st_size for path in mine)
         assert budget.foreign == sum(path.stat().st_size for path in others) + len(b"no bag")
         health = anyio.run(Health(memory, "1"))
         assert health["foreign_bytes"] == budget.foreign
@@ -386,7 +386,7 @@ class TestReports:
         assert "ros2-memory adopt DIR" in disk
         cli.main(["info", "--json"])
         reported = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
-        assert reported["used_gb"] == 0.0
+        assert reported["used_gb"] < 0.001
         assert reported["foreign_gb"] is not None
 
 
