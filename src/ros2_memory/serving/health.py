@@ -41,7 +41,7 @@ NAMED: Final = 3
 
 _MAX_TOPICS: Final = 20
 _MAX_MISSING: Final = 6
-_MAX_CHARS: Final = 300
+_MAX_CHARS: Final = 290
 
 _HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 

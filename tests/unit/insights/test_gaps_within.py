@@ -40,13 +40,10 @@ def at_rates(
     messages = [
         odom(at(n / 200), n / 200, 0.0) for n in range(int(200 * length)) if is_on(n / 200, fast)
     ]
-    for hz, off in ((50, fast), (10, stalls)):
-        times = [n / hz + 0.001 for n in range(int(hz * length))]
-        messages += [
-            boolean(at(t), True) if hz == 50 else text(at(t), "here")
-            for t in times
-            if is_on(t, off)
-        ]
+    flags = [n / 50 + 0.001 for n in range(int(50 * length))]
+    messages += [boolean(at(t), data=True) for t in flags if is_on(t, fast)]
+    texts = [n / 10 + 0.001 for n in range(int(10 * length))]
+    messages += [text(at(t), "here") for t in texts if is_on(t, stalls)]
     return sorted(messages, key=lambda message: message.log_time)
 
 
@@ -74,8 +71,8 @@ def stalled(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
 
 
 def ask(memory: Memory, tool: str, **arguments: Any) -> dict[str, Any]:
-    reply: dict[str, Any] = asked(memory, memory.index.bag_dir, tool, **arguments)
-    return reply
+    found: dict[str, Any] = asked(memory, memory.index.bag_dir, tool, **arguments)
+    return found
 
 
 def gaps(memory: Memory) -> list[tuple[float, float]]:

@@ -61,6 +61,7 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
         "incomplete": 0,
         "unread": 0,
         "clock_faults": 0,
+        "gaps_last_hour": {"count": 0, "seconds": 0.0},
         "index_age_s": 0.0,
     }
 
