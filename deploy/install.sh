@@ -147,11 +147,9 @@ make_user() {
 make_folders() {
   as=
   [ "$me" -ne 0 ] || as=$(owner)
-  if [ ! -d "$root$state" ]; then
-    mkdir -p "$root${state%/*}"
-    mkdir -m 0750 "$root$state"
-    [ -z "$as" ] || chown -h "$me:${as#*:}" "$root$state"
-  fi
+  mkdir -p "$root${state%/*}"
+  # Only the bags are closed to others: a recorder that runs as the robot's user has to pass here.
+  [ -d "$root$state" ] || mkdir -m 0755 "$root$state"
   if [ -d "$root$bags" ] || [ "$query_only" = yes ]; then
     return 0
   fi

@@ -101,8 +101,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason=reason))
 
 
-def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Counts the tests that need the shared bags, so that nobody takes skipped ones for passed."""
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_terminal_summary(
+    terminalreporter: pytest.TerminalReporter,
+) -> Generator[None, object, object]:
+    """Counts the tests that need the shared bags, so that nobody takes skipped ones for passed.
+
+    Below the reasons of what was skipped.
+    """
+    result = yield
     reports = [
         report
         for reports in terminalreporter.stats.values()
@@ -114,6 +121,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(
             f"{len(needing)} tests need the shared bags: {len(skipped)} skipped"
         )
+    return result
 
 
 @pytest.hookimpl(wrapper=True)
