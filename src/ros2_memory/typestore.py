@@ -45,7 +45,6 @@ _CACHED_TYPE_BYTES: Final = 2_048
 """Counted for each besides its text, so that no more than 4,096 are cached."""
 _REASON_LENGTH: Final = 300
 
-_RULE: Final = "=" * 80
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
 _EVENT: Final = "_Event"
 _HALVES: Final = ("Request", "Response")
@@ -356,36 +355,6 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
         finished = waiting.pop()
         known[finished] = Definition(finished, tuple(fields))
     return known[root]
-
-
-def text_of(definition: Definition) -> str:
-    """Returns the text of a definition and of its nested types, as rosbag2 concatenates them.
-
-    Constants and bounds are not in it: payloads do not have them.
-    """
-    sections: dict[str, str] = {}
-    waiting = [definition]
-    while waiting:
-        described = waiting.pop()
-        if described.type in sections:
-            continue
-        lines: list[str] = []
-        for field in described.fields:
-            if isinstance(field.kind, Definition):
-                waiting.append(field.kind)
-                kind = field.kind.type.replace("/msg/", "/")
-            else:
-                kind = field.kind
-            length = "" if field.length == SEQUENCE else field.length
-            lines.append(
-                f"{kind} {field.name}" if length is None else f"{kind}[{length}] {field.name}"
-            )
-        sections[described.type] = "".join(f"{line}\n" for line in lines)
-    root = sections.pop(definition.type)
-    nested = (
-        f"{_RULE}\nMSG: {name.replace('/msg/', '/')}\n{text}" for name, text in sections.items()
-    )
-    return root + "".join(nested)
 
 
 def _kind(field: FieldDesc, known: Mapping[str, Definition]) -> str | Definition:

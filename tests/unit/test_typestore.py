@@ -18,7 +18,6 @@ from ros2_memory.typestore import (
     MAX_TEXT_BYTES,
     MessageType,
     Typestores,
-    text_of,
 )
 from tests.support.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
 
@@ -150,7 +149,7 @@ class TestTexts:
         for name in get_typestore(Stores.LATEST).fielddefs:
             standard = stores.lookup(name, "", b"")
             assert isinstance(standard, MessageType)
-            written = stores.lookup(name, "ros2msg", text_of(standard.fields).encode())
+            written = stores.lookup(name, "ros2msg", standard.fields.text().encode())
             assert isinstance(written, MessageType)
             assert spelled_out(written.fields) == spelled_out(standard.fields), name
 

@@ -44,7 +44,6 @@ from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
-from ros2_memory.typestore import text_of
 
 _REPORT_EVERY: Final = 512
 
@@ -220,7 +219,7 @@ def _with_definitions(
         if definition is None:
             undefined.extend({schema.name} - {*undefined})
             return channel
-        text = text_of(definition).encode()
+        text = definition.text().encode()
         return replace(channel, schema=replace(schema, encoding="ros2msg", text=text))
 
     for each in messages:

@@ -197,6 +197,36 @@ class Definition:
     type: str
     fields: tuple[Field, ...]
 
+    def text(self) -> str:
+        """Returns it as `.msg` files, with those of nested types, as rosbag2 concatenates them.
+
+        Constants and bounds are not in it: payloads do not have them.
+        """
+        sections: dict[str, str] = {}
+        waiting = [self]
+        while waiting:
+            each = waiting.pop()
+            if each.type not in sections:
+                sections[each.type] = "".join(map(_msg_line, each.fields))
+                waiting += [
+                    field.kind for field in each.fields if isinstance(field.kind, Definition)
+                ]
+        nested = [
+            f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n{lines}"
+            for name, lines in sections.items()
+            if name != self.type
+        ]
+        return "".join((sections[self.type], *nested))
+
+
+def _msg_line(field: Field) -> str:
+    """Returns a field as a line of a `.msg` file."""
+    kind = field.kind
+    if isinstance(kind, Definition):
+        kind = kind.type.replace("/msg/", "/")
+    length = "" if field.length == SEQUENCE else field.length
+    return f"{kind} {field.name}\n" if length is None else f"{kind}[{length}] {field.name}\n"
+
 
 class BagReader(ABC):
     """Reads bag files of the kinds that `reads` accepts."""

@@ -102,7 +102,7 @@ async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
         ]
         assert "/odom" in {row["topic"] for row in await read(client, "episodic://topics")}
         assert "trust" in await read(client, "episodic://status")
-        assert await read(client, "episodic://moments") == {"moments": []}
+        assert (await read(client, "episodic://moments"))["moments"] == []
 
 
 async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
@@ -260,7 +260,7 @@ async def test_one_moment_is_a_resource(tmp_path: Path) -> None:
     async with Client(server(tmp_path)) as client:
         shown = await read(client, f"episodic://moments/{name}")
         [listed] = (await read(client, "episodic://moments"))["moments"]
-        assert shown == listed
+        assert shown == {"now": shown["now"], **listed}
         assert (shown["moment"], shown["label"]) == (name, "spilled coffee")
         refused = await read(client, "episodic://moments/spilt-coffee")
     assert refused["error"] == "invalid_arguments"
