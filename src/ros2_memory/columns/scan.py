@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -49,6 +49,9 @@ _MOST_LOOKED_UP: Final = 64
 """Parts whose columns are looked up at once."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
+_MOST_BYTES: Final = 64 << 20
+"""Columns of one bag that are held at once; those of a bag with more are not, and it is read."""
+_TOO_LARGE: Final = "its messages are too large to hold their columns"
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +238,7 @@ class Scan:
                 tables = self._scanner.split(source.number, self._asked.topic)
             if tables is None:
                 hashed = bool(self._shared) or self._asked.relatches
-                tables = [*self._asked.decode(source.bag, self._asked.topic, hashed)]
+                tables = _bounded(self._asked.decode(source.bag, self._asked.topic, hashed))
             known = [
                 BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
             ]
@@ -397,3 +400,17 @@ class Scan:
                     published[rows] = table.publish_times
                     hashes[rows] = table.payload_hashes
         return published, hashes
+
+
+def _bounded(tables: Iterable[Table]) -> list[Table]:
+    """Returns the tables of a bag; without their columns where these take too much together."""
+    found: list[Table] = []
+    size = 0
+    for table in tables:
+        size += table.memory_bytes
+        found.append(table)
+        if size > _MOST_BYTES:
+            left_out = {"": _TOO_LARGE}
+            found = [replace(each, columns={}, elements={}, left_out=left_out) for each in found]
+        del table
+    return found
