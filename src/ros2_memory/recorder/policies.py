@@ -100,7 +100,8 @@ class SilenceWatch:
                 self._grew_at_s, self._has_grown = now_s, True
         if self._grew_at_s is None or not (self._has_grown or offered):
             return False
-        return now_s - self._grew_at_s >= self._patience_s
+        least_s = 0.0 if self._has_grown else WAITING_S
+        return now_s - self._grew_at_s >= max(self._patience_s, least_s)
 
     def rotated(self, *, for_silence: bool) -> None:
         """Notes that the recording was rotated, for silence or because its session was over."""

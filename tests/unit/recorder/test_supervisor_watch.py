@@ -377,7 +377,7 @@ class TestShortfall:
         world.supervisor.start()
         world.run(10)
         world.defaults["deaf"] = False
-        world.run(20)
+        world.run(40)
         assert [each.deaf for each in world.running] == [False]
         assert world.heartbeat()["state"] == "recording"
 

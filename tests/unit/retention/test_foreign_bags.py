@@ -181,6 +181,8 @@ class TestRetention:
         mine = recording(tmp_path, A, 0)
         own.complete(A)
         own.note(A, {path.name for path in mine}, ended=True)
+        for later in ("rec_later", "rec_latest"):  # without a heartbeat these may be being written
+            own.begin(later)
         others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
         newest = recording(tmp_path, B, 3 * 3600)
         with structlog.testing.capture_logs() as logs:
