@@ -179,8 +179,8 @@ def _known_keys(model: type, fault: ErrorDetails, nodes: Mapping[str, type]) -> 
             model = get_args(model)[1]
         else:
             model = nodes.get(str(section)) or get_type_hints(model)[str(section)]
-            given = [each for each in get_args(model) if isinstance(each, type)]
-            model = next(filter(is_dataclass, given), model)  # of one that may be null
+            if type(None) in get_args(model):
+                model = get_args(model)[0]
     names = (field.name for field in fields(model) if is_dataclass(model))
     return ["_target_" if name == "target" else name for name in names]
 

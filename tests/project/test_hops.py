@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 T0: Final = 1_700_000_000 * NS_PER_S
 PACKAGE: Final = f"{Path(ros2_memory.__file__).parent}/"
-MOST_FILES: Final = 45
-MOST_FRAMES: Final = 18
+MOST_FILES: Final = 50
+MOST_FRAMES: Final = 20
 
 
 class CallProfile:

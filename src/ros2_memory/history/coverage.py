@@ -131,13 +131,15 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
 
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
-    bag_dir = view.memory.index.bag_dir
+    bag_dir, touched = view.memory.index.bag_dir, view.gaps(window)
+    if not touched:
+        return
     known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
     if explained and not known:
         return
     found: dict[str, list[str]] = {}
     gone = deleted_spans(bag_dir)
-    gaps = (part for each in view.gaps(window) for part in _unrecorded(view.snapshot, each, gone))
+    gaps = (part for each in touched for part in _unrecorded(view.snapshot, each, gone))
     for start, end in gaps:
         cause = next((each.by for each in known if each.start < end and start < each.stop), "")
         may_come = being_written(view.snapshot, TimeWindow(start + 1, end))

@@ -97,7 +97,7 @@ class View:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
         first, last = window.asked()
         touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
-        return without_steps(self, touched)
+        return without_steps(self, touched) if touched else touched
 
     def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
         """Returns how many messages the window holds, and `at_most` of them, evenly spaced.

@@ -2,8 +2,8 @@
 
 From one bag to the next, or within a bag, as its summary states. What explains a pause is how often
 topics have a message that usually have one: the second most frequent of them, since one may fall
-silent by itself. Where there are no two, only a longer pause between bags is a gap: from one split
-of a recording to the next, in which the recorder ran on, twice the longer one, or 20 s.
+silent by itself. Between bags a longer pause is a gap however rare topics are: from one split of a
+recording to the next, in which the recorder ran on, twice the longer one, or 20 s.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile
 
 SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
-"""Between two recordings in which fewer than two topics usually have a message."""
+"""Between two recordings, where topics are frequent."""
 _GAP_PERIODS: Final = 3
 _GAP_SPLITS: Final = 2
 _LONGEST_LEAST_NS: Final[Ns] = 20 * NS_PER_S
@@ -108,8 +108,9 @@ class Rhythm:
         return max(SHORTEST_GAP_NS, _GAP_PERIODS * min(self._periods.values(), default=0))
 
     def _is_gap(self, pause: Pause) -> bool:
-        if all(len(self._periods_of(bag)) > 1 for bag in pause.bags):
-            return pause.length > _GAP_PERIODS * self._slower(pause)
+        several = all(len(self._periods_of(bag)) > 1 for bag in pause.bags)
+        if several and pause.length > _GAP_PERIODS * self._slower(pause):
+            return True
         if len(pause.bags) == 1:
             return False
         longer = max(bag.end - bag.start for bag in pause.bags)

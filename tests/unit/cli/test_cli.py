@@ -209,11 +209,15 @@ class TestTopics:
 
 
 class TestInfo:
-    def test_it_shows_the_range_the_gaps_and_the_bags(self, capsys: Capture) -> None:
+    def test_it_shows_the_range_the_gaps_and_the_bags(self, bag_dir: Path, capsys: Capture) -> None:
+        # Far from where it was: the hour before it was no step of the clock.
+        messages = [odom(T0 + (7200 + n) * NS_PER_S, 500.0, float(n)) for n in range(20)]
+        write_mcap(bag_dir / "rec" / "rec_2.mcap", messages)
         assert cli.main(["info", "--json"]) == 0
         output = json.loads(capsys.readouterr().out)
         assert output["data_time_range"]["earliest"] == 1_700_000_000.0
-        assert output["data_time_range"]["bags"] == 2
+        assert output["data_time_range"]["bags"] == 3
+        assert len(output["data_time_range"]["clock_steps"]) == 1
         assert len(output["data_time_range"]["gaps"]) == 1
         assert output["memory_status"]["budget"]["max_gb"] is None
 
