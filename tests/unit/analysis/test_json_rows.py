@@ -90,7 +90,7 @@ def turned(ns: int, numbers: tuple[float, float, float, float]) -> Msg:
 
 kinds = st.sampled_from(
     [
-        st.builds(odom, moment, number, number, number, vx=number),
+        st.builds(odom, moment, number, number, st.floats(-5, 5), vx=number),
         st.builds(
             lambda ns, x: tf(ns, transform(ns, "map", "odom", (x, x, 0.0), 0.1)), moment, number
         ),

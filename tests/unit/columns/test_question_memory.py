@@ -23,7 +23,8 @@ from pathlib import Path
 from ros2_memory import cli
 
 asked = ["find_last_match", "topic=/chatter", "condition_type=contains", f"value={sys.argv[2]}"]
-cli.main(["ask", "--json", "--bag-dir", sys.argv[1], *asked])
+patient = "server.call_timeout_s=600"
+cli.main(["ask", "--json", "--bag-dir", sys.argv[1], *asked, patient])
 status = Path("/proc/self/status").read_text()
 print(int(next(line for line in status.splitlines() if "VmHWM" in line).split()[1]) >> 10)
 """
