@@ -119,12 +119,12 @@ class Heartbeat:
     state_bytes: Count = 0
     last_error_at: Int64 | None = None
     recovered: bool = False
-    unknown_types: tuple[str, ...] = ()
-    unheard: tuple[str, ...] = ()
-    fell_silent: tuple[str, ...] = ()
-    required_missing: tuple[str, ...] = ()
-    advice: str | None = None
-    list_refused: str | None = None
+    unknown_types: tuple[_Text, ...] = ()
+    unheard: tuple[_Text, ...] = ()
+    fell_silent: tuple[_Text, ...] = ()
+    required_missing: tuple[_Text, ...] = ()
+    advice: _Text | None = None
+    list_refused: _Text | None = None
 
     def is_live(self, now: Ns) -> bool:
         """Returns whether the recorder that wrote this is likely to be running still.

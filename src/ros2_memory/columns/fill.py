@@ -223,7 +223,8 @@ class Filling:
             keys = self.store.beginning_before(before)
             if not self.store.delete([key.path for key in keys]):
                 break
-            self._trimmed = {**self._trimmed, **dict.fromkeys(keys, self._clock.now())}
+            still = {key: at for key, at in self._trimmed.items() if self._is_refused(key)}
+            self._trimmed = {**still, **dict.fromkeys(keys, self._clock.now())}
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.give_back()
 

@@ -83,7 +83,7 @@ def delete_catalogue(file: Path) -> None:
 
 
 def _is_catalogue(file: Path) -> bool:
-    """Returns whether a database has the tables of a catalogue of digests, or is none any more."""
+    """Returns whether a file is a catalogue of digests, by its tables, or a damaged database."""
     address = f"{file.absolute().as_uri()}?mode=rw"
     try:
         with closing(sqlite3.connect(address, uri=True, timeout=PATIENCE_S)) as base:

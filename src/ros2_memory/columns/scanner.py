@@ -103,7 +103,7 @@ class Scanner:
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
-        clock_steps: by suspected hole and the bags beside it, the steps of the clock in it.
+        clock_steps: by pause and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
         things: by settings, what was estimated of all bags of a timeline.

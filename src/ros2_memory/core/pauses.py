@@ -18,7 +18,7 @@ Pauses: TypeAlias = "tuple[tuple[Ns, Ns], ...]"
 
 SHORTEST_PAUSE_NS: Final[Ns] = NS_PER_S // 2
 _PERIODS: Final = 1.5
-"""Half of what a gap takes: a bag with long ones makes its topics seem slower than they are."""
+"""Half of those of a gap: in a bag with long pauses the mean period is longer than the usual."""
 _MOST: Final = 64
 """The longest pauses of a bag are stated."""
 

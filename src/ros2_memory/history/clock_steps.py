@@ -50,7 +50,7 @@ _MOST_STAMPED: Final = 8
 """Topics of which header stamps are looked at."""
 _STAMP: Final = "header.stamp"
 _STEPS_BYTES: Final = 1_000
-"""About how much memory takes what a hole is."""
+"""About how much memory the steps of a pause take."""
 
 
 def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep, ...]:
@@ -65,9 +65,7 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
 
 
 def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
-    """Returns those gaps, of a snapshot and in order, that are no step of the clock."""
-    if not gaps:
-        return gaps
+    """Returns those gaps, of which there is one at least, in order, that are no clock step."""
     try:
         steps = {
             at for at, by in _steps_around(view, TimeWindow(gaps[0][0], gaps[-1][1])) if by > 0

@@ -371,8 +371,8 @@ class Notes:
             # A sentence on the bag's summary may report the same already.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
-        # In which order bags are found damaged depends on what is stored: sorted, the sentences
-        # are the same whatever is.
+        # The order in which damaged bags are found depends on which bags are stored, and the reply
+        # must not: so these sentences are sorted.
         shared = iter(sorted(kind.sentence(files) for kind, files in by_kind.items()))
         return tuple(
             each if isinstance(each, str) else next(shared)

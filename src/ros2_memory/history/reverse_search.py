@@ -1,8 +1,7 @@
 """Search backwards in time for the last message that meets a condition.
 
-Zones and words of columns rule out what cannot match, and so do a lake's words of whole bags. Only
-the time of what is left is searched; inside of it everything that can decide which messages count
-is read.
+Zones and words of columns rule out bags and parts, and so do a lake's words of bags. The times of
+the others are searched, with every message there that decides which ones count.
 """
 
 from __future__ import annotations

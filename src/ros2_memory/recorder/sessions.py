@@ -216,7 +216,7 @@ class RecordingSessions:
         splits = session.splits
         if splits.received - OWN_TOPICS:
             return True
-        # Of what else it writes, some may be of nodes of its own user, as /rosout always is.
+        # Other bytes may come from nodes of the recorder's own user, as those of /rosout do.
         others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
         if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
             return False

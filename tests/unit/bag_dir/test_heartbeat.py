@@ -6,7 +6,7 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 import pytest
@@ -224,6 +224,22 @@ def test_a_value_of_the_wrong_kind_is_named(tmp_path: Path, key: str, value: obj
 
 def test_keys_of_another_version_are_passed_over(tmp_path: Path) -> None:
     assert _read_with(tmp_path, "mood", "fine") is None
+
+
+def test_every_text_is_one_that_utf_8_can_hold(tmp_path: Path) -> None:
+    write_heartbeat(tmp_path, BEAT)
+    content = json.loads((tmp_path / HEARTBEAT_FILE).read_text())
+    texts = {each.name for each in fields(BEAT) if "_Text" in str(each.type)}
+    lists = {each for each in texts if isinstance(content[each], list)}
+    assert {"last_error", "advice"} < texts - lists
+    assert {"recordings", "unheard"} < lists
+    content |= dict.fromkeys(texts, "\ud800") | dict.fromkeys(lists, ["\ud800"]) | {"lost": {}}
+    (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
+    beat = read_heartbeat(tmp_path).heartbeat
+    assert beat is not None
+    told = json.dumps(asdict(beat), ensure_ascii=False)
+    assert told.encode().count(rb"\\ud800") == len(texts) - 1  # "lost" is empty
+    assert not any("str" in str(each.type) for each in fields(BEAT))
 
 
 @given(
