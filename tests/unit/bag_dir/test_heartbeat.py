@@ -233,7 +233,8 @@ def test_every_text_is_one_that_utf_8_can_hold(tmp_path: Path) -> None:
     lists = {each for each in texts if isinstance(content[each], list)}
     assert {"last_error", "advice"} < texts - lists
     assert {"recordings", "unheard"} < lists
-    content |= dict.fromkeys(texts, "\ud800") | dict.fromkeys(lists, ["\ud800"]) | {"lost": {}}
+    half = "\ud800"
+    content |= {name: [half] if name in lists else half for name in texts} | {"lost": {}}
     (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
     beat = read_heartbeat(tmp_path).heartbeat
     assert beat is not None
