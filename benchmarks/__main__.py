@@ -1,6 +1,7 @@
 """`python -m benchmarks`: draws a world by a seed, fills its memory, asks it, prints one table.
 
-The seed is the hash of the commit that is measured, so that nobody can tune for its world.
+The seed is the hash of the commit that is measured, so that nobody can tune for its world. With
+`--recorder` it measures the recorder's daemon instead.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
-from benchmarks import plain, report, timing, worlds
+from benchmarks import plain, recorder, report, timing, worlds
 from benchmarks.bags import Topic
 from benchmarks.questions import questions
 from benchmarks.report import Line, milliseconds
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from benchmarks.questions import Question
-    from benchmarks.timing import Asked, Filled
+    from benchmarks.timing import Asked, Ran
     from ros2_memory.core.model import JsonValue
 
 _DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks"
@@ -29,6 +30,8 @@ _DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks"
 def main(argv: Sequence[str] | None = None) -> int:
     """Prints the table; the exit code is 0 whatever was measured, 1 where there is no world."""
     given = _parser().parse_args(argv)
+    if given.recorder:
+        return _recorder(given.dir / "recorder", given.bags, given.setup)
     size = given.days if given.world == worlds.HOME else given.bags
     seed = int((given.seed or report.commit()).split()[0][:16], 16)
     try:
@@ -58,6 +61,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _recorder(folder: Path, bags: int, setup: Path | None) -> int:
+    print(report.head(f"{bags:,} bags of the recorder's own"), flush=True)
+    peak_mb, resident_mb = recorder.measured(folder, bags, setup)
+    memory = f"{peak_mb:.0f} / {resident_mb:.0f} MB"
+    print(report.row(Line("memory of the daemon: peak / resident", memory)))
+    return 0
+
+
 def _measured(
     place: Path,
     facts: dict[str, JsonValue],
@@ -68,12 +79,16 @@ def _measured(
 ) -> Iterator[Line]:
     if fills:
         bags, size = cast("int", facts["bags"]), cast("int", facts["bytes"])
-        yield from _filling(timing.filled(place), "fill", bags, size)
+        yield from _filling(place, timing.filled(place), "fill", bags, size)
         if facts.get("lake"):
-            yield from _filling(timing.shipped(place), "ship", bags, size)
+            yield from _filling(place, timing.shipped(place), "ship", bags, size)
     # A robot of a fleet alone could be asked as plain rosbags are.
     alone = "topics" in facts and "robots" not in facts
     bags_of_it = plain.bags_of(place) if yardsticks and alone else []
+    if asked:
+        ran = timing.first_answer(place, asked[0])
+        both = f"{ran.seconds:.2f} s, {ran.elapsed_s:.2f} s by the clock"
+        yield Line("start to first answer, a process", both)
     timing.imported(place, asked)
     starts = []
     for question in asked:
@@ -87,9 +102,10 @@ def _measured(
     yield Line("resident after them / peak", f"{ours.resident_mb:.0f} / {ours.peak_mb:.0f} MB")
 
 
-def _filling(filled: Filled, words: str, bags: int, size: int) -> Iterator[Line]:
+def _filling(place: Path, filled: Ran, words: str, bags: int, size: int) -> Iterator[Line]:
     yield Line(f"{words}, for each bag", milliseconds(filled.seconds * 1e3 / bags))
-    share = f"{filled.stored / bags / 1e3:.2f} kB ({filled.stored / size:.1%} of the bags)"
+    stored = timing.stored(place)
+    share = f"{stored / bags / 1e3:.2f} kB ({stored / size:.1%} of the bags)"
     yield Line("stored, for each bag", share)
     yield Line(f"peak memory of {words}", f"{filled.peak_mb:.0f} MB")
 
@@ -113,6 +129,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--bags", type=int, default=2_000, help="of splits")
     parser.add_argument("--robots", type=int, help="a fleet, each with a third of the recordings")
     parser.add_argument("--lake", action="store_true", help="the fleet's bags are in a lake")
+    parser.add_argument("--recorder", action="store_true", help="the daemon, over --bags")
+    parser.add_argument("--setup", type=Path, help="with --recorder: setup file of a real ros2")
     parser.add_argument("--seed", metavar="HEX", help="default: the commit's hash")
     parser.add_argument("--only", default="", metavar="TEXT", help="only questions named so")
     parser.add_argument("--keep", action="store_true", help="ask what is stored, fill nothing")

@@ -106,14 +106,15 @@ def _count(bag: Bag, scan: Scan) -> int:
 
 def floor(bags: Sequence[Bag], topic: Topic, at: int) -> float:
     """Returns the processor time (s) of reading and decoding the one message that answers."""
-    bag = next((bag for bag in reversed(bags) if bag.start <= at <= bag.stop), bags[-1])
-    with bag.path.open("rb") as stream:
-        summary = make_reader(stream).get_summary()
-        found = list(make_reader(stream).iter_messages([topic.name], ending_at=at))
-    if summary is None or not found:
-        raise ValueError(
-            f"{bag.path.name} has no message of {topic.name} before the time asked for"
-        )
+    # The robot may have begun a bag at this moment, so its last message is in the one before.
+    for bag in (bag for bag in reversed(bags) if bag.start <= at):
+        with bag.path.open("rb") as stream:
+            summary = make_reader(stream).get_summary()
+            found = list(make_reader(stream).iter_messages([topic.name], ending_at=at))
+        if summary is not None and found:
+            break
+    else:
+        raise ValueError(f"no bag has a message of {topic.name} before the time asked for")
     _, channel, message = found[-1]
     index = next(
         each

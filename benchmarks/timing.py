@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 from benchmarks.worlds import STRANGERS
-from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory
+from ros2_memory.bootstrap import build_dispatcher, build_memory
 from ros2_memory.bootstrap_fleet import build_fleet
-from ros2_memory.cli.maintenance.index import fill_store
+from ros2_memory.cli.options import EXIT_NEGATIVE
 from ros2_memory.config import load_settings
 from ros2_memory.core.logging_setup import configure_logging
 
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from benchmarks.questions import Question
     from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Memory
     from ros2_memory.serving.dispatch import Dispatcher
 
 _FORKED: Final = multiprocessing.get_context("fork")  # imports are not counted
@@ -44,12 +43,12 @@ _NOW: Final = re.compile(r".*ago_s|.*age_s|now.*|there_now|notes")
 _COUNTS: Final = ("total", "at_least", "count", "distance_m", "mean", "visits", "things")
 
 
-class Filled(NamedTuple):
-    """What indexing took: processor seconds of all its processes, MB of the largest, bytes."""
+class Ran(NamedTuple):
+    """What a command took: processor seconds of all its processes, by the clock, MB at its peak."""
 
     seconds: float
+    elapsed_s: float
     peak_mb: float
-    stored: int
 
 
 class Asked(NamedTuple):
@@ -99,7 +98,7 @@ def settings_of(place: Path) -> Settings:
     return load_settings(overrides(place), env={})
 
 
-def filled(place: Path) -> Filled:
+def filled(place: Path) -> Ran:
     """Indexes a world anew, as `ros2-memory index` does.
 
     Raises:
@@ -109,7 +108,17 @@ def filled(place: Path) -> Filled:
     return _command(place, "index", "--json", *overrides(place))
 
 
-def shipped(place: Path) -> Filled:
+def first_answer(place: Path, question: Question) -> Ran:
+    """Starts a program that answers one question and ends: Python, imports, all bags, the answer.
+
+    Raises:
+        subprocess.CalledProcessError: the command failed.
+    """
+    arguments = json.dumps(dict(question.arguments))
+    return _command(place, "ask", "--json", question.tool, arguments, *overrides(place))
+
+
+def shipped(place: Path) -> Ran:
     """Ships a fleet's bags into a lake, made anew, and takes them away from the robots.
 
     Raises:
@@ -123,27 +132,23 @@ def shipped(place: Path) -> Filled:
     return done
 
 
-def _command(place: Path, *words: str) -> Filled:
+def _command(place: Path, *words: str) -> Ran:
     program = [sys.executable, "-m", "ros2_memory.cli", *words]
     environment = os.environ | {"XDG_CACHE_HOME": str(place / "store"), "TZ": "UTC"}
+    begun = time.monotonic()
     with subprocess.Popen(program, env=environment, stdout=subprocess.DEVNULL) as child:
         _, status, used = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
+    elapsed_s = time.monotonic() - begun
+    if child.returncode not in {0, EXIT_NEGATIVE}:  # no data is an answer
         raise subprocess.CalledProcessError(child.returncode, program)
-    peak_mb = used.ru_maxrss * 1024 / 1e6
-    return Filled(used.ru_utime + used.ru_stime, peak_mb, stored(place))
+    return Ran(used.ru_utime + used.ru_stime, elapsed_s, used.ru_maxrss * 1024 / 1e6)
 
 
 def stored(place: Path) -> int:
     """Returns the bytes that the store of a world takes."""
     folders = (place / "store", place / "lake")
     return sum(path.stat().st_size for one in folders for path in one.rglob("*") if path.is_file())
-
-
-def made_known(memory: Memory, settings: Settings) -> None:
-    """Has a memory know every bag, as `ros2-memory index` does, in this process."""
-    fill_store(build_backfill(settings, memory))
 
 
 def asked(place: Path, question: Question) -> Asked:

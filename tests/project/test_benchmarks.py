@@ -108,13 +108,14 @@ def test_the_command_fills_asks_and_prints_one_table(
         "fill, for each bag",
         "stored, for each bag",
         "peak memory of fill",
+        "start to first answer, a process",
         "position at a time",
         "start: look at all bags",
         "all questions in one server",
         "resident after them / peak",
     ]
     assert all(line["figure"] in printed for line in lines)
-    position = lines[3]
+    position = lines[4]
     assert position["plain"].endswith("ms")
     assert position["floor"].endswith("ms")
     assert not position["trouble"]

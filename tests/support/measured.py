@@ -43,7 +43,7 @@ UNMEASURED: Final = (
     "test_deep_directories.py",
     "test_documents.py",
     "test_forget_messages.py::test_whatever_was_done",
-    "test_home_*.py",
+    "home/*.py",
     "test_hostile_*.py",
     "test_instances.py::test_nearly_every_label",
     "test_*_real_bags.py",

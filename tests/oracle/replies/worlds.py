@@ -13,11 +13,11 @@ from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
-from benchmarks.home import recording as home
-from benchmarks.home.days import Scale
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
+from tests.home import recording as home
+from tests.home.days import Scale
 from tests.oracle import worlds as odd
 from tests.oracle.replies.robot_day import FULL, SHORT, write_robot_day
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, write_mcap

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from benchmarks.home.flat import HALL_X, ROOMS
-from benchmarks.home.paths import Knots, Path, finished
-from benchmarks.home.things import DAY, HOUR
+from tests.home.flat import HALL_X, ROOMS
+from tests.home.paths import Knots, Path, finished
+from tests.home.things import DAY, HOUR
 
 if TYPE_CHECKING:
-    from benchmarks.home.days import Scale
+    from tests.home.days import Scale
 
 
 class Person(NamedTuple):

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import pytest
-from benchmarks.home.__main__ import made
-from benchmarks.home.days import CLOCK_STEP_S, Scale
-from benchmarks.home.truth import truth_of
 
+from tests.home.days import CLOCK_STEP_S, Scale
+from tests.home.truth import truth_of
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of
 
@@ -22,9 +21,9 @@ SCALE = Scale()
 
 
 def test_the_blind_time_and_the_step_of_the_clock_are_all_that_is_reported(
-    worlds: Path,
+    home: Path,
 ) -> None:
-    bags, truth = made(SCALE, worlds) / "bags", truth_of(SCALE)
+    bags, truth = home / "bags", truth_of(SCALE)
     memory = memory_of(bags, clock=SettableClock(round(truth.recorded[-1][1] + 60) * S))
     reply = asked(memory, bags, "data_time_range")
     [silence], [step] = reply["silences"], reply["clock_steps"]

@@ -6,20 +6,20 @@ from functools import cache, partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-
 from benchmarks import payloads
-from benchmarks.home import camera, days
-from benchmarks.home.drift import AHEAD_S
-from benchmarks.home.world import VISION, Beats, Recording, Stream, World
 from benchmarks.motion import Motion
+
+from tests.home import camera, days
+from tests.home.drift import AHEAD_S
+from tests.home.world import VISION, Beats, Recording, Stream, World
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from benchmarks.motion import Floats
     from numpy.typing import NDArray
 
-    from benchmarks.home.camera import Detected
-    from benchmarks.motion import Floats
+    from tests.home.camera import Detected
 
 OPTICAL: Final = "camera_optical_frame"
 """The frame of the detections: z ahead, x right, y down."""

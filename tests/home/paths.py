@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home.flat import way
+from tests.home.flat import way
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from benchmarks.motion import Floats
+    from numpy.typing import NDArray
 
 SPEED: Final = 0.4
 TURNING: Final = 0.9

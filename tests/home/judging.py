@@ -31,11 +31,7 @@ class Expected(Protocol):
         ...
 
     def as_json(self) -> dict[str, JsonValue]:
-        """Returns it as `questions.json` has it."""
-        ...
-
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
+        """Returns it in plain values."""
         ...
 
 
@@ -56,10 +52,6 @@ class Number:
         """Returns `number` and `within`."""
         return {"number": round(self.value, 3), "within": round(self.within, 3)}
 
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return "number"
-
 
 @dataclass(frozen=True, slots=True)
 class Time:
@@ -76,10 +68,6 @@ class Time:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `earliest` and `latest`."""
         return {"earliest": round(self.earliest, 3), "latest": round(self.latest, 3)}
-
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return "time: Unix seconds or ISO 8601"
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,10 +96,6 @@ class Words:
         """Returns `any_of` and `none_of`."""
         return {"any_of": [*self.any_of], "none_of": [*self.none_of]}
 
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return 'a short word, or "none"' if self.or_none else "text"
-
 
 @dataclass(frozen=True, slots=True)
 class YesNo:
@@ -126,10 +110,6 @@ class YesNo:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `is`."""
         return {"is": self.value}
-
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return "true or false"
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,10 +129,6 @@ class Names:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `all_of` and `maybe`."""
         return {"all_of": [*sorted(self.all_of)], "maybe": [*sorted(self.maybe)]}
-
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return "list of names"
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,11 +151,6 @@ class Series:
         """Returns `series`."""
         return {"series": {name: each.as_json() for name, each in self.values.items()}}
 
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        names, values = [*self.values], [*self.values.values()]
-        return f"object: {values[0].form()} for each name, such as {names[0]}"
-
 
 @dataclass(frozen=True, slots=True)
 class Order:
@@ -194,10 +165,6 @@ class Order:
     def as_json(self) -> dict[str, JsonValue]:
         """Returns `in_order`."""
         return {"in_order": [*self.names]}
-
-    def form(self) -> str:
-        """Returns what kind of value is asked for."""
-        return "list of names in order"
 
 
 def right(truth: Mapping[str, Expected], answer: Answer) -> bool:

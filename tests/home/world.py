@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home import camera, days, drift, things
-from benchmarks.home.paths import Pose
-from benchmarks.home.people import people
+from tests.home import camera, days, drift, things
+from tests.home.paths import Pose
+from tests.home.people import people
 
 if TYPE_CHECKING:
+    from benchmarks.motion import Floats
     from numpy.typing import NDArray
 
-    from benchmarks.home.camera import Sights
-    from benchmarks.home.days import Life, Scale
-    from benchmarks.home.drift import Drift
-    from benchmarks.home.people import Person
-    from benchmarks.home.things import Thing
-    from benchmarks.motion import Floats
+    from tests.home.camera import Sights
+    from tests.home.days import Life, Scale
+    from tests.home.drift import Drift
+    from tests.home.people import Person
+    from tests.home.things import Thing
 
 START_S: Final = 1_772_409_600
 """When the world begins: Monday, 2026-03-02, 00:00 UTC, in Unix seconds."""

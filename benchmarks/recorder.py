@@ -1,13 +1,11 @@
-"""`python -m benchmarks.recorder_memory`: the memory of the recorder's daemon with a week of bags.
+"""The memory of the recorder's daemon with a week of bags.
 
-The daemon itself, over 60,480 bags of its own that fill its budget, so that each split that closes
-has it delete the oldest. It supervises the real `ros2 bag record` where `--setup` names its setup
-file, else the tests' stand-in for it; the memory of that child is not counted.
+The daemon itself, over bags of its own that fill its budget, so that each split that closes has it
+delete the oldest. The memory of its child, `ros2 bag record`, is not counted.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import shutil
@@ -17,55 +15,46 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from tests.support import stub_ros2
 
 from benchmarks.bags import Recording, Row, Topic
-from benchmarks.report import machine
 from benchmarks.timing import resident_mb
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import identity_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from pathlib import Path
 
-MOST_MB: Final = 150.0
-_DIR: Final = Path(__file__).resolve().parents[1] / "build" / "benchmarks" / "recorder_memory"
 _TOPICS: Final = 12
 _MESSAGES: Final = 3
 """Of each topic in a bag: the daemon's memory depends on how many topics there are, not on this."""
 _SPLIT_NS: Final = 10 * 10**9
 _SPLITS: Final = 60
 """Of a recording."""
-_WEEK: Final = 60_480
 _PASSES: Final = 3
 """Deletions that are waited for."""
 _PATIENCE_S: Final = 600.0
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Prints the peak; the exit code is 1 where it is above `MOST_MB`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks.recorder_memory", description=__doc__
-    )
-    parser.add_argument("--bags", type=int, default=_WEEK, help="splits of 10 s")
-    parser.add_argument("--setup", type=Path, help="a ROS setup file with ros2 bag record")
-    parser.add_argument("--dir", type=Path, default=_DIR, help="where the bags lie meanwhile")
-    asked = parser.parse_args(argv)
-    shutil.rmtree(asked.dir, ignore_errors=True)
-    asked.dir.mkdir(parents=True)
+def measured(folder: Path, bags: int, setup: Path | None) -> tuple[float, float]:
+    """Returns the daemon's peak and resident memory (MB) over so many bags, made in `folder`.
+
+    Args:
+        folder: is made anew, and deleted afterwards.
+        bags: splits of 10 s.
+        setup: the setup file of a `ros2 bag record`; without it the tests' stand-in is run.
+
+    Raises:
+        RuntimeError: the daemon ended, or deletes nothing.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     try:
-        size = _make_week(asked.dir / "bags", asked.bags)
-        print(
-            f"{asked.bags} bags of {_TOPICS} topics, {size / 1e6:.0f} MB\n{machine()}", flush=True
-        )
-        peak = _peak_mb(asked.dir, size, asked.setup)
+        return _peak_mb(folder, _make_week(folder / "bags", bags), setup)
     finally:
-        shutil.rmtree(asked.dir, ignore_errors=True)
-    print("ok" if peak <= MOST_MB else f"MISSED: at most {MOST_MB:g} MB")
-    return int(peak > MOST_MB)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _make_week(bag_dir: Path, bags: int) -> int:
@@ -102,7 +91,7 @@ def _rows(start: int, *, with_latched: bool) -> list[Row]:
     return sorted(rows)
 
 
-def _peak_mb(folder: Path, size: int, setup: Path | None) -> float:
+def _peak_mb(folder: Path, size: int, setup: Path | None) -> tuple[float, float]:
     topics = folder / "topics.yaml"
     topics.write_text("topics: [/odom, /tf]\n", encoding="utf-8")
     programs = folder / "bin"
@@ -126,13 +115,11 @@ def _peak_mb(folder: Path, size: int, setup: Path | None) -> float:
         process = subprocess.Popen(argv, env=environment, stderr=stream, stdin=subprocess.DEVNULL)
         try:
             _await_deletions(process, log)
-            figures = [resident_mb(each, str(process.pid)) for each in ("VmRSS", "VmHWM")]
+            own = str(process.pid)
+            return resident_mb("VmHWM", own), resident_mb("VmRSS", own)
         finally:
             process.send_signal(signal.SIGTERM)
             process.wait(timeout=60)
-    resident, peak = figures
-    print(f"recorder daemon: peak {peak:.0f} MB, resident {resident:.0f} MB")
-    return peak
 
 
 def _await_deletions(process: subprocess.Popen[bytes], log: Path) -> None:
@@ -152,7 +139,3 @@ def _await_deletions(process: subprocess.Popen[bytes], log: Path) -> None:
                 return
         time.sleep(0.5)
     raise RuntimeError(f"the recorder did not delete {_PASSES} times:\n{log.read_text()[-2000:]}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home.days import SLIP_M
-from benchmarks.home.paths import Pose
+from tests.home.days import SLIP_M
+from tests.home.paths import Pose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from benchmarks.motion import Floats
     from numpy.typing import NDArray
 
-    from benchmarks.home.days import Life, Scale
-    from benchmarks.motion import Floats
+    from tests.home.days import Life, Scale
 
 _STEP_S: Final = 1.0
 _DRIFT_M: Final = 0.006

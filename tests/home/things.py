@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from benchmarks.home.flat import room_at
+from tests.home.flat import room_at
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

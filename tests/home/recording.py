@@ -15,10 +15,11 @@ from textwrap import indent
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
+import yaml
+from benchmarks.bags import QOS, definition
 from mcap.writer import CompressionType, Writer
 
-from benchmarks.bags import QOS, definition
-from benchmarks.home.messages import (
+from tests.home.messages import (
     TF_STATIC,
     TRANSIENT_LOCAL,
     TYPES,
@@ -26,14 +27,16 @@ from benchmarks.home.messages import (
     fixed_frames,
     records,
 )
-from benchmarks.home.world import world_of
+from tests.home.things import LABELS
+from tests.home.truth import places
+from tests.home.world import world_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from benchmarks.home.days import Scale
-    from benchmarks.home.world import Recording, World
+    from tests.home.days import Scale
+    from tests.home.world import Recording, World
 
 _CHUNK_BYTES: Final = 16 * 1024
 _LEFT: Final = 0.6
@@ -52,8 +55,17 @@ class _Split(NamedTuple):
         return self.counts.total()
 
 
-def write(scale: Scale, folder: Path, *, jobs: int | None = None) -> int:
-    """Writes all recordings into `folder`, which must be empty or absent; returns their number.
+def write_world(scale: Scale, folder: Path) -> None:
+    """Writes bags, and the places and labels that a user would have named, into `folder`."""
+    write(scale, folder / "bags")
+    named = {"places": places(), "labels": {label: [*also] for label, also in LABELS.items()}}
+    for kind, content in named.items():
+        text = yaml.safe_dump({kind: content}, sort_keys=False, default_flow_style=None)
+        (folder / f"{kind}.yaml").write_text(text, encoding="utf-8")
+
+
+def write(scale: Scale, folder: Path) -> None:
+    """Writes all recordings into `folder`, which must be empty or absent.
 
     Raises:
         FileExistsError: a recording lies there already.
@@ -66,10 +78,9 @@ def write(scale: Scale, folder: Path, *, jobs: int | None = None) -> int:
         for number in numbers:
             record(number)
     else:
-        with ProcessPoolExecutor(jobs) as workers:
+        with ProcessPoolExecutor() as workers:
             for _ in workers.map(record, numbers, chunksize=8):
                 pass
-    return len(numbers)
 
 
 def _record(scale: Scale, folder: Path, number: int) -> None:

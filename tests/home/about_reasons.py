@@ -5,19 +5,19 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Final
 
-from benchmarks.home import replies
-from benchmarks.home.days import CLOCK_STEP_S
-from benchmarks.home.judging import Number, Time, Words, YesNo
-from benchmarks.home.questions import Question, ask, in_words
-from benchmarks.home.world import VISION
+from tests.home import replies
+from tests.home.days import CLOCK_STEP_S
+from tests.home.judging import Number, Time, Words, YesNo
+from tests.home.questions import Question, ask, in_words
+from tests.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from benchmarks.home.judging import Answer
-    from benchmarks.home.questions import Asked
-    from benchmarks.home.replies import Row
-    from benchmarks.home.truth import Standstill
+    from tests.home.judging import Answer
+    from tests.home.questions import Asked
+    from tests.home.replies import Row
+    from tests.home.truth import Standstill
 
 _REASONS: Final = {
     "blocked": ("block", "abort", "no way", "no path", "failed to create plan"),

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home.flat import clear_lines
-from benchmarks.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS
+from tests.home.flat import clear_lines
+from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from benchmarks.motion import Floats
     from numpy.typing import NDArray
 
-    from benchmarks.home.paths import Pose
-    from benchmarks.home.people import Person
-    from benchmarks.home.things import Thing
-    from benchmarks.motion import Floats
+    from tests.home.paths import Pose
+    from tests.home.people import Person
+    from tests.home.things import Thing
 
 CAMERA: Final = (0.15, 0.0, 0.40)
 """The camera's position (m) in `base_link`; it looks straight ahead."""

@@ -13,9 +13,8 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from benchmarks.motion import Floats
+    from numpy.typing import NDArray
 
 
 class Room(NamedTuple):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, TypeAlias
 
-from benchmarks.home.judging import unix_of
+from tests.home.judging import unix_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -5,24 +5,24 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from benchmarks.home import replies
-from benchmarks.home.camera import PERSON
-from benchmarks.home.flat import FRONT_DOOR
-from benchmarks.home.instances import point_of
-from benchmarks.home.judging import Names, Number, Order, Time, Words, YesNo
-from benchmarks.home.questions import Question, ask
-from benchmarks.home.things import NEVER_SEEN
-from benchmarks.home.world import VISION
+from tests.home import replies
+from tests.home.camera import PERSON
+from tests.home.flat import FRONT_DOOR
+from tests.home.instances import point_of
+from tests.home.judging import Names, Number, Order, Time, Words, YesNo
+from tests.home.questions import Question, ask
+from tests.home.things import NEVER_SEEN
+from tests.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from benchmarks.home.judging import Answer, Expected
-    from benchmarks.home.questions import Asked
-    from benchmarks.home.replies import Row
-    from benchmarks.home.things import Place
-    from benchmarks.home.truth import PlaceOfThing, ThingTruth
     from ros2_memory.core.model import JsonValue
+    from tests.home.judging import Answer, Expected
+    from tests.home.questions import Asked
+    from tests.home.replies import Row
+    from tests.home.things import Place
+    from tests.home.truth import PlaceOfThing, ThingTruth
 
 _WITHIN_M: Final = 0.4
 _PEOPLE: Final = frozenset({PERSON})

@@ -13,18 +13,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from benchmarks.home.days import CLOCK_STEP_S
-from benchmarks.home.judging import Answer, Expected, Time
-from benchmarks.home.replies import Row
-from benchmarks.home.things import DAY
-from benchmarks.home.truth import truth_of
-from benchmarks.home.world import START_S, world_of
+from tests.home.days import CLOCK_STEP_S
+from tests.home.judging import Answer, Expected, Time
+from tests.home.replies import Row
+from tests.home.things import DAY
+from tests.home.truth import truth_of
+from tests.home.world import START_S, world_of
 
 if TYPE_CHECKING:
-    from benchmarks.home.days import Scale
-    from benchmarks.home.truth import PlaceOfThing, ThingTruth, Truth
-    from benchmarks.home.world import World
     from ros2_memory.core.model import JsonValue
+    from tests.home.days import Scale
+    from tests.home.truth import PlaceOfThing, ThingTruth, Truth
+    from tests.home.world import World
 
 KINDS: Final = ("spatial", "temporal", "counting", "change", "routine", "why", "reliability")
 Reader: TypeAlias = Callable[[Sequence[Row]], Answer]
@@ -47,17 +47,6 @@ class Question:
     truth: Mapping[str, Expected]
     calls: tuple[ToolCall, ...]
     read: Reader
-
-    def as_json(self) -> dict[str, JsonValue]:
-        """Returns it as `questions.json` has it."""
-        return {
-            "id": self.id,
-            "kind": self.kind,
-            "text": self.text,
-            "answer": {name: expected.form() for name, expected in self.truth.items()},
-            "truth": {name: expected.as_json() for name, expected in self.truth.items()},
-            "calls": [{"tool": call.tool, "arguments": {**call.arguments}} for call in self.calls],
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +129,7 @@ def questions(scale: Scale) -> list[Question]:
     if scale.days < 2:
         raise ValueError("the questions need 2 days or more")
     # Their makers import this module.
-    from benchmarks.home import about_places, about_reasons, about_things  # noqa: PLC0415
+    from tests.home import about_places, about_reasons, about_things  # noqa: PLC0415
 
     asked = Asked(world_of(scale), truth_of(scale))
     found = [

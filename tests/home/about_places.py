@@ -7,20 +7,20 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from benchmarks.home import messages, replies
-from benchmarks.home.flat import HALL, ROOMS, room_at
-from benchmarks.home.judging import Number, Series, Time, Words
-from benchmarks.home.questions import Question, ToolCall, ask, in_words
-from benchmarks.home.things import DAY
+from tests.home import messages, replies
+from tests.home.flat import HALL, ROOMS, room_at
+from tests.home.judging import Number, Series, Time, Words
+from tests.home.questions import Question, ToolCall, ask, in_words
+from tests.home.things import DAY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from benchmarks.home.judging import Answer, Expected
-    from benchmarks.home.questions import Asked
-    from benchmarks.home.replies import Row
-    from benchmarks.home.truth import Span
     from ros2_memory.core.model import JsonValue
+    from tests.home.judging import Answer, Expected
+    from tests.home.questions import Asked
+    from tests.home.replies import Row
+    from tests.home.truth import Span
 
 _BATTERY: Final = messages.BATTERY.topic
 _OFF_DOCK: Final[dict[str, JsonValue]] = {

@@ -8,26 +8,27 @@ the detector ran and the recorder as well; `detected` adds the detector's own lu
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from benchmarks.home import flat
-from benchmarks.home.days import CLOCK_STEP_S
-from benchmarks.home.things import DAY
-from benchmarks.home.world import START_S, world_of
+from tests.home import flat
+from tests.home.days import CLOCK_STEP_S
+from tests.home.things import DAY
+from tests.home.world import START_S, world_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from benchmarks.home.days import Scale
-    from benchmarks.home.things import Place, Thing
-    from benchmarks.home.world import World
     from benchmarks.motion import Floats
+
     from ros2_memory.core.model import JsonValue
+    from tests.home.days import Scale
+    from tests.home.things import Place, Thing
+    from tests.home.world import World
 
 Span: TypeAlias = tuple[float, float]
 VIEW_GAP_S: Final = 5.0
@@ -132,10 +133,6 @@ class Truth:
     def of(self, label: str) -> list[ThingTruth]:
         """Returns the things of a label."""
         return [thing for thing in self.things if thing.label == label]
-
-    def as_json(self) -> JsonValue:
-        """Returns it as plain values."""
-        return _plain(asdict(self))
 
 
 @cache
@@ -336,17 +333,3 @@ def _standstills(world: World, recorded: Sequence[Span]) -> tuple[Standstill, ..
                 span = world.clock_at(begin), world.clock_at(end)
                 found.append(Standstill(*span, x, y, room, reason))
     return tuple(found)
-
-
-def _plain(value: object) -> JsonValue:
-    if isinstance(value, dict):
-        return {str(name): _plain(each) for name, each in value.items()}
-    if hasattr(value, "_asdict"):
-        return _plain(value._asdict())
-    if isinstance(value, list | tuple):
-        return [_plain(each) for each in value]
-    if isinstance(value, float):
-        return round(value, 4)
-    if value is None or isinstance(value, int | str):
-        return value
-    raise TypeError(f"{value!r} is no plain value")

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from benchmarks.home.flat import DOCK, HALL_X, SPOTS, Spot, way
-from benchmarks.home.paths import Knots, Path, finished
-from benchmarks.home.things import DAY, HOUR
+from tests.home.flat import DOCK, HALL_X, SPOTS, Spot, way
+from tests.home.paths import Knots, Path, finished
+from tests.home.things import DAY, HOUR
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -10,24 +10,23 @@ import asyncio
 import json
 import math
 from dataclasses import dataclass, field
-from statistics import median
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from benchmarks.home import replies
-from benchmarks.home.camera import in_view
-from benchmarks.home.paths import Pose
-from benchmarks.home.world import VISION
+from tests.home import replies
+from tests.home.camera import in_view
+from tests.home.paths import Pose
+from tests.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from benchmarks.home.replies import Row
-    from benchmarks.home.things import Place
-    from benchmarks.home.truth import PlaceOfThing, ThingTruth, Truth
-    from benchmarks.home.world import World
     from ros2_memory.serving.mcp_server import EpisodicServer
+    from tests.home.replies import Row
+    from tests.home.things import Place
+    from tests.home.truth import PlaceOfThing, ThingTruth, Truth
+    from tests.home.world import World
 
 _SAME_M: Final = 0.7
 """A place that is reported so near to a true one is that one: half of the way to another."""
@@ -50,34 +49,16 @@ class Measures:
     switches: list[str] = field(default_factory=list)
     denied: list[str] = field(default_factory=list)
 
-    def lines(self) -> list[str]:
-        """Returns them in words."""
-        share = len(self.switches) / self.sightings if self.sightings else 0.0
-        away = f"{median(self.away_m):.2f} m median, {max(self.away_m):.2f} m at most"
-        return [
-            f"labels with the right number of instances: {self.right_labels} of {self.labels}"
-            + _listed(self.wrong_numbers),
-            f"places away from the truth: {away if self.away_m else 'none'}",
-            f"moves known within one split: {self.moves_in_time} of {self.moves}"
-            + _listed(self.late_moves),
-            f"places where a thing never stood: {len(self.switches)}, {share:.1%} of "
-            f"{self.sightings} sightings" + _listed(self.switches),
-            f"denied where the thing does stand: {len(self.denied)}" + _listed(self.denied),
-        ]
 
-
-def measured(server: EpisodicServer, truth: Truth, split_s: float) -> Measures | None:
-    """Returns the measures; None while no tool, or another one, answers `find_things`."""
+def measured(server: EpisodicServer, truth: Truth, split_s: float) -> Measures:
+    """Returns the measures."""
     found = Measures()
-    try:
-        for label in sorted({thing.label for thing in truth.things}):
-            things = [thing for thing in truth.of(label) if thing.known()]
-            if not things:
-                continue
-            reply = asyncio.run(server.dispatcher.answer("find_things", {"label": label})).text
-            _compare(found, label, things, replies.things(json.loads(reply)), split_s)
-    except replies.UnreadableError:
-        return None
+    for label in sorted({thing.label for thing in truth.things}):
+        things = [thing for thing in truth.of(label) if thing.known()]
+        if not things:
+            continue
+        reply = asyncio.run(server.dispatcher.answer("find_things", {"label": label})).text
+        _compare(found, label, things, replies.things(json.loads(reply)), split_s)
     return found
 
 
@@ -90,14 +71,6 @@ class Denials:
     """Since the thing was seen last, its place was in view in fewer than two messages."""
     false: list[str] = field(default_factory=list)
     """The thing stood there all the time."""
-
-    def lines(self) -> list[str]:
-        """Returns them in words."""
-        return [
-            f"denied as of the end of each recorded time: {self.count}",
-            f"denied where nobody looked: {len(self.unseen)}{_listed(self.unseen)}",
-            f"denied although it stood there: {len(self.false)}{_listed(self.false)}",
-        ]
 
 
 def denials(server: EpisodicServer, world: World, truth: Truth) -> Denials:
@@ -203,7 +176,3 @@ def point_of(found: Row) -> tuple[float, float]:
 
 def _away(point: tuple[float, float], place: Place | None) -> float:
     return math.inf if place is None else math.dist(point, (place.x, place.y))
-
-
-def _listed(names: Sequence[str]) -> str:
-    return f" ({', '.join(names)})" if names else ""

@@ -8,14 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from benchmarks.home.__main__ import made, write
-from benchmarks.home.days import Scale
-from benchmarks.home.world import world_of
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
+from tests.home.days import Scale
+from tests.home.recording import write_world
+from tests.home.world import world_of
+
 if TYPE_CHECKING:
-    from benchmarks.home.world import World
+    from tests.home.world import World
 
 pytestmark = pytest.mark.xdist_group("home")
 
@@ -24,11 +25,6 @@ SCALE = Scale()
 
 def _world() -> World:
     return world_of(SCALE)
-
-
-@pytest.fixture(scope="module")
-def folder(worlds: Path) -> Path:
-    return made(SCALE, worlds)
 
 
 def _splits(folder: Path) -> list[Path]:
@@ -55,15 +51,15 @@ def test_a_world_is_the_same_each_time_and_another_for_another_seed(tmp_path: Pa
     digests = []
     for nth, scale in enumerate((day, day, Scale(days=1, seed=8))):
         world_of.cache_clear()
-        write(scale, tmp_path / str(nth))
+        write_world(scale, tmp_path / str(nth))
         digests.append(_digest(tmp_path / str(nth)))
     assert digests[0] == digests[1] != digests[2]
 
 
-def test_plain_rosbags_reads_every_closed_split_and_every_closed_recording(folder: Path) -> None:
+def test_plain_rosbags_reads_every_closed_split_and_every_closed_recording(home: Path) -> None:
     counts: Counter[str] = Counter()
     closed = {each.name for each in _world().recordings if not each.cut}
-    for path in _splits(folder):
+    for path in _splits(home):
         with path.open("rb") as stream:
             summary = make_reader(stream).get_summary()
         assert summary is not None
@@ -75,6 +71,6 @@ def test_plain_rosbags_reads_every_closed_split_and_every_closed_recording(folde
                 count = sum(1 for _ in reader.messages())
                 assert count == summary.statistics.message_count
     for name in closed:
-        with Reader(folder / "bags" / name) as reader:
+        with Reader(home / "bags" / name) as reader:
             count = sum(1 for _ in reader.messages())
             assert count == reader.message_count == counts[name] > 0
