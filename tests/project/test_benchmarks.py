@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from benchmarks import plain, questions, timing, worlds
+from benchmarks import plain, questions, worlds
 from benchmarks.__main__ import main
-from benchmarks.bags import Recording, Row, Topic
 from benchmarks.payloads import typestore
 from benchmarks.questions import NEVER
 from mcap.exceptions import McapError
@@ -71,28 +70,6 @@ def test_the_world_of_strangers_has_bags_of_several_kinds(tmp_path: Path) -> Non
     place = worlds.made(worlds.STRANGERS, SEED, 0, tmp_path)
     assert {path.suffix for path in place.rglob("*") if path.is_file()} >= {".mcap", ".db3"}
     assert questions.questions(json.loads((place / "world.json").read_bytes()), SEED)
-
-
-def test_a_recording_describes_its_earlier_splits_in_each(tmp_path: Path) -> None:
-    recording = Recording(tmp_path / "run", [Topic("/said", "std_msgs/msg/String")])
-    for start in (10, 20):
-        recording.write([Row(start, start, 0, b"\0\1\0\0\2\0\0\0x\0")])
-    recording.close()
-    with (tmp_path / "run" / "run_1.mcap").open("rb") as stream:
-        [told] = make_reader(stream).iter_metadata()
-    assert all(f"run_{nth}.mcap" in told.metadata["serialized_metadata"] for nth in (0, 1))
-
-
-def test_the_hash_of_a_reply_leaves_out_what_depends_on_now() -> None:
-    replies = [json.dumps({"total": 3, "x": 1.0, "age_s": age, "now": age}) for age in (1, 2)]
-    assert len({timing.in_short(reply) for reply in replies}) == 1
-    assert timing.in_short(replies[0])[0].startswith("total 3 ")
-    assert timing.in_short(json.dumps({"x": 2.0}))[0] != timing.in_short(json.dumps({"x": 1.0}))[0]
-
-
-def test_a_reply_that_left_something_out_is_reported_as_such() -> None:
-    assert timing.in_short(json.dumps({"notes": ["3 bags were not read"]}))[1]
-    assert not timing.in_short(json.dumps({"notes": ["by /odom"]}))[1]
 
 
 def test_the_command_fills_asks_and_prints_one_table(

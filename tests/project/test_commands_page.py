@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.cli import app
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import own_all
@@ -55,11 +54,3 @@ def test_every_command_runs(words: list[str], capsys: pytest.CaptureFixture[str]
     assert cli.main([*given, *more]) in CODES.get(given[0], {0})
     shown = capsys.readouterr()
     assert shown.out or shown.err
-
-
-def test_every_command_that_there_is_stands_there() -> None:
-    assert {
-        name
-        for name in app.COMMANDS
-        if f"ros2-memory {name}" not in PAGE and f"| `{name}` |" not in PAGE
-    } == set()

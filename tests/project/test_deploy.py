@@ -62,6 +62,21 @@ def test_a_unit_is_exposed_by_less_than_its_limit(unit: Path, limit: float) -> N
     assert exposure(unit) < limit
 
 
+@needs_analyze
+@EACH
+def test_a_unit_is_understood_by_systemd(unit: Path, tmp_path: Path) -> None:
+    copy = tmp_path / unit.name
+    # The program is not installed here, and its absence is no fault of the unit.
+    copy.write_text(re.sub(r"(?m)^(Exec\w+)=.*", r"\1=/bin/true", unit.read_text()))
+    ran = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", copy],
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    assert [line for line in ran.stderr.splitlines() if unit.name in line] == []
+
+
 @EACH
 def test_a_unit_is_ready_when_it_says_so_and_is_started_again_when_it_fails(unit: Path) -> None:
     settings = settings_of(unit)

@@ -1,4 +1,4 @@
-"""What README and the reference promise exists, and what exists is in the reference."""
+"""What documents name exists, and AGENTS.md and the package's map leave no room out."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, get_type_hints
 
 import pytest
 
+import ros2_memory
 from ros2_memory.config import Ros2BagNode, Settings
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.tools.spec_tools import build_tools
@@ -111,3 +112,30 @@ def test_every_file_that_a_document_links_to_or_names_exists(document: Path) -> 
     ]
     assert lost == []
     assert [each for each in named if not (ROOT / each).exists()] == []
+
+
+SOURCE = ROOT / "src" / "ros2_memory"
+MAPS = [
+    ROOT / "AGENTS.md",
+    *(ROOT / "docs" / name for name in ("architecture.md", "reference/specification.md")),
+]
+
+
+@pytest.mark.parametrize("document", MAPS, ids=lambda document: document.name)
+def test_every_module_that_a_map_names_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    named = re.findall(r"`([a-z_0-9/.-]+(?:/|\.py|\.toml|\.yaml))(?:::[\w:]+)?`", text)
+    elsewhere = ("moments/", "build/", "tools/mcp.yaml", "topics.yaml", "metadata.yaml")
+    paths = [each for each in named if not each.startswith((*elsewhere, "."))]
+    assert len(paths) > 15
+    assert [
+        each for each in paths if not ((SOURCE / each).exists() or (ROOT / each).exists())
+    ] == []
+
+
+def test_agents_and_the_map_of_the_package_name_every_room() -> None:
+    rooms = sorted(each.parent.name for each in SOURCE.glob("*/__init__.py"))
+    agents = (ROOT / "AGENTS.md").read_text(encoding="utf-8")
+    assert [room for room in rooms if f"`{room}/`" not in agents] == []
+    mapped = re.findall(r"^    ([a-z_]+) ", ros2_memory.__doc__ or "", re.MULTILINE)
+    assert sorted({*rooms} - {*mapped}) == []

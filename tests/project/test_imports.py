@@ -139,8 +139,3 @@ def test_the_server_imports_nothing_that_records_deletes_or_is_for_people(
     observing = {"opentelemetry.sdk", "prometheus_client", "ros2_memory.observability.prometheus"}
     absent = DELETING | RECORDING | PEOPLE | FLEET | observing | {"httpx", "jsonschema"}
     assert absent & {*there} == set()
-
-
-def test_what_tests_start_need_not_compile_what_it_imports() -> None:
-    asked = [sys.executable, "-c", "import sys; print(sys.dont_write_bytecode)"]
-    assert subprocess.check_output(asked, text=True) == "False\n"

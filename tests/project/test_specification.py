@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import yaml
 
@@ -33,10 +32,6 @@ NAMED_KEYS = {
 """The keys of section 7, with their defaults there."""
 
 
-def is_there(path: str) -> bool:
-    return any((folder / path).exists() for folder in (ROOT, ROOT / "src/ros2_memory"))
-
-
 def test_the_table_has_every_section_in_order() -> None:
     assert list(dict.fromkeys(row[0].split()[0] for row in ROWS)) == SECTIONS
     assert {len(row) for row in ROWS} == {4}
@@ -46,22 +41,6 @@ def test_each_row_says_where_it_is_and_what_tests_it() -> None:
     for section, code, tests, _ in ROWS:
         assert "`" in code or code == "the rows above", section
         assert "`tests/" in tests, section
-
-
-def test_every_path_that_the_page_names_exists() -> None:
-    named = re.findall(r"`([\w./-]+(?:\.\w+|/))(?:::[\w:]+)?`", PAGE)
-    paths = [name for name in named if "/" in name or name.endswith((".py", ".toml", ".yaml"))]
-    assert len(paths) > 60
-    assert [path for path in paths if not is_there(path) and path != "tools/mcp.yaml"] == []
-
-
-def test_every_test_that_the_page_names_exists() -> None:
-    named = re.findall(r"`(tests/[\w/]+\.py)::([\w:]+)`", PAGE)
-    assert len(named) > 20
-    for path, test in named:
-        text = Path(ROOT / path).read_text(encoding="utf-8")
-        for name in test.split("::"):
-            assert re.search(rf"^ *(async )?(def|class) {name}\b", text, re.MULTILINE), test
 
 
 def test_the_configuration_marks_the_keys_of_the_specification_with_its_defaults() -> None:
