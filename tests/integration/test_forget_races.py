@@ -98,7 +98,7 @@ def test_whoever_deletes_first_nothing_that_is_kept_or_foreign_is_lost(
     budget = size_of(robot.bag_dir / "rec_20260101T000000Z") // 2
     # Into a file: nobody reads a pipe meanwhile, and a full one would stop it.
     log = tmp_path / "house.log"
-    house_keeping = [sys.executable, "-m", "tests.support.rival_housekeeper"]
+    house_keeping = [sys.executable, "-m", "tests.integration.rival_housekeeper"]
     with log.open("w") as stream:
         house = subprocess.Popen(
             [*house_keeping, robot.bag_dir, str(budget), stop],

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import pytest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
-from tests.support.another_user import NOBODY, as_nobody, needs_another_user, own_network
+from tests.integration.another_user import NOBODY, as_nobody, needs_another_user, own_network
 from tests.support.live_recorder import (
     NS_PER_S,
     LiveRecorder,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from tests.integration.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
 from tests.support.examples import LONG
-from tests.support.kill_campaign import KINDS, Campaign, Terms, place_is_right, run_campaign
 from tests.support.ros_processes import real_or_double
 from tests.timing import Watch, driven
 

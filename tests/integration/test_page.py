@@ -11,9 +11,9 @@ import pytest
 
 from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
+from tests.integration.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
 from tests.integration.test_server_process import serving
 from tests.support.bags import boolean, detections, odom, text, write_mcap
-from tests.support.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
 from tests.support.documented_history import heartbeat
 from tests.support.processes import until
 from tests.support.robot_run import T0, T0_S

@@ -40,7 +40,7 @@ def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
 @pytest.fixture
 def robot(site: Machine, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
     truth = tmp_path / "truth"
-    argv = [site.env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.private_robot", str(truth)]
+    argv = [site.env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.private_robot", str(truth)]
     known = {**site.env, "PYTHONPATH": site.env["ROS2_LIVE_PYTHONPATH"]}
     process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:

@@ -38,7 +38,7 @@ def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
 
 @contextmanager
 def publishing(env: Mapping[str, str], *topics: str) -> Iterator[subprocess.Popen[bytes]]:
-    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.counting_publishers", *topics]
+    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.counting_publishers", *topics]
     known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
     process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:

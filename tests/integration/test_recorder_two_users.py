@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 from ros2_memory.recorder.process.environment import advice_on_silence
-from tests.support.another_user import as_nobody, needs_another_user, own_network
+from tests.integration.another_user import as_nobody, needs_another_user, own_network
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import end, ros_environment, wait_for
@@ -51,7 +51,7 @@ def test_what_a_recorder_of_another_user_receives(
     ):
         folder = Path(made)
         folder.chmod(0o777)
-        publisher = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.support.counting_publishers"]
+        publisher = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.counting_publishers"]
         robot = subprocess.Popen(
             [*network, *publisher, "/odom:50:reliable"],
             env={**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]},

@@ -16,14 +16,7 @@ from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, Summ
 from mcap.stream_reader import breakup_chunk
 from rosbags.highlevel import AnyReader
 
-from tests.support.ros_processes import (
-    RECORDERS,
-    installation,
-    publishing_robot,
-    ros_environment,
-    wait_for,
-)
-from tests.support.ros_recordings import (
+from tests.integration.ros_recordings import (
     Recording,
     embedded,
     in_file,
@@ -32,6 +25,13 @@ from tests.support.ros_recordings import (
     metadata,
     records,
     summary_of,
+)
+from tests.support.ros_processes import (
+    RECORDERS,
+    installation,
+    publishing_robot,
+    ros_environment,
+    wait_for,
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
 from tests.timing import in_time

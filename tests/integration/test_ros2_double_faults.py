@@ -20,16 +20,7 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.highlevel import AnyReader
 
-from tests.support.processes import PATIENCE_S, until
-from tests.support.ros_processes import (
-    RECORDERS,
-    SHARED_MEMORY,
-    installation,
-    publishing_robot,
-    ros_environment,
-    wait_for,
-)
-from tests.support.ros_recordings import (
+from tests.integration.ros_recordings import (
     Recording,
     embedded,
     in_file,
@@ -38,6 +29,15 @@ from tests.support.ros_recordings import (
     metadata,
     records,
     summary_of,
+)
+from tests.support.processes import PATIENCE_S, until
+from tests.support.ros_processes import (
+    RECORDERS,
+    SHARED_MEMORY,
+    installation,
+    publishing_robot,
+    ros_environment,
+    wait_for,
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
 from tests.timing import each_in_time, in_time

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.decoded_bags import bag_of, decoded_alike, tables_of
-from tests.support.drawn_types import DrawnTypes, drawn_types
 from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.unit.columns.decoded_bags import bag_of, decoded_alike, tables_of
+from tests.unit.columns.drawn_types import DrawnTypes, drawn_types
 
 if TYPE_CHECKING:
     pass

@@ -34,10 +34,10 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.bags import transform as transform_of
-from tests.support.decoded_bags import bag_of, compared, decoded_alike, tables_of
-from tests.support.drawn_types import DrawnField, DrawnTypes
 from tests.support.leaves import Comparison
 from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
+from tests.unit.columns.decoded_bags import bag_of, compared, decoded_alike, tables_of
+from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from ros2_memory.columns.detections import DetectionColumns, detections_by
 from ros2_memory.messages.detections import detections_of
-from tests.support.drawn_tables import drawn_tables, stored
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
+from tests.unit.columns.drawn_tables import drawn_tables, stored
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.detections import Detections
     from ros2_memory.columns.table import Table
     from ros2_memory.messages.detections import Detection
-    from tests.support.drawn_tables import Drawn
+    from tests.unit.columns.drawn_tables import Drawn
 
 EXTRACTOR = shipped_extractor()
 SETTLED = (

@@ -20,7 +20,9 @@ from ros2_memory.counts.field_numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, euler_of
 from tests.support.bags import make
-from tests.support.drawn_tables import (
+from tests.support.examples import examples
+from tests.support.memories import shipped_extractor
+from tests.unit.columns.drawn_tables import (
     MAPPED,
     OTHERS,
     Drawn,
@@ -30,8 +32,6 @@ from tests.support.drawn_tables import (
     paths_of,
     stored,
 )
-from tests.support.examples import examples
-from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -17,9 +17,9 @@ from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, goals, write_mcap
-from tests.support.drawn_tables import drawn_tables, stored
 from tests.support.examples import examples
 from tests.support.memories import memory_of, shipped_extractor
+from tests.unit.columns.drawn_tables import drawn_tables, stored
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.stated import Facts
     from ros2_memory.analysis.topic_events import State
     from ros2_memory.columns.table import Table
-    from tests.support.drawn_tables import Drawn
+    from tests.unit.columns.drawn_tables import Drawn
 
 EXTRACTOR = shipped_extractor()
 T0 = 1_784_000_000 * NS_PER_S

@@ -15,7 +15,10 @@ from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals,
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.truth import ColumnCondition
 from tests.support.bags import make, stamp
-from tests.support.drawn_tables import (
+from tests.support.examples import LONG, examples
+from tests.support.memories import shipped_extractor
+from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
+from tests.unit.columns.drawn_tables import (
     Drawn,
     condition_on,
     drawn_of,
@@ -23,9 +26,6 @@ from tests.support.drawn_tables import (
     message,
     stored,
 )
-from tests.support.examples import LONG, examples
-from tests.support.memories import shipped_extractor
-from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
 
 if TYPE_CHECKING:
     from ros2_memory.columns.truth import Truth

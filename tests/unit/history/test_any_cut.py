@@ -26,7 +26,10 @@ from mcap.reader import make_reader
 from ros2_memory.core.model import TimeWindow
 from tests.support.bags import typestore
 from tests.support.column_worlds import World, check_all, check_rows
-from tests.support.cut_histories import (
+from tests.support.examples import LONG, examples
+from tests.support.memories import asked, assert_same_counts, memory_of
+from tests.support.random_histories import S, write_history
+from tests.unit.history.cut_histories import (
     T0,
     change_something,
     cut,
@@ -37,15 +40,12 @@ from tests.support.cut_histories import (
     span_of,
     write,
 )
-from tests.support.examples import LONG, examples
-from tests.support.memories import asked, assert_same_counts, memory_of
-from tests.support.random_histories import S, write_history
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from random import Random
 
-    from tests.support.cut_histories import Splits
+    from tests.unit.history.cut_histories import Splits
 
 Question = tuple[str, dict[str, Any]]
 Ask = Callable[..., Any]

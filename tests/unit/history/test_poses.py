@@ -18,9 +18,9 @@ from ros2_memory.history.poses import pose_rows, poses_of
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, make, odom, quaternion, text, write_mcap
 from tests.support.column_worlds import EVERYTHING, World
-from tests.support.cut_histories import cut, draw_recordings, fill_some, write
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.unit.history.cut_histories import cut, draw_recordings, fill_some, write
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -21,13 +21,13 @@ from tests.support.sights import (
     sights_of_messages,
     whole,
 )
-from tests.support.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
+from tests.unit.things.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.things.instances import Instance
-    from tests.support.simulated_things import Thing
+    from tests.unit.things.simulated_things import Thing
 
 pytestmark = pytest.mark.xdist_group("instances")
 """The homes are made once, for all tests of this file."""

@@ -25,7 +25,7 @@ from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, with_store
-from tests.support.posed import posed, way_of
+from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

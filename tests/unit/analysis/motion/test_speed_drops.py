@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop, speed_drops
-from tests.support.posed import posed, stood_in
+from tests.unit.analysis.motion.posed import posed, stood_in
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.motion.standstills import LARGEST_M, SHORTEST_NS, Standstill
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
-from tests.support.posed import posed, stood_in
+from tests.unit.analysis.motion.posed import posed, stood_in
 
 Poses = list[tuple[int, tuple[float, float, float]]]
 S = NS_PER_S

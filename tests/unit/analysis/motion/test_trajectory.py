@@ -17,10 +17,10 @@ from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from tests.support.posed import posed, way_of
 from tests.support.rosbags_oracle import messages
 from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import points
+from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -1,6 +1,6 @@
 """A robot with a privacy mode: `/odom` numbered at 50 Hz, and `/privacy_mode`, latched.
 
-    python -m tests.support.private_robot TRUTH
+    python -m tests.integration.private_robot TRUTH
 
 SIGUSR1 sets the mode, SIGUSR2 ends it: the number of the next message is then appended to TRUTH.
 """

@@ -1,6 +1,6 @@
 """A housekeeper that deletes by a budget and keeps moments, all the time, until a file appears.
 
-python -m tests.support.rival_housekeeper BAG_DIR MAX_BYTES STOP_FILE
+python -m tests.integration.rival_housekeeper BAG_DIR MAX_BYTES STOP_FILE
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import BagReader, Record
-    from tests.support.drawn_types import DrawnTypes
+    from tests.unit.columns.drawn_types import DrawnTypes
 
 EVERYTHING: Final = TimeWindow.everything()
 

@@ -1,6 +1,6 @@
 """Publishers of numbered messages, of any QoS, for tests of what a recorder loses.
 
-    python -m tests.support.counting_publishers /odom:100:reliable /scan:50:best_effort:deadline
+    python -m tests.integration.counting_publishers /odom:100:reliable /scan:50:best_effort:deadline
 
 Each argument is a topic, its messages a second, its reliability, and more of its QoS: `latched`
 (transient local), `deadline` (of half a second) or `deep` (what waits is kept, not only the newest
