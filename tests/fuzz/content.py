@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sqlite3
 import struct
 from contextlib import closing
@@ -41,10 +40,6 @@ if TYPE_CHECKING:
 
 _BASE: Final = BASE_S * NS_PER_S
 _PAGE: Final = 4096
-_ODD_DOUBLES: Final = (
-    b"\xff" * 8,
-    *(struct.pack("<d", number) for number in (math.nan, math.inf, 1e308, 5e-324)),
-)
 _NUMBERS: Final = (0, 1, 2, 0xFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFE, 0xFFFFFFFF, 1 << 26)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
@@ -72,10 +72,6 @@ class FakeReader(BagReader):
         """A file of which nothing can be read."""
         self._bags[path] = FakeBag(damage=reason)
         return path
-
-    def set_closing(self, path: Path, closing: Closing) -> None:
-        """Closes or reopens a bag."""
-        self._bags[path] = replace(self._bags[path], closing=closing)
 
     def remove(self, path: Path) -> None:
         """Lets a bag vanish."""

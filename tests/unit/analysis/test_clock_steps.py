@@ -25,20 +25,6 @@ def over(moved_m: float, *, length: float = 8.0, before: float = 0.5, after: flo
     return step_over((100 * S, round((100 + length) * S)), first, second)
 
 
-def test_time_that_moved_nothing_did_not_pass() -> None:
-    assert over(0.05) == ClockStep(100 * S, round(7.9 * S))
-
-
-def test_a_robot_that_drove_on_shows_that_it_did() -> None:
-    assert over(4.0) is None
-    assert over(1.3) is None
-
-
-def test_a_robot_that_stands_on_one_side_shows_nothing() -> None:
-    assert over(0.0, before=0.0) is None
-    assert over(0.0, after=0.05) is None
-
-
 def test_one_pose_has_no_speed() -> None:
     first, second = poses(99.0, 0.0, 0.5), poses(108.0, 0.5, 0.5)
     assert step_over((100 * S, 108 * S), first[-1:], second) is None

@@ -114,23 +114,6 @@ def test_messages_of_tables_that_overlap_are_taken_as_those_of_one(
     assert _comparable(events_of_stated(joined_stated(stated))) == _comparable(events_of(messages))
 
 
-def test_a_boolean_that_toggles_is_reported_with_its_new_value() -> None:
-    flags = [State(flags=(("value", value),)) for value in (False, False, True, False)]
-    events = events_of(each_second(*flags))
-    assert events is not None
-    assert events.toggles == (
-        Change("value", 2 * NS_PER_S, True),
-        Change("value", 3 * NS_PER_S, False),
-    )
-
-
-def test_an_error_that_is_reported_again_is_listed_once_with_its_count() -> None:
-    hot = State(errors=("motor: hot",))
-    events = events_of(each_second(hot, EMPTY_STATE, hot, hot))
-    assert events is not None
-    assert events.errors == (ReportedError("motor: hot", 0, 3 * NS_PER_S, 3),)
-
-
 def test_what_is_beyond_the_limit_is_counted() -> None:
     blinking = [seeing("cup") if nth % 4 == 0 else seeing() for nth in range(40)]
     whole = events_of(each_second(*blinking))
@@ -165,13 +148,6 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     assert events.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14
     assert events.left_out == (15 - 10) + (flips - 10) + (15 - 10)
-
-
-def test_messages_without_events_make_empty_events() -> None:
-    events = events_of(each_second(EMPTY_STATE, EMPTY_STATE))
-    assert events is not None
-    assert events.is_empty
-    assert events_of([]) is None
 
 
 def test_labels_booleans_and_errors_are_found_in_values() -> None:

@@ -6,12 +6,8 @@ import pytest
 
 from ros2_memory.core import errors
 from ros2_memory.core.errors import (
-    BagError,
-    BagVanishedError,
     EpisodicError,
-    NoDataError,
     NoDataReason,
-    UndecodableError,
 )
 
 
@@ -50,33 +46,3 @@ def test_the_reasons_for_no_data_are_those_that_a_client_knows() -> None:
         "empty_memory",
         "mixed",
     }
-
-
-def test_no_data_carries_its_reason_and_its_sentence() -> None:
-    error = NoDataError(NoDataReason.GAP, "nothing there")
-    assert (error.code, error.reason, error.detail, str(error)) == (
-        "no_data",
-        "gap",
-        "nothing there",
-        "nothing there",
-    )
-
-
-def test_a_bag_error_names_the_file_and_the_reason() -> None:
-    error = BagVanishedError("a/b.mcap", "it was deleted")
-    assert isinstance(error, BagError)
-    assert (error.path, error.reason, str(error)) == (
-        "a/b.mcap",
-        "it was deleted",
-        "a/b.mcap: it was deleted",
-    )
-
-
-def test_an_undecodable_message_names_its_topic_and_type() -> None:
-    error = UndecodableError("/gps", "novatel/msg/BESTPOS", "there is no definition")
-    assert str(error) == "/gps (novatel/msg/BESTPOS): there is no definition"
-    assert (error.topic, error.type_name, error.reason) == (
-        "/gps",
-        "novatel/msg/BESTPOS",
-        "there is no definition",
-    )

@@ -19,14 +19,12 @@ from ros2_memory.core.timebase import (
     WallClock,
     iso_local,
     local_text,
-    ms_from_ns,
     ns_from_unix,
     rest_of_text_s,
     unix_from_ns,
     unix_from_text,
     unix_rounded_up,
 )
-from tests.support.clocks import FixedClock
 from tests.support.strategies import moments
 
 if TYPE_CHECKING:
@@ -102,10 +100,6 @@ def test_seconds_that_are_no_number_are_refused_by_name(seconds: float) -> None:
         ns_from_unix(seconds)
 
 
-def test_milliseconds_are_for_log_events() -> None:
-    assert ms_from_ns(1_500_000) == 1.5
-
-
 @given(moments)
 def test_a_local_time_names_the_same_microsecond_with_its_offset(moment: int) -> None:
     text = iso_local(moment)
@@ -118,11 +112,6 @@ def test_a_local_time_names_the_same_microsecond_with_its_offset(moment: int) ->
 @pytest.mark.parametrize("seconds", [10**15, -(10**15)])
 def test_a_moment_that_the_calendar_does_not_reach_has_no_local_time(seconds: int) -> None:
     assert iso_local(seconds * NS_PER_S) is None
-
-
-def test_a_fixed_clock_stands_still() -> None:
-    clock = FixedClock(42)
-    assert (clock.now(), clock.now()) == (42, 42)
 
 
 def test_the_wall_clock_counts_from_the_epoch_in_nanoseconds() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -38,22 +37,6 @@ def told(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False
     return list(unread_spans(snapshot, window, nothing=nothing))
 
 
-LOST_SPLIT = Snapshot(
-    Timeline.of((split(0), split(2), split(3))), damaged=(torn(1),), scanned_at=T0 + DAY
-)
-
-
-@pytest.mark.parametrize(
-    ("start", "stop", "touched"),
-    [(0, 9, False), (5, 12, True), (12, 15, True), (19.5, 31, True), (21, 31, False)],
-)
-def test_a_split_that_could_not_be_read_is_reported_in_windows_that_may_touch_it(
-    start: float, stop: float, touched: bool
-) -> None:
-    sentence = "1 bag file could not be read and may hold more: rec/rec_1.mcap (torn)"
-    assert told(LOST_SPLIT, start, stop) == [sentence] * touched
-
-
 def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
     snapshot = Snapshot(
         Timeline.of((split(0),)), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY
@@ -61,22 +44,6 @@ def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found
     assert told(snapshot, 0, 9) == []
     assert told(snapshot, 0, 9, nothing=True) == [
         "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
-    ]
-
-
-def test_an_old_file_that_nobody_removes_is_not_part_of_every_answer() -> None:
-    old = torn(0, T0 - 30 * DAY, "old")
-    snapshot = Snapshot(Timeline.of((split(0), split(1))), damaged=(old,), scanned_at=T0 + DAY)
-    assert told(snapshot, 0, 20) == []
-    assert told(snapshot, 0, 20, nothing=True) == []
-    assert len(told(snapshot, -30 * 86400 - 5, 20)) == 1
-
-
-def test_files_that_are_not_read_here_count_too() -> None:
-    other = SetAside(Path("/b/rec/rec_1.db3"), "choose storage=rosbag2", T0 + DAY)
-    snapshot = Snapshot(Timeline.of((split(0), split(2))), unread=(other,), scanned_at=T0 + DAY)
-    assert told(snapshot, 11, 12) == [
-        "1 bag file could not be read and may hold more: rec/rec_1.db3 (choose storage=rosbag2)"
     ]
 
 
@@ -91,39 +58,10 @@ def test_many_files_are_counted_and_the_last_ones_named() -> None:
     ]
 
 
-def test_the_split_being_written_is_reported_from_the_end_of_the_one_before_it_on() -> None:
-    active = SetAside(Path("/b/rec/rec_1.mcap"), "still being written")
-    snapshot = Snapshot(Timeline.of((split(0),)), active=(active,), scanned_at=T0 + 15 * S)
-    assert told(snapshot, 0, 9) == []
-    assert told(snapshot, 5, 12) == [
-        "the split being written is left out: nothing after 1784023209.000000"
-    ]
-
-
 def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
     active = SetAside(Path("/b/other/other_0.mcap"), "still being written")
     snapshot = Snapshot(Timeline.of((split(0), split(1))), active=(active,), scanned_at=T0 + 25 * S)
     assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
-
-
-def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it() -> None:
-    cut = split(1, state=BagState.INCOMPLETE, notes=("the last 41 bytes could not be read",))
-    snapshot = Snapshot(Timeline.of((split(0), cut)), scanned_at=T0 + DAY)
-    assert told(snapshot, 0, 9) == []
-    assert told(snapshot, 5, 15) == [
-        (
-            "1 unfinished bag; its readable part is used: rec/rec_1.mcap (the last 41 "
-            "bytes could not be read)"
-        )
-    ]
-
-
-def test_a_closed_bag_that_contradicts_itself_is_reported() -> None:
-    odd = [split(number, notes=("its own statistics are wrong",)) for number in range(5)]
-    snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)
-    assert told(snapshot, 0, 5) == ["rec/rec_0.mcap: its own statistics are wrong"]
-    named = "rec/rec_4.mcap, rec/rec_3.mcap, rec/rec_2.mcap and 2 more"
-    assert told(snapshot, 0, 60) == [f"5 bags ({named}): its own statistics are wrong"]
 
 
 def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:

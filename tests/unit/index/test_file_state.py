@@ -131,28 +131,11 @@ def test_an_open_bag_of_a_recording_that_the_heartbeat_names_is_active_however_s
     assert scan.run(path, age_s=age_s, names={"day/rec_1", "rec_2"}) is FileState.ACTIVE
 
 
-@pytest.mark.parametrize("names", [set(), {"rec_2"}, {"rec_1"}, {"day"}])
-def test_an_open_bag_of_a_recording_that_a_live_heartbeat_does_not_name_is_left_behind(
-    scan: RepeatedScan, tmp_path: Path, names: set[str]
-) -> None:
-    path = plain(tmp_path / "day" / "rec_1" / "rec_1_0.mcap", [1], closed=False)
-    assert scan.run(path, age_s=0, names=names) is FileState.INCOMPLETE
-
-
 def test_an_open_bag_in_the_bag_directory_itself_is_named_by_a_dot(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
     assert scan.run(path, age_s=3600, names={"."}) is FileState.ACTIVE
-
-
-def test_a_bag_left_open_serves_what_is_readable(scan: RepeatedScan, tmp_path: Path) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1, 2], closed=False)
-    scan.run(path, age_s=3600)
-    assert scan.classification is not None
-    assert scan.classification.bag is not None
-    assert scan.classification.bag.state is BagState.INCOMPLETE
-    assert (scan.classification.bag.start, scan.classification.bag.end) == (1, 2)
 
 
 def test_a_growth_that_was_seen_counts_whatever_the_mtime_says(
@@ -197,22 +180,6 @@ def test_after_the_clock_was_set_back_a_growth_counts_for_three_splits_more(
     assert scan.run(path, now=earlier + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
-def test_an_active_bag_is_not_summarised(scan: RepeatedScan, tmp_path: Path) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    scan.run(path, age_s=0)
-    assert scan.reader.summaries.total() == 0
-    assert scan.reason() == "still being written"
-
-
-def test_an_active_bag_becomes_a_bag_when_it_is_closed_in_place(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    assert scan.run(path, age_s=0) is FileState.ACTIVE
-    close(path)
-    assert scan.run(path, age_s=0, names={"."}) is FileState.CLOSED
-
-
 def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
@@ -224,29 +191,12 @@ def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after
     assert scan.is_watched()
 
 
-def test_a_file_that_is_no_bag_is_damaged_with_the_readers_reason(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = tmp_path / "rec_0.mcap"
-    path.write_text("# Dockerfile", encoding="utf-8")
-    assert scan.run(path, age_s=0) is FileState.DAMAGED
-    assert scan.reason() == "not a bag"
-
-
 def test_a_bag_left_open_before_its_first_message_is_damaged(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan"], closed=False)
     assert scan.run(path, age_s=3600) is FileState.DAMAGED
     assert "before its first message" in scan.reason()
-
-
-def test_a_closed_bag_without_a_message_is_empty_and_names_its_silent_topics(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = plain(tmp_path / "rec_0.mcap", silent=["/scan", "/tf"])
-    assert scan.run(path, age_s=3600) is FileState.EMPTY
-    assert scan.classification == Classification(FileState.EMPTY, silent=("/scan", "/tf"))
 
 
 def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(
@@ -270,14 +220,6 @@ def test_a_name_in_capitals_is_not_read_and_says_what_to_do(
     assert "must end in .mcap, in lower case: rename it" in scan.reason()
 
 
-def test_an_unchanged_file_is_read_once(scan: RepeatedScan, tmp_path: Path) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1])
-    for later in range(3):
-        scan.run(path, age_s=100 if later == 0 else None, now=NOW + later * S)
-    assert scan.reader.summaries == {"rec_0.mcap": 1}
-    assert scan.reader.closings == {"rec_0.mcap": 1}
-
-
 @pytest.mark.parametrize("age_s", [0, 1.9, -1.9])
 def test_what_was_read_of_a_file_younger_than_2_s_is_read_again(
     scan: RepeatedScan, tmp_path: Path, age_s: float
@@ -292,16 +234,6 @@ def test_what_was_read_of_a_file_younger_than_2_s_is_read_again(
     assert scan.classification.bag is not None
     assert scan.classification.bag.start == 22
     assert not scan.is_watched()
-
-
-def test_a_replaced_file_is_read_again(scan: RepeatedScan, tmp_path: Path) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [11])
-    scan.run(path, age_s=100)
-    plain(path, [22])
-    scan.run(path, age_s=50)
-    assert scan.classification is not None
-    assert scan.classification.bag is not None
-    assert (scan.classification.bag.start, scan.classification.bag.mtime_ns) == (22, NOW - 50 * S)
 
 
 def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(

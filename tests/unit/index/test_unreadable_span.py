@@ -22,16 +22,6 @@ OWN = "rec_20260921T130000Z"
 """Begun 4400 s before NOW."""
 
 
-def test_between_two_splits_it_holds_what_lies_between_them() -> None:
-    found = unreadable_span("rec", Neighbours(100 * S, 200 * S), NOW, NOW)
-    assert found == TimeWindow(100 * S, 200 * S + 1)
-
-
-def test_behind_the_last_split_it_ends_when_its_file_was_last_written() -> None:
-    found = unreadable_span("rec", Neighbours(NOW - 600 * S), NOW - 500 * S, NOW)
-    assert found == TimeWindow(NOW - 600 * S, NOW - 440 * S)
-
-
 def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
     found = unreadable_span("rec", Neighbours(NOW - 1000 * HOUR), NOW, NOW)
     assert found == TimeWindow(NOW - 1000 * HOUR, NOW - 976 * HOUR)
@@ -47,12 +37,6 @@ def test_before_the_first_split_it_begins_with_its_recording() -> None:
 def test_alone_in_a_folder_it_ends_when_it_was_written_and_holds_a_day() -> None:
     found = unreadable_span("someones", Neighbours(), NOW - HOUR, NOW)
     assert found == TimeWindow(NOW - 25 * HOUR + 60 * S, NOW - HOUR + 60 * S)
-
-
-def test_where_nothing_is_known_around_it_its_time_is_unknown() -> None:
-    assert unreadable_span("someones", Neighbours(), None, NOW) is None
-    assert unreadable_span("someones", Neighbours(), 5 * S, NOW) is None
-    assert unreadable_span("someones", Neighbours(), NOW + HOUR, NOW) is None
 
 
 def test_a_file_that_is_still_being_written_has_no_end() -> None:

@@ -58,19 +58,6 @@ async def test_so_many_run_at_once_and_the_others_wait() -> None:
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
 
 
-async def test_a_client_that_floods_the_queue_does_not_hold_up_another() -> None:
-    queue, gates = FairQueue("test", 2), Gates()
-    flood = started(queue, gates, "flood", 64)
-    await until(lambda: len(gates.begun) == 2)
-    [other] = started(queue, gates, "other", 1)
-    await until(lambda: queue.waiting == 63)
-    gates.release("flood0", "other0")
-    assert await other == "other0"
-    assert gates.begun[2] == "other0"
-    gates.release()
-    assert len(await asyncio.gather(*flood)) == 64
-
-
 async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
     queue, gates = FairQueue("test", 1), Gates()
     tasks = [
@@ -136,21 +123,6 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert leaving.cancelled()
     assert gates.begun == ["a0", "a2"]
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
-
-
-async def test_a_full_queue_refuses_the_newest_of_whoever_fills_it() -> None:
-    queue, gates = FairQueue("test", 1, most_waiting=4), Gates()
-    flood = started(queue, gates, "flood", 6)
-    await until(lambda: queue.waiting == 4)
-    with pytest.raises(BusyError, match="4 questions wait already"):
-        await flood[5]
-    [other] = started(queue, gates, "other", 1)
-    with pytest.raises(BusyError, match="fewer at once"):
-        await flood[4]
-    assert queue.waiting == 4
-    gates.release()
-    assert await other == "other0"
-    assert await asyncio.gather(*flood[:4]) == [f"flood{n}" for n in range(4)]
 
 
 async def test_what_a_question_raises_reaches_its_caller_and_frees_the_place() -> None:

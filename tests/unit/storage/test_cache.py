@@ -16,13 +16,6 @@ def test_what_was_used_last_is_kept() -> None:
     assert (cache.get("a"), cache.get("b"), cache.get("c")) == ("A", None, "C")
 
 
-def test_what_is_larger_than_the_whole_cache_is_not_kept_and_evicts_nothing() -> None:
-    cache: ByteLru[str] = ByteLru(10)
-    cache.put("a", "A", 4)
-    cache.put("b", "B", 11)
-    assert (cache.get("a"), cache.get("b")) == ("A", None)
-
-
 def test_a_replaced_value_counts_once() -> None:
     cache: ByteLru[str] = ByteLru(10)
     cache.put("a", "old", 6)

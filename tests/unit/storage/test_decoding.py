@@ -13,9 +13,6 @@ if TYPE_CHECKING:
     from tests.support.bags import Msg
 
 
-CDR = b"\x00\x01\x00\x00"
-
-
 def record_of(message: Msg, schema: Schema | None = None) -> Record:
     given = schema or Schema(message.type, "ros2msg", definition(message.type).encode())
     return Record(Channel(message.topic, "cdr", given), 1, 1, message.payload)
@@ -25,23 +22,6 @@ def test_big_endian_messages_are_read() -> None:
     payload = b"\x00\x00\x00\x00" + b"\x00\x00\x00\x03hi\x00"
     record = record_of(text(1, "x"))._replace(payload=payload)
     assert getattr(Decoding().decode(record), "data", "") == "hi"
-
-
-@pytest.mark.parametrize(
-    "payload",
-    [
-        b"",
-        b"\x00",
-        b"\x00\x01\x00\x00",
-        b"\x00\x01\x00\x00\xff\xff\xff\xff",
-        b"\x07\x00\x00\x00abc",
-    ],
-)
-def test_payloads_that_do_not_fit_are_undecodable(payload: bytes) -> None:
-    record = record_of(text(1, "x"))._replace(payload=payload)
-    with pytest.raises(UndecodableError, match="does not fit the definition") as caught:
-        Decoding().decode(record)
-    assert caught.value.topic == "/chatter"
 
 
 def test_every_cut_of_a_payload_is_undecodable_and_nothing_else() -> None:
@@ -72,13 +52,3 @@ def test_equal_channels_of_two_bags_decode_alike_and_different_ones_each_in_thei
             message, Schema(message.type, "ros2msg", b"uint32 size\nuint8[2] bytes\n")
         )
         assert getattr(decoding.decode(other), "size", 0) == 2
-
-
-def test_the_reason_for_a_channel_is_the_reason_for_its_messages() -> None:
-    decoding = Decoding()
-    record = record_of(text(1, "x"), Schema("nowhere_msgs/msg/X"))
-    reason = decoding.undecodable(record.channel)
-    with pytest.raises(UndecodableError) as caught:
-        decoding.decode(record)
-    assert caught.value.reason == reason
-    assert decoding.undecodable(record_of(text(1, "x")).channel) is None

@@ -22,7 +22,7 @@ from tests.support.shared_bags import BAGS, REAL, RECORDED, needs_real, needs_re
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader, Record
 
 EVERYTHING = TimeWindow.everything()
@@ -86,61 +86,6 @@ every_recorded_file = pytest.mark.parametrize(
     sorted(p for p in RECORDED.rglob("*") if rosbag2().reads(p)) if RECORDED.is_dir() else [],
     ids=lambda path: str(path.relative_to(BAGS)),
 )
-
-
-@needs_real
-@every_set
-def test_each_file_has_what_is_expected(name: str) -> None:
-    files = expectations()[name]["expected"].get("files", {})
-    for path in files_of(name):
-        if path.name not in files:
-            continue
-        for reader in readers_of(path):
-            summary = reader.summarize(path)
-            expected = files[path.name]
-            assert (summary.count, summary.start, summary.end) == (
-                expected["count"],
-                expected["start_ns"],
-                expected["end_ns"],
-            ), path
-
-
-@needs_real
-@pytest.mark.parametrize(
-    "name", [name for name, what in expectations().items() if "topics" in what["expected"]]
-)
-def test_each_topic_has_what_is_expected(name: str) -> None:
-    expected = expectations()[name]["expected"]
-    found: dict[str, list[TopicSummary]] = {}
-    silent: set[str] = set()
-    for path in files_of(name):
-        summary = rosbag2().summarize(path)
-        silent |= set(summary.silent)
-        for topic in summary.topics:
-            found.setdefault(topic.topic, []).append(topic)
-    assert {topic: _joined(parts) for topic, parts in found.items()} == {
-        topic: (_full_type(what["type"]), what["count"], what["first_ns"], what["last_ns"])
-        for topic, what in expected["topics"].items()
-    }
-    declared = expected["declared_topics"]
-    # Of the bag of 2018 its makers could not tell which topics it declares.
-    if declared is not None:
-        assert silent - set(found) == set(expected["empty_topics"])
-        assert len(silent | set(found)) == declared
-
-
-def _full_type(name: str) -> str:
-    return name.replace("/", "/msg/") if name.count("/") == 1 else name
-
-
-def _joined(parts: list[TopicSummary]) -> tuple[str, int, int, int]:
-    (type_name,) = {part.type for part in parts}
-    return (
-        type_name,
-        sum(part.count for part in parts),
-        min(part.first for part in parts),
-        max(part.last for part in parts),
-    )
 
 
 @needs_real
@@ -209,41 +154,6 @@ def test_service_events_decode_as_do_the_topics_beside_them() -> None:
 
 
 @needs_real
-@pytest.mark.parametrize(
-    ("name", "cut"),
-    [
-        (name, cut)
-        for name, what in expectations().items()
-        for cut in what["expected"].get("truncate", [])
-    ],
-    ids=lambda value: value if isinstance(value, str) else str(value["bytes"]),
-)
-def test_a_file_cut_short_gives_what_had_reached_the_disk(
-    name: str, cut: dict[str, Any], tmp_path: Path
-) -> None:
-    (source,) = files_of(name)
-    path = tmp_path / source.name
-    path.write_bytes(source.read_bytes()[: cut["bytes"]])
-    count = cut.get("messages_if_partial_uncompressed_chunk_is_walked")
-    if count is None:
-        count = cut["messages_in_complete_chunks"]
-    for reader in readers_of(path):
-        summary = reader.summarize(path)
-        assert reader.closing(path) is Closing.OPEN
-        assert not summary.complete
-        assert any("the file ends early" in note for note in summary.notes)
-        # Of a chunk that the cut goes through, some may be recovered beyond the whole chunks.
-        assert summary.count >= count
-        records = all_records(reader, path)
-        assert len(records) == summary.count
-        if "range2_ns" in cut:
-            assert summary.count == count
-            assert [summary.start, summary.end] == cut["range2_ns"]
-        original = set(all_records(reader, source))
-        assert original.issuperset(records)
-
-
-@needs_real
 def test_every_legal_layout_of_the_summary_section_is_read() -> None:
     per_file = expectations()["mcap_conformance_2022"]["expected"]["per_file"]
     paths = files_of("mcap_conformance_2022")
@@ -285,31 +195,6 @@ def test_the_truncated_file_has_its_whole_chunk() -> None:
     summary = mcap().summarize(path)
     assert not summary.complete
     assert summary.notes == ("the file ends early: the last 58 bytes could not be read",)
-
-
-SESSIONS = ("session_mcap", "session_sqlite3", "session_zstd", "session_zstd_file")
-
-
-@needs_recorded
-@pytest.mark.parametrize("session", SESSIONS)
-def test_a_session_has_what_was_published(session: str) -> None:
-    truth = json.loads((RECORDED / f"{session}.truth.json").read_text(encoding="utf-8"))
-    counts: Counter[str] = Counter()
-    latched: set[str] = set()
-    for path in sorted((RECORDED / session).iterdir()):
-        if rosbag2().reads(path):
-            summary = rosbag2().summarize(path)
-            assert summary.complete
-            assert rosbag2().closing(path) is Closing.CLOSED
-            counts.update({topic.topic: topic.count for topic in summary.topics})
-            latched |= {topic.topic for topic in summary.topics if topic.latched}
-    published = truth["published"]
-    assert latched == {"/tf_static"}
-    assert counts.keys() == published.keys()
-    # Only the first recorder outlived its publisher.
-    late = 0 if session == "session_mcap" else 20
-    for topic, count in published.items():
-        assert count - late <= counts[topic] <= count
 
 
 @needs_recorded

@@ -59,16 +59,6 @@ def times_in(batches: Iterable[object]) -> Counter[int]:
     )
 
 
-def test_a_damaged_chunk_is_lost_alone_and_named(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
-    spoilt = chunks_of(path)[2]
-    spoil_chunk(path, 2)
-    found, [error] = all_of(McapReader().batches(path, TOPICS, EVERYTHING))
-    assert error.lost == (spoilt.message_start_time, spoilt.message_end_time)
-    lost = set(range(spoilt.message_start_time, spoilt.message_end_time + 1))
-    assert set(times_in(found)) == set(range(20)) - lost
-
-
 @pytest.mark.parametrize("number", range(4))
 @pytest.mark.parametrize(("at", "value"), [(0, 3), (8, 1)])
 def test_an_index_that_lies_loses_no_message_and_doubles_none(
