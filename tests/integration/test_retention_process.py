@@ -27,6 +27,7 @@ from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
+from tests.integration.split_writer import DOCK
 from tests.integration.test_recorder_daemon import Site, sited
 from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -36,7 +37,6 @@ from tests.support.live_recorder import answer
 from tests.support.memories import memory_of
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
-from tests.support.split_writer import DOCK
 from tests.unit.core.test_deep_directories import DEEP, within
 
 if TYPE_CHECKING:
@@ -127,7 +127,8 @@ class Asker:
 @contextmanager
 def writer(bag_dir: Path, begin: int) -> Iterator[Callable[[], dict[str, Any]]]:
     """A process that records; each call takes it a split further."""
-    command = [sys.executable, "-m", "tests.support.split_writer", str(bag_dir), f"--begin={begin}"]
+    module = "tests.integration.split_writer"
+    command = [sys.executable, "-m", module, str(bag_dir), f"--begin={begin}"]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:

@@ -1,4 +1,4 @@
-"""Writes records as rosbag2 lays splits out: `python -m tests.support.split_writer`.
+"""Writes records as rosbag2 lays splits out: `python -m tests.integration.split_writer`.
 
 A line on stdin takes it one step further: the next split is opened, and the one before it closed.
 It answers each with a line of JSON. The end of stdin ends the recording.
