@@ -129,17 +129,6 @@ def test_only_what_may_be_refused_is_refused_and_with_its_reason(name: str) -> N
 
 
 @needs_real
-def test_of_the_bag_without_definitions_the_standard_types_decode() -> None:
-    (path,) = files_of("novatel_customtypes_nometa_db3")
-    reader = rosbag2()
-    good = [r for r in all_records(reader, path) if reader.undecodable(r.channel) is None]
-    assert Counter(record.channel.type for record in good) == {
-        "nav_msgs/msg/Odometry": 11,
-        "sensor_msgs/msg/NavSatFix": 11,
-    }
-
-
-@needs_real
 def test_service_events_decode_as_do_the_topics_beside_them() -> None:
     (path,) = files_of("rosbag2_service_events_mcap")
     found = [(r.channel.type, mcap().decode(r)) for r in all_records(mcap(), path)]
@@ -168,23 +157,6 @@ def test_every_legal_layout_of_the_summary_section_is_read() -> None:
         assert mcap().closing(path) is Closing.CLOSED
         if expected["log_ns"] is not None:
             assert [summary.start, summary.end] == expected["log_ns"]
-
-
-@needs_real
-def test_a_text_file_with_a_bags_name_is_refused_by_name_and_reason() -> None:
-    path = REAL / "tiryoh_small_and_truncated" / "Dockerfile.mcap"
-    for reader in readers_of(path):
-        assert reader.closing(path) is Closing.CLOSED
-        with pytest.raises(BagError, match=r"Dockerfile\.mcap: not an MCAP file"):
-            reader.summarize(path)
-
-
-@needs_real
-def test_statistics_that_are_wrong_are_reported_and_not_believed() -> None:
-    (path,) = files_of("rosbag2_time0_mcap")
-    summary = mcap().summarize(path)
-    assert summary.start == 0
-    assert [note for note in summary.notes if "its own statistics are wrong" in note]
 
 
 @needs_real
@@ -256,12 +228,3 @@ def test_latched_transforms_lie_where_they_were_received() -> None:
         "tfs_0.mcap": [2],
         "tfs_3.mcap": [1],
     }
-
-
-@needs_recorded
-def test_a_split_cut_short_by_a_full_disk_is_read_as_far_as_it_goes() -> None:
-    path = RECORDED / "extra" / "full_truncated" / "fullsmall_4.mcap"
-    summary = mcap().summarize(path)
-    assert not summary.complete
-    assert summary.count == 94
-    assert len(all_records(mcap(), path)) == 94
