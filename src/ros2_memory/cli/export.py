@@ -14,16 +14,8 @@ import typer
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
-    BagDir,
-    End,
-    Last,
-    Recording,
-    Start,
-    Verbose,
-    Words,
-    load_to_look,
-    open_memory,
-    parse_window,
+    Bags,
+    Times,
     print_line,
 )
 from ros2_memory.cli.output import progress_bar, with_local_times
@@ -49,7 +41,6 @@ _REPORT_EVERY: Final = 512
 
 
 def export(
-    words: Words = None,
     *,
     mcap: Annotated[
         Path | None,
@@ -68,9 +59,7 @@ def export(
         list[str] | None,
         typer.Option(metavar="GLOB", help="Copy only these topics, such as /vision/*; repeatable."),
     ] = None,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     latched: Annotated[
         bool | None,
         typer.Option(
@@ -86,9 +75,7 @@ def export(
         ),
     ] = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Copy a time window to MCAP or Parquet, each message once.
 
@@ -97,10 +84,9 @@ def export(
     """
     if (mcap is None) == (parquet is None):
         raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
+    memory = bags.memory()
     view = View(memory, Call())
-    window = parse_window(memory, start, end, last)
+    window = times.window(memory)
     topics = _topics(view, topic or ())
     note_unread(view, window)
     with _progress(view, window) as report:

@@ -29,6 +29,8 @@ from tests.support.housekeepers import OURS, embedding, made_moment, own_all
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tests.support.program import Program
+
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
 
@@ -116,7 +118,7 @@ def test_a_recording_without_a_bag_goes_too(bag_dir: Path) -> None:
 
 
 def test_latched_messages_that_later_answers_need_are_carried_on(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, capsys: Capture, exits: Program
 ) -> None:
     assert forget(0, 15, "--yes") == 0
     assert "1 latched message is carried on" in capsys.readouterr().out
@@ -125,7 +127,7 @@ def test_latched_messages_that_later_answers_need_are_carried_on(
     )
     assert record.log_time == T0
     asked = json.dumps({"parent": "base_link", "child": "laser", "timestamp": T0 / NS_PER_S + 25})
-    assert cli.main(["ask", "get_transform_at", asked, "--json"]) == 0
+    exits(0, "ask", "get_transform_at", asked, "--json")
 
 
 def test_what_was_carried_on_from_the_window_is_reported(bag_dir: Path, capsys: Capture) -> None:
@@ -169,19 +171,20 @@ def test_a_bag_with_another_name_is_reported(bag_dir: Path, capsys: Capture) -> 
     assert "delete the moment's folder" in capsys.readouterr().out
 
 
-def test_the_store_forgets_with_them(bag_dir: Path, capsys: Capture) -> None:
-    assert cli.main(["index"]) == 0
+def test_the_store_forgets_with_them(bag_dir: Path, exits: Program) -> None:
+    exits(0, "index")
     assert known(bag_dir) == 4
     assert forget(20, 35, "--yes") == 0
-    assert cli.main(["index"]) == 0
+    exits(0, "index")
     assert known(bag_dir) == 3
     asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
-    assert cli.main(["ask", "find_last_match", asked, "--json"]) == 0
-    assert capsys.readouterr().out.strip().splitlines()[-1] == "null"
+    assert (
+        exits(0, "ask", "find_last_match", asked, "--json").out.strip().splitlines()[-1] == "null"
+    )
 
 
 def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, capsys: Capture, exits: Program
 ) -> None:
     assert cli.main(["index"]) == 0
     store = bag_dir / OWN_FOLDER / FILE
@@ -192,7 +195,7 @@ def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
     assert forget(40, 55, "--yes") == 0
     assert "nothing to delete" in capsys.readouterr().out
     assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / OWN_FOLDER)
-    assert cli.main(["index"]) == 0
+    exits(0, "index")
     assert b"secret3" in unpacked(store)
 
 
@@ -242,10 +245,9 @@ def test_bags_that_others_record_are_refused(
     assert len(bags(bag_dir)) == 4
 
 
-def test_without_a_window_nothing_is_forgotten(bag_dir: Path, capsys: Capture) -> None:
-    assert cli.main(["forget", "--yes"]) == 2
-    assert cli.main(["forget", "--yes", "--start", "0"]) == 2
-    assert "--last" in capsys.readouterr().err
+def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
+    exits(2, "forget", "--yes")
+    assert "--last" in exits(2, "forget", "--yes", "--start", "0").err
     assert len(bags(bag_dir)) == 4
 
 
@@ -304,7 +306,7 @@ class TestForeignBags:
         assert not (bag_dir / "session").exists()
 
     def test_without_a_list_nothing_goes_before_it_is_adopted(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, capsys: Capture, exits: Program
     ) -> None:
         # What a recorder embeds, a copy without its list embeds as well.
         shutil.rmtree(bag_dir / ".episodic")
@@ -314,7 +316,7 @@ class TestForeignBags:
         assert forget(190, 300, "--yes") == 1
         assert path.exists()
         assert f"`ros2-memory adopt {name}` first" in capsys.readouterr().out
-        assert cli.main(["adopt", name]) == 0
+        exits(0, "adopt", name)
         assert forget(190, 300, "--yes") == 0
         assert not path.exists()
 

@@ -30,6 +30,9 @@ from tests.support.shared_bags import REAL, needs_real
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.core.reply import JsonObject
+    from tests.support.program import Program
+
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
 
@@ -61,9 +64,8 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, capsys: Capture) -> None:
-    assert cli.main(["cat", "/od*", str(folder)]) == 2
-    assert "/od* is a pattern; matching: /odom" in capsys.readouterr().err
+def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Program) -> None:
+    assert "/od* is a pattern; matching: /odom" in exits(2, "cat", "/od*", folder).err
 
 
 def test_where_another_program_made_all_recordings_it_is_said_once(
@@ -118,12 +120,11 @@ class TestPaths:
             assert str(tmp_path / "empty") in shown
 
     def test_where_an_error_names_a_tool_people_read_the_command(
-        self, folder: Path, tmp_path: Path, capsys: Capture
+        self, folder: Path, tmp_path: Path, exits: Program
     ) -> None:
         (tmp_path / "empty").mkdir()
         for topic, path, command in (("/odom", "empty", "info"), ("/nothing", "a", "topics")):
-            assert cli.main(["cat", topic, str(folder / path)]) == 2
-            shown = capsys.readouterr().err
+            shown = exits(2, "cat", topic, folder / path).err
             assert f"; `ros2-memory {command}` lists" in shown
             assert "data_time_range" not in shown
             assert "list_recorded_topics" not in shown
@@ -140,9 +141,8 @@ class TestPaths:
         _, shown = run(capsys, "topics", folder, "--json")
         assert [len(row["notes"]) for row in json.loads(shown)] == [1, 1]
 
-    def test_errors_have_no_control_characters(self, folder: Path, capsys: Capture) -> None:
-        assert cli.main(["cat", "/\x1b[31m", str(folder)]) == 2
-        assert "\x1b" not in capsys.readouterr().err
+    def test_errors_have_no_control_characters(self, folder: Path, exits: Program) -> None:
+        assert "\x1b" not in exits(2, "cat", "/\x1b[31m", folder).err
 
     def test_bags_of_others_need_no_recorder_and_no_preset(
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
@@ -267,13 +267,11 @@ class TestRecordings:
         assert [row["recording"] for row in json.loads(shown)] == [name]
 
     def test_a_name_that_there_is_not_is_refused_with_one_like_it(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
         write_mcap(folder / "kitchen_run" / "kitchen_run_0.mcap", seconds(400, 1))
-        assert cli.main(["info", str(folder), "--recording", "kitchen_rum"]) == 2
-        assert "similar: kitchen_run" in capsys.readouterr().err
-        assert cli.main(["info", str(folder), "--recording", "../a"]) == 2
-        assert "data.recording" in capsys.readouterr().err
+        assert "similar: kitchen_run" in exits(2, "info", folder, "--recording", "kitchen_rum").err
+        assert "data.recording" in exits(2, "info", folder, "--recording", "../a").err
 
     def test_what_is_forgotten_is_forgotten_of_one_recording_too(
         self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
@@ -296,10 +294,9 @@ class TestRecordings:
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
-    def test_what_deletes_looks_at_all_of_them(self, folder: Path, capsys: Capture) -> None:
+    def test_what_deletes_looks_at_all_of_them(self, folder: Path, exits: Program) -> None:
         words = ["forget", "--last", "9000", "--yes", "deployment=robot", "data.recording=a"]
-        assert cli.main([*words, f"recording.bag_dir={folder}"]) == 2
-        assert "data.recording=null" in capsys.readouterr().err
+        assert "data.recording=null" in exits(2, *words, f"recording.bag_dir={folder}").err
         assert (folder / "a" / "a_0.mcap").exists()
 
 
@@ -360,18 +357,20 @@ class TestCat:
         assert times == [T0 + n * NS_PER_S for n in expected]
 
     def test_a_topic_or_a_field_that_there_is_not_is_named_with_those_there_are(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        assert cli.main(["cat", "/odon", str(folder)]) == 2
-        assert "/odom" in capsys.readouterr().err
-        assert cli.main(["cat", "/odom", str(folder), "--csv", "--field", "pose.nothing"]) == 2
-        assert "position" in capsys.readouterr().err
+        assert "/odom" in exits(2, "cat", "/odon", folder).err
+        assert (
+            "position" in exits(2, "cat", "/odom", folder, "--csv", "--field", "pose.nothing").err
+        )
 
     def test_where_nothing_lies_in_the_time_the_exit_code_is_1(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        assert cli.main(["cat", "/odom", str(folder / "a"), "--end", "2001-01-01"]) == 1
-        assert "no message of /odom" in capsys.readouterr().err
+        assert (
+            "no message of /odom"
+            in exits(1, "cat", "/odom", folder / "a", "--end", "2001-01-01").err
+        )
 
     def test_a_reader_that_ends_early_is_no_error(self, folder: Path) -> None:
         program = [sys.executable, "-m", "ros2_memory.cli", "cat", "/odom", str(folder / "a")]
@@ -389,13 +388,11 @@ def test_a_time_that_is_printed_is_read_back_to_the_microsecond(us: int) -> None
 
 
 def test_times_and_durations_of_tools_may_be_words() -> None:
-    schema = {
-        "properties": {
-            "start": {"type": ["number", "string"]},
-            "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
-            "seconds": {"type": "number"},
-            "topic": {"type": "string"},
-        }
+    known: dict[str, JsonObject] = {
+        "start": {"type": ["number", "string"]},
+        "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
+        "seconds": {"type": "number"},
+        "topic": {"type": "string"},
     }
     given_words = {
         "start": "10m",
@@ -403,20 +400,20 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
         "seconds": "2h",
         "topic": "3d",
     }
-    assert with_times(given_words, schema, 1_700_000_000.0) == {
+    assert with_times(given_words, known, 1_700_000_000.0) == {
         "start": 1_700_000_000.0 - 600,
         "timestamps": [1_699_999_999.0, 1_700_000_000.0 - 3600],
         "seconds": 7200.0,
         "topic": "3d",
     }
     with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
-        with_times({"start": "soon"}, schema, 1_700_000_000.0)
+        with_times({"start": "soon"}, known, 1_700_000_000.0)
 
 
 def test_a_text_time_is_left_to_the_tool_that_knows_what_its_last_decimal_is() -> None:
-    schema = {"properties": {"start": {"type": ["number", "string"]}}}
+    known: dict[str, JsonObject] = {"start": {"type": ["number", "string"]}}
     asked: dict[str, object] = {"start": "2026-11-20T14:05:03.745"}
-    assert with_times(asked, schema, 1_700_000_000.0) == asked
+    assert with_times(asked, known, 1_700_000_000.0) == asked
 
 
 def test_one_parser_reads_all_times_and_knows_nanoseconds() -> None:
@@ -435,19 +432,17 @@ def test_where_the_topic_is_forgotten_the_command_is_named(folder: Path, capsys:
         assert expected in capsys.readouterr().err
 
 
-def test_a_path_may_come_first(folder: Path, capsys: Capture, tmp_path: Path) -> None:
+def test_a_path_may_come_first(folder: Path, exits: Program, tmp_path: Path) -> None:
     bags = folder / "a"
     for first, last in (
         (["cat", bags, "/odom"], ["cat", "/odom", bags]),
         (["ask", bags, "data_time_range"], ["ask", "data_time_range", bags]),
     ):
-        assert cli.main([*map(str, first)]) == 0
-        shown = capsys.readouterr().out
-        assert cli.main([*map(str, last)]) == 0
-        assert shown == capsys.readouterr().out
+        shown = exits(0, *first).out
+        assert shown == exits(0, *last).out
     for words in ([bags], [bags, "timeline"], [bags, "signal", "/odom"]):
         picture = tmp_path / "picture.svg"
-        assert cli.main(["plot", *map(str, words), "-o", str(picture)]) == 0
+        exits(0, "plot", *words, "-o", picture)
         picture.unlink()
 
 
@@ -460,16 +455,14 @@ def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, capsys: Capture) ->
 
 
 def test_commands_take_a_path_and_the_log_is_shown_on_request(
-    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
     assert run(capsys, "index", folder / "a")[0] == 0
     code, shown = run(capsys, "config", "show", folder / "a", "--json")
     assert (code, json.loads(shown)["recording.bag_dir"]) == (0, str(folder / "a"))
-    assert cli.main(["config", "show", "foo=[bar"]) == 2
-    assert "expecting" not in capsys.readouterr().err
-    assert cli.main(["-v", "info", str(folder / "a")]) == 0
-    assert "index_scanned" in capsys.readouterr().err
+    assert "expecting" not in exits(2, "config", "show", "foo=[bar").err
+    assert "index_scanned" in exits(0, "-v", "info", folder / "a").err
 
 
 def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, capsys: Capture) -> None:

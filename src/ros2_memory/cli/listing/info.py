@@ -17,11 +17,7 @@ from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
     AsJson,
-    BagDir,
-    Recording,
-    Verbose,
-    Words,
-    load_to_look,
+    Bags,
     open_memory,
     print_line,
     stdout_console,
@@ -57,19 +53,17 @@ _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 def topics(
-    words: Words = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    *,
+    bags: Bags,
 ) -> None:
     """List every recorded topic: type, messages, usual rate, first and last message.
 
     The rate is that of the topic's newest hour, from its first to its last message in each bag;
     latched topics and logs have none.
     """
-    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY], recording)
-    memory = open_memory(settings, verbose=verbose)
+    settings = bags.settings(_WHOLE_REPLY)
+    memory = open_memory(settings, verbose=bags.verbose)
     dispatcher = build_dispatcher(settings, memory)
     (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
     reply: JsonValue = json.loads(answer.text)
@@ -151,17 +145,15 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
 
 
 def info(
-    words: Words = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    *,
+    bags: Bags,
 ) -> None:
     """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
-    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
+    settings = bags.settings(_WHOLE_REPLY, "server.tools=all")
     robots = settings.fleet.robots
     if not robots:
-        report = _report(settings, verbose=verbose)
+        report = _report(settings, verbose=bags.verbose)
         if as_json:
             print_line(json.dumps(report.as_json()))
         else:
@@ -169,7 +161,9 @@ def info(
         are_bags = report.are_bags
     else:
         every = {
-            name: _report(robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING)
+            name: _report(
+                robot_settings(settings, name), verbose=bags.verbose, setting=ROBOTS_SETTING
+            )
             for name in robots
         }
         if as_json:
