@@ -227,9 +227,8 @@ def test_the_text_of_an_answer(answer: Answer, text: str) -> None:
         (ConfigError("say a"), '{"error":"invalid_config","detail":"say a"}'),
     ],
 )
-def test_having_no_data_is_an_answer_and_other_errors_are_such_for_the_protocol_too(
-    error: EpisodicError, text: str
-) -> None:
+def test_having_no_data_is_an_answer_with_its_reason(error: EpisodicError, text: str) -> None:
+    """Other errors are errors for the protocol, too."""
     reply = REPLIES.error(error)
     assert (reply.text, reply.is_error) == (
         text,
