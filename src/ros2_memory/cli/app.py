@@ -207,10 +207,10 @@ class LazyCommand(TyperCommand):
             parent.add_typer(loaded, name=self._name, epilog=epilog(self._name))
         elif callable(loaded):
             # Imported here, as the command is, since it imports much itself.
-            from ros2_memory.cli.options import reported_errors  # noqa: PLC0415
+            from ros2_memory.cli.options import as_command  # noqa: PLC0415
 
-            reporting = reported_errors(self._name)(loaded)
-            parent.command(self._name, epilog=epilog(self._name))(reporting)
+            command = as_command(self._name)(loaded)
+            parent.command(self._name, epilog=epilog(self._name))(command)
         return get_group(parent).commands[self._name]
 
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Final
 
@@ -33,6 +33,7 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import print_reply
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
+from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.timebase import unix_from_ns, unix_from_text
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
@@ -47,7 +48,6 @@ _SETTING: Final = re.compile(
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""
-_OF_TYPE: Final = ("type", "items")
 _MOST_ROWS: Final = 10
 """Waypoints that text shows."""
 _RECAP: Final = "recap"
@@ -115,9 +115,9 @@ def ask(
             print_reply(stdout_console(), rows)
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return
-    schema = tools[tool].schema if tool in tools else {}
-    asked = parse_arguments([each for each in words if each not in of_settings], schema)
-    arguments = with_times(asked, schema, unix_from_ns(present(memory)))
+    known = tools[tool].arguments if tool in tools else {}
+    asked = parse_arguments([each for each in words if each not in of_settings], known)
+    arguments = with_times(asked, known, unix_from_ns(present(memory)))
     arguments |= _newest_day(memory, tool, arguments)
     with spinner(f"asking {tool}"):
         (reply,) = call_tools(dispatcher, {tool: arguments})
@@ -159,12 +159,12 @@ def is_error(reply: JsonValue) -> bool:
     return isinstance(reply, dict) and "error" in reply
 
 
-def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[str, object]:
+def parse_arguments(given: Sequence[str], known: Mapping[str, JsonObject]) -> dict[str, object]:
     """Parses the arguments of a tool: one JSON object, or `key=value` each.
 
     Args:
         given: the words of the command line.
-        schema: the tool's JSON schema: what it takes as text is not parsed as JSON.
+        known: the JSON schemas of the tool's arguments: what is taken as text is not parsed.
 
     Raises:
         InvalidArgumentsError: a word is neither.
@@ -182,12 +182,12 @@ def parse_arguments(given: Sequence[str], schema: Mapping[str, object]) -> dict[
                 f"{word!r} is not an argument; write key=value, such as seconds_ago=10, or one "
                 "JSON object"
             )
-        arguments[key] = text if _takes_text(schema, key) else _from_json(text, text)
+        arguments[key] = text if _takes_text(known.get(key, {})) else _from_json(text, text)
     return arguments
 
 
 def with_times(
-    arguments: Mapping[str, object], schema: Mapping[str, object], now: float
+    arguments: Mapping[str, object], known: Mapping[str, JsonObject], now: float
 ) -> dict[str, object]:
     """Returns a tool's arguments, with times and durations as people write them in seconds.
 
@@ -196,13 +196,13 @@ def with_times(
     Raises:
         InvalidArgumentsError: a text is no time.
     """
-    properties = schema.get("properties")
-    known = properties if isinstance(properties, dict) else {}
     return {key: _in_seconds(value, known.get(key), now) for key, value in arguments.items()}
 
 
 def _in_seconds(value: object, schema: object, now: float) -> object:
-    kind, items = (schema.get(key) if isinstance(schema, dict) else None for key in _OF_TYPE)
+    kind, items = (
+        schema.get(key) if isinstance(schema, dict) else None for key in ("type", "items")
+    )
     if isinstance(value, list):
         return [_in_seconds(each, items, now) for each in value]
     if isinstance(value, str) and kind == "array":
@@ -225,15 +225,12 @@ def _from_json(text: str, otherwise: str | None) -> JsonValue:
     return value
 
 
-def _takes_text(schema: Mapping[str, object], key: str) -> bool:
-    properties = schema.get("properties")
-    known = properties.get(key) if isinstance(properties, dict) else None
-    if not isinstance(known, dict):
-        return False
-    several = known.get("anyOf")
-    kinds = [dict(each).get("type") for each in several] if isinstance(several, list) else ()
+def _takes_text(schema: JsonObject) -> bool:
+    several = schema.get("anyOf")
+    forms = several if isinstance(several, list) else []
+    kinds = [each.get("type") for each in forms if isinstance(each, dict)]
     # A list in place of one text is read from its JSON by the argument itself.
-    return known.get("type") == "string" or kinds == ["string", "array"]
+    return schema.get("type") == "string" or kinds == ["string", "array"]
 
 
 def _without_waypoints(answer: JsonValue) -> JsonValue:
@@ -252,15 +249,20 @@ def _without_waypoints(answer: JsonValue) -> JsonValue:
     return {key: each for key, each in answer.items() if key != "waypoints"} | shown
 
 
-def _tool_row(tool: Tool) -> JsonValue:
-    properties, required = tool.schema.get("properties"), tool.schema.get("required")
-    names = list(properties) if isinstance(properties, dict) else []
+def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:
+    """Yields each argument with its schema; the name of one that may be left out ends in `?`."""
+    required = tool.schema.get("required")
     needed = required if isinstance(required, list) else []
+    for name, schema in tool.arguments.items():
+        yield name if name in needed else f"{name}?", schema
+
+
+def _tool_row(tool: Tool) -> JsonValue:
     purpose, _, _ = tool.description.removeprefix("Blocking. ").partition(". ")
     return {
         "tool": tool.name,
         "purpose": purpose.partition(";")[0].rstrip("."),
-        "arguments": ", ".join(each if each in needed else f"{each}?" for each in names),
+        "arguments": ", ".join(name for name, _ in _arguments(tool)),
     }
 
 
@@ -274,12 +276,6 @@ def _print_help(name: str) -> None:
     if name not in tools:
         raise InvalidArgumentsError(f"there is no tool {name}; the tools are {', '.join(tools)}")
     tool = tools[name]
-    properties, required = tool.schema.get("properties"), tool.schema.get("required")
     print_line(f"ros2-memory ask {name} key=value ... [PATH]\n\n{tool.description}\n")
-    for key, each in properties.items() if isinstance(properties, dict) else ():
-        shape = each if isinstance(each, dict) else {}
-        described = str(shape.get("description", ""))
-        if isinstance(examples := shape.get("examples"), list) and examples:
-            described += f" For example {json.dumps(examples[0])}."
-        needed = "" if isinstance(required, list) and key in required else "?"
-        print_line(f"  {key + needed:<20} {described.strip()}".rstrip())
+    for argument, schema in _arguments(tool):
+        print_line(f"  {argument:<20} {schema.get('description', '')}".rstrip())

@@ -15,9 +15,9 @@ from ros2_memory.cli.options import (
     AsJson,
     BagDir,
     Words,
-    load_given_with_sources,
+    as_command,
+    load_given,
     print_line,
-    reported_errors,
 )
 from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
@@ -32,7 +32,7 @@ config = typer.Typer(
 
 
 @config.command("show", epilog=epilog("config"))
-@reported_errors("config show")
+@as_command("config show")
 def config_show(
     words: Words = None,
     bag_dir: BagDir = None,
@@ -47,7 +47,7 @@ def config_show(
     given = words or []
     named = [each for each in given if re.fullmatch(r"[a-z_][\w.]*", each)]
     rest = [each for each in given if each not in named]
-    settings, source = load_given_with_sources(bag_dir, rest)
+    settings, source = load_given(bag_dir, rest)
     values = _chosen(dict(_keys(plain_values(settings))), named)
     if as_json:
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}

@@ -9,14 +9,14 @@ import json
 import os
 import shutil
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import filterfalse
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeAlias, TypeVar
 
 import typer
 from rich.console import Console
@@ -27,18 +27,11 @@ from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bootstrap import build_recorder, query_settings_of
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.doctor_lake import check_lake, check_shipping
-from ros2_memory.cli.findings import Finding, Level
-from ros2_memory.cli.findings import error as _error
-from ros2_memory.cli.findings import in_order as _ok
-from ros2_memory.cli.findings import warning as _warning
+from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
 from ros2_memory.cli.listing.info import assumed_active
 from ros2_memory.cli.options import (
     AsJson,
-    BagDir,
-    Recording,
-    Verbose,
-    Words,
-    load_to_look,
+    Bags,
     open_memory,
     print_line,
     spinner,
@@ -70,6 +63,9 @@ from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
 from ros2_memory.storage.base import BagReader, Closing
 
+T = TypeVar("T")
+Check: TypeAlias = Callable[[Examined], Iterator[Finding]]
+
 _RECENT_NS: Final[Ns] = 3600 * NS_PER_S
 """A topic without a message in the newest data of this length is not being recorded."""
 _HEALTH_TIMEOUT_S: Final = 5.0
@@ -94,18 +90,12 @@ _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros
 _STYLES: Final = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
 
 
-def doctor(
-    words: Words = None,
-    as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
-) -> None:
+def doctor(as_json: AsJson = False, *, bags: Bags) -> None:
     """Check configuration, disk, clock, bags, recorder, ROS environment, topics and server.
 
     Each finding says how to fix it.
     """
-    findings = [*_examine(bag_dir, words, recording, verbose=verbose)]
+    findings = [*_examine(bags)]
     worst = max(each.level for each in findings)
     if as_json:
         rows = [asdict(each) | {"level": each.level.name.lower()} for each in findings]
@@ -115,65 +105,52 @@ def doctor(
     raise typer.Exit(int(worst))
 
 
-def _examine(
-    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None, *, verbose: bool
-) -> Iterator[Finding]:
+def _examine(bags: Bags) -> Iterator[Finding]:
     """Yields all findings; one alone where the configuration is refused."""
     try:
-        settings = load_to_look(bag_dir, words, recording)
+        settings = bags.settings()
         robots = settings.fleet.robots
-        memory = None if robots else open_memory(settings, verbose=verbose)
-    except ConfigError as error:
-        yield _error("config", str(error), "correct the key that it names")
+        memory = None if robots else open_memory(settings, verbose=bags.verbose)
+    except ConfigError as refused:
+        yield Finding(Level.ERROR, "config", str(refused), "correct the key that it names")
         return
-    yield _ok("config", f"composed from {config_dir(os.environ)}")
+    yield Finding(Level.OK, "config", f"composed from {config_dir(os.environ)}")
     if memory is None:
         for name in robots:
-            yield from _of_robot(name, robot_settings(settings, name), verbose=verbose)
+            yield from _of_robot(name, robot_settings(settings, name), verbose=bags.verbose)
         with spinner("asking the lake"):
-            yield from check_lake(settings)
-        yield from check_extras(settings)
-        yield from check_server(settings)
+            yield from _found({"lake": check_lake} | _OF_SETTINGS, settings)
         return
-    now, snapshot = memory.clock.now(), memory.index.snapshot()
     with spinner("asking the disk, ros2, the recorder and the server"):
-        foreign = memory.foreign(snapshot)
-        yield from check_bag_dir(settings, 0 if foreign is None else foreign.total_bytes)
-        yield from check_clock(snapshot, now)
-        yield from check_bags(settings, memory)
-        yield from check_recordings(memory, snapshot)
-        yield from check_columns(memory)
-        recorder = settings.recorder
-        if isinstance(recorder, NullRecorderNode):
-            yield _ok("recorder", "recorder=none: nothing is recorded here")
+        robot = Examined(settings, memory, memory.index.snapshot(), memory.clock.now())
+        yield from _found(_OF_BAGS, robot)
+        if isinstance(settings.recorder, NullRecorderNode):
+            yield Finding(Level.OK, "recorder", "recorder=none: nothing is recorded here")
         else:
-            yield from check_ros(settings, recorder.setup_files, memory.reader, now)
-            yield from check_recorder(settings, now)
-            yield from check_shipping(settings, snapshot, now)
-            yield from check_topics(settings, snapshot, now)
-        yield from check_extras(settings)
-        yield from check_server(settings)
+            yield from _found(_OF_RECORDER, robot)
+        yield from _found(_OF_SETTINGS, settings)
+
+
+def _found(checks: Mapping[str, Callable[[T], Iterator[Finding]]], what: T) -> Iterator[Finding]:
+    """Yields the findings of checks by their concerns."""
+    for about, check in checks.items():
+        for each in check(what):
+            yield replace(each, about=each.about or about)
 
 
 def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
     """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
     memory = open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
-    now, snapshot = memory.clock.now(), memory.index.snapshot()
+    snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
+    found: Iterable[Finding]
     if snapshot.problem:
         do = "is the disk mounted? The other robots are answered for meanwhile"
-        yield _warning("robot", f"{name}: {own.recording.bag_dir}: {snapshot.problem}", do)
-        return
-    if not (snapshot.bags or snapshot.active):
+        found = [warning(f"{bag_dir}: {snapshot.problem}", do)]
+    elif not (snapshot.bags or snapshot.active):
         do = f"{ROBOTS_SETTING} names another directory for it"
-        yield _warning("robot", f"{name}: {own.recording.bag_dir}: {nothing_here(snapshot)}", do)
-        return
-    found = [
-        *check_bag_dir(own),
-        *check_clock(snapshot, now),
-        *check_bags(own, memory),
-        *check_recordings(memory, snapshot),
-        *check_columns(memory),
-    ]
+        found = [warning(f"{bag_dir}: {nothing_here(snapshot)}", do)]
+    else:
+        found = _found(_OF_BAGS, Examined(own, memory, snapshot, memory.clock.now()))
     for each in found:
         if each.level is not Level.OK or each.about == "bags":
             yield replace(each, about="robot", seen=f"{name}: {each.seen}")
@@ -191,30 +168,22 @@ def _print(console: Console, findings: Sequence[Finding]) -> None:
             console.print(Text(f"{'':17}-> {escape(each.do)}"), soft_wrap=True)
 
 
-def check_bag_dir(settings: Settings, foreign_bytes: int = 0) -> Iterator[Finding]:
-    """Checks that the bag directory exists, that this user may use it, and that its disk has room.
-
-    `foreign_bytes` is the size of the bags that the recorder did not make and does not delete.
-    """
-    bag_dir = settings.recording.bag_dir.absolute()
-    records = not isinstance(settings.recorder, NullRecorderNode)
+def check_bag_dir(robot: Examined) -> Iterator[Finding]:
+    """Checks that the bag directory exists, and that this user may use it."""
+    bag_dir = robot.settings.recording.bag_dir.absolute()
+    records = not isinstance(robot.settings.recorder, NullRecorderNode)
     if not bag_dir.is_dir():
         if not records:
             do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
-            yield _error("bag_dir", f"{bag_dir} is not a directory", do)
+            yield error(f"{bag_dir} is not a directory", do)
             return
         do = "the recorder makes it when it starts; is its disk mounted?"
-        yield _warning("bag_dir", f"{bag_dir} is not there", do)
+        yield warning(f"{bag_dir} is not there", do)
     else:
         yield _check_permissions(bag_dir, records=records)
     if (bag_dir / ERASING_FILE).exists():
         seen = "an earlier `ros2-memory forget` was interrupted: some data to delete is still there"
-        yield _warning("bag_dir", seen, "run any `ros2-memory forget`: it finishes that first")
-    if records:
-        yield _check_disk(settings, bag_dir, foreign_bytes)
-        if (budget := settings.retention.max_total_gb) < SMALL_BUDGET_GB:
-            do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
-            yield _warning("disk", small_budget(budget), do)
+        yield warning(seen, "run any `ros2-memory forget`: it finishes that first")
 
 
 def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
@@ -224,26 +193,38 @@ def _check_permissions(bag_dir: Path, *, records: bool) -> Finding:
         user = f"user {os.getuid()}"
     if not os.access(bag_dir, os.R_OK | os.X_OK):
         do = "give this user the right to read it, or run as the user of the services"
-        return _error("bag_dir", f"{user} may not read {bag_dir}", do)
+        return error(f"{user} may not read {bag_dir}", do)
     if not records:
-        return _ok("bag_dir", f"{bag_dir}, readable by {user}")
+        return ok(f"{bag_dir}, readable by {user}")
     if os.access(bag_dir, os.R_OK | os.W_OK | os.X_OK):
-        return _ok("bag_dir", f"{bag_dir}, readable and writable by {user}")
+        return ok(f"{bag_dir}, readable and writable by {user}")
     do = (
         "fine if the recorder runs as another user, who may: "
         "sudo -u USER ros2-memory doctor looks as that one"
     )
-    return _warning("bag_dir", f"{bag_dir}, readable but not writable by {user}", do)
+    return warning(f"{bag_dir}, readable but not writable by {user}", do)
 
 
-def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Finding:
+def check_disk(robot: Examined) -> Iterator[Finding]:
+    """Checks that the disk has room for the budget, where bags are recorded."""
+    if isinstance(robot.settings.recorder, NullRecorderNode):
+        return
+    yield _room(robot)
+    if (budget := robot.settings.retention.max_total_gb) < SMALL_BUDGET_GB:
+        do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
+        yield warning(small_budget(budget), do)
+
+
+def _room(robot: Examined) -> Finding:
+    bag_dir, limits = robot.settings.recording.bag_dir.absolute(), robot.settings.retention
     existing = next(each for each in (bag_dir, *bag_dir.parents) if each.is_dir())
     try:
         disk = shutil.disk_usage(existing)
-    except OSError as error:
-        return _error("disk", f"{existing} cannot be measured: {error}", "look after the disk")
+    except OSError as problem:
+        return error(f"{existing} cannot be measured: {problem}", "look after the disk")
     mount = next(each for each in (existing, *existing.parents) if os.path.ismount(each))
-    limits = settings.retention
+    foreign = robot.memory.foreign(robot.snapshot)
+    foreign_bytes = 0 if foreign is None else foreign.total_bytes
     free, used = disk.free / GB, max(_size(bag_dir) - foreign_bytes, 0) / GB
     state = state_bytes_in(bag_dir) / GB
     seen = (
@@ -260,14 +241,14 @@ def _check_disk(settings: Settings, bag_dir: Path, foreign_bytes: int) -> Findin
             f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
             "other files on this disk"
         )
-        return _error("disk", seen, do)
+        return error(seen, do)
     if free - limits.min_free_gb < limits.max_total_gb - used:
         do = (
             "the disk is full before the budget is: lower retention.max_total_gb to "
             f"{max(free - limits.min_free_gb + used, 0):.1f}, or make room"
         )
-        return _warning("disk", seen, do)
-    return _ok("disk", seen)
+        return warning(seen, do)
+    return ok(seen)
 
 
 def _size(folder: Path) -> int:
@@ -282,49 +263,50 @@ def _size(folder: Path) -> int:
     return sum(sizes.values())
 
 
-def check_clock(snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+def check_clock(robot: Examined) -> Iterator[Finding]:
     """Checks this machine's clock, and those of the machines that dated the bags."""
+    snapshot, now = robot.snapshot, robot.now
     do = "set the clock (timedatectl, chrony); bags keep the dates they were given"
     latest = snapshot.dating.latest
     if now < FIRST_BAGS_NS:
-        yield _error("clock", f"it shows {iso_local(now)}: it was never set", do)
+        yield error(f"it shows {iso_local(now)}: it was never set", do)
     elif latest is not None and latest > now + FUTURE_NS:
         seen = f"the newest data is dated {unix_from_ns(latest - now):.0f} s after the present"
-        yield _error("clock", seen, do)
+        yield error(seen, do)
     elif snapshot.dating.faults:
         faults = counted(len(snapshot.dating.faults), "bag was", "bags were")
         seen = f"{faults} dated by a wrong clock: `ros2-memory info` lists them"
-        yield _warning("clock", seen, do)
+        yield warning(seen, do)
     else:
-        yield _ok("clock", f"{iso_local(now)} (this machine)")
+        yield ok(f"{iso_local(now)} (this machine)")
 
 
-def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
-    """Checks that all bags can be read, and all messages in them decoded."""
+def check_bags(robot: Examined) -> Iterator[Finding]:
+    """Checks that all bags can be read, and all messages in them decoded; and what they hold."""
+    settings, memory, snapshot, _ = robot
     covered = data_time_range(memory, Call())
-    snapshot = memory.index.snapshot()
     if snapshot.problem:
-        yield _error("bags", snapshot.problem, "see bag_dir above; is the disk mounted?")
+        yield error(snapshot.problem, "see bag_dir above; is the disk mounted?")
         return
     if covered.bags or covered.active:
         newest = "" if covered.latest is None else f"; newest: {iso_local(covered.latest)}"
         files = counted(covered.bags, "bag file is", "bag files are")
-        yield _ok("bags", f"{files} readable{newest}")
+        yield ok(f"{files} readable{newest}")
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
-        yield _warning("bags", nothing_here(snapshot), do)
+        yield warning(nothing_here(snapshot), do)
     if broken := (*covered.damaged, *covered.incomplete):
         names = listed([f"{each.path.name} ({each.reason})" for each in broken])
         seen = f"{len(covered.damaged)} damaged and {len(covered.incomplete)} unfinished: {names}"
-        yield _warning("bags", seen, _how_to_repair(broken, memory.reader, settings))
+        yield warning(seen, _how_to_repair(broken, memory.reader, settings))
     if covered.unread:
         names = listed([each.path.name for each in covered.unread])
         files = counted(len(covered.unread), "file is", "files are")
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
-        yield _warning("bags", f"{files} not read: {names}", do)
+        yield warning(f"{files} not read: {names}", do)
     yield from _check_remarks(snapshot)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
-        yield _warning("bags", sentence, "copy the missing data from its source")
+        yield warning(sentence, "copy the missing data from its source")
     # The reason names the key where a configured folder would help.
     missing = [each for each in covered.undecodable if _MSG_FOLDERS in each.reason]
     others = [each for each in covered.undecodable if _MSG_FOLDERS not in each.reason]
@@ -332,9 +314,8 @@ def check_bags(settings: Settings, memory: Memory) -> Iterator[Finding]:
     for topics, do in ((missing, name_them), (others, _NOT_DECODED)):
         if topics:
             names = listed([f"{each.topic} ({each.reason})" for each in topics])
-            yield _warning(
-                "bags", f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do
-            )
+            yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
+    yield from _check_recordings(memory, snapshot)
 
 
 def _check_remarks(snapshot: Snapshot) -> Iterator[Finding]:
@@ -351,7 +332,7 @@ def _check_remarks(snapshot: Snapshot) -> Iterator[Finding]:
     ):
         if some:
             names = listed([f"{each.path.name} ({'; '.join(each.summary.notes)})" for each in some])
-            yield _warning("bags", f"{counted(len(some), one, many)}: {names}", do)
+            yield warning(f"{counted(len(some), one, many)}: {names}", do)
 
 
 def _how_to_repair(broken: Sequence[SetAside], reader: BagReader, settings: Settings) -> str:
@@ -370,7 +351,7 @@ def _is_repairable(path: Path, reader: BagReader) -> bool:
         return False
 
 
-def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
+def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
     """Checks that the recordings are one history, and that no file counts as active by mistake."""
     pairs = sorted(mixed_recordings(memory, Call()), key=lambda each: each.topic is None)
     do = (
@@ -385,19 +366,19 @@ def check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
         )
         if topic is not None:
             seen += f"; each has different messages on {topic}, as from two robots"
-        yield _warning("bags", seen, do)
+        yield warning(seen, do)
     for contradiction in contradicting_frames(memory, Call())[:MAX_NAMED]:
-        yield _warning("bags", str(contradiction), do)
+        yield warning(str(contradiction), do)
     if len(pairs) > MAX_NAMED:
         seen = counted(len(pairs) - MAX_NAMED, "more pair overlaps", "more pairs overlap")
-        yield _warning("bags", seen, "`ros2-memory info` lists them all")
+        yield warning(seen, "`ros2-memory info` lists them all")
     for path, until in assumed_active(memory, snapshot):
         seen = (
             f"{path.parent.name}/{path.name} has no end and was written lately: until "
             f"{iso_local(until)} it counts as still being written"
         )
         do = "if no program writes it (a copy), wait until then: answers use its readable part"
-        yield _warning("bags", seen, do)
+        yield warning(seen, do)
 
 
 def check_columns(memory: Memory) -> Iterator[Finding]:
@@ -408,70 +389,71 @@ def check_columns(memory: Memory) -> Iterator[Finding]:
     dropped = store.dropped()
     if store.trouble is not None:
         do = "answers are right, and slower; free the disk, or let it be written"
-        yield _warning("columns", f"the store of columns {store.trouble}", do)
+        yield warning(f"the store of columns {store.trouble}", do)
     if store.refusals:
         bags = counted(store.refusals, "bag")
         do = "answers are right, and slower; please report this as a defect, with the reason"
-        yield _warning("columns", f"{bags} could not be stored ({store.refused_for})", do)
+        yield warning(f"{bags} could not be stored ({store.refused_for})", do)
     if dropped:
         since = iso_local(min(dropped.values()))
         seen = f"topics beyond store.max_share since {since}, whose bags are read: "
-        yield _ok("columns", f"{seen}{', '.join(dropped)}")
+        yield ok(f"{seen}{', '.join(dropped)}")
 
 
-def check_recorder(settings: Settings, now: Ns) -> Iterator[Finding]:
+def check_recorder(robot: Examined) -> Iterator[Finding]:
     """Checks what the recorder's heartbeat reports."""
-    heartbeat, reason = read_heartbeat(settings.recording.bag_dir)
+    now = robot.now
+    heartbeat, reason = read_heartbeat(robot.settings.recording.bag_dir)
     if heartbeat is None:
-        yield _error("recorder", str(reason), _START_RECORDER)
+        yield error(str(reason), _START_RECORDER)
         return
     age = f"{unix_from_ns(abs(now - heartbeat.updated)):.0f} s ago"
     if heartbeat.state is RecorderState.STOPPED:
-        yield _warning("recorder", f"it was stopped {age}", _START_RECORDER)
+        yield warning(f"it was stopped {age}", _START_RECORDER)
     elif not heartbeat.is_live(now):
         do = f"journalctl -u ros2-memory-recorder says why it ended; {_START_RECORDER}"
-        yield _error("recorder", f"its last heartbeat was {age}, and gives no reason to end", do)
+        yield error(f"its last heartbeat was {age}, and gives no reason to end", do)
     elif heartbeat.state is RecorderState.PAUSED:
         why = heartbeat.last_error or "it gives no reason"
-        yield _error("recorder", f"it is paused: {why}", "see disk above")
+        yield error(f"it is paused: {why}", "see disk above")
     elif heartbeat.state is RecorderState.WAITING:
-        yield _error("recorder", "it waits, and has recorded nothing", str(heartbeat.waiting_for))
+        yield error("it waits, and has recorded nothing", str(heartbeat.waiting_for))
     else:
         subscribed = counted(len(heartbeat.subscribed), "topic")
-        yield _ok("recorder", f"{heartbeat.state}, {subscribed} subscribed")
+        yield ok(f"{heartbeat.state}, {subscribed} subscribed")
         yield from _check_heartbeat(heartbeat)
 
 
 def _check_heartbeat(heartbeat: Heartbeat) -> Iterator[Finding]:
     for seen in required_missing(heartbeat):
-        yield _error("recorder", seen, "are their publishers running? compare recording.required")
+        yield error(seen, "are their publishers running? compare recording.required")
     for seen in unrecorded(heartbeat):
-        yield _warning("recorder", seen, _UNRECORDED)
+        yield warning(seen, _UNRECORDED)
     if silent := sorted({*heartbeat.silent} - {*heartbeat.unheard, *heartbeat.fell_silent}):
         do = (
             "is their publisher running? If it runs as another user, the recorder receives it only "
             "over the network: set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 for the recorder; in the "
             "discovery range LOCALHOST that has no effect, see docs/how-to/systemd.md"
         )
-        yield _warning("recorder", f"subscribed, but no messages from: {listed(silent)}", do)
+        yield warning(f"subscribed, but no messages from: {listed(silent)}", do)
     if heartbeat.age_held:
         do = "synchronise the clock (timedatectl set-ntp true, or chrony); the budget still holds"
-        yield _warning("recorder", heartbeat.age_held, do)
+        yield warning(heartbeat.age_held, do)
     if heartbeat.unshipped:
         do = "does ros2-memory ship run? raise retention.max_total_gb until it has caught up"
-        yield _warning("recorder", heartbeat.unshipped, do)
+        yield warning(heartbeat.unshipped, do)
     if heartbeat.list_refused:
-        yield _error("recorder", heartbeat.list_refused, "correct the list of topics")
+        yield error(heartbeat.list_refused, "correct the list of topics")
     if heartbeat.failing_rules:
         do = (
             "correct the rule in the file that recording.exclude_when names, and restart the "
             "recorder: it then reads the splits that are held back; see docs/how-to/forget.md"
         )
         found = heartbeat.held_back or listed(heartbeat.failing_rules)
-        yield _error("recorder", found, do)
+        yield error(found, do)
     elif heartbeat.held_back:
         do = "free the disk, or repair the file; docs/how-to/forget.md says what becomes of it"
-        yield _warning("recorder", heartbeat.held_back, do)
+        yield warning(heartbeat.held_back, do)
     yield from _check_error(heartbeat)
 
 
@@ -484,42 +466,44 @@ def _check_error(heartbeat: Heartbeat) -> Iterator[Finding]:
             times = counted(heartbeat.restarts, "time")
             seen = f"it restarted ros2 bag record {times}; {seen}"
         if heartbeat.recovered:
-            yield _ok("recorder", f"recording goes on since; {seen}")
+            yield ok(f"recording goes on since; {seen}")
         else:
-            yield _warning("recorder", seen, "see its log")
+            yield warning(seen, "see its log")
 
 
-def check_ros(
-    settings: Settings, setup_files: Sequence[Path], reader: BagReader, now: Ns
-) -> Iterator[Finding]:
+def check_ros(robot: Examined) -> Iterator[Finding]:
     """Checks that `ros2 bag record` runs in the environment that the recorder gives it.
 
     A recorder that is running may have its setup files by its own arguments.
     """
+    settings, memory, _, now = robot
+    recorder = settings.recorder
+    setup_files = () if isinstance(recorder, NullRecorderNode) else recorder.setup_files
     try:
-        build_recorder(settings, reader=reader).check()
-    except EpisodicError as error:
-        reason, _, do = str(error).partition("; ")
+        build_recorder(settings, reader=memory.reader).check()
+    except EpisodicError as problem:
+        reason, _, do = str(problem).partition("; ")
         heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
         runs = heartbeat is not None and heartbeat.state is not RecorderState.STOPPED
         if not setup_files and heartbeat is not None and runs and heartbeat.is_live(now):
             seen = f"{reason} with these settings, but the running recorder has it by its own"
             do = "give this command the recorder's settings (its environment and arguments)"
-            yield _warning("ros", seen, do)
+            yield warning(seen, do)
             return
-        yield _error("ros", reason, do or "correct recorder.setup_files")
+        yield error(reason, do or "correct recorder.setup_files")
     else:
         files = ", ".join(map(str, setup_files))
-        yield _ok("ros", f"ros2 bag record can be run{f' after {files}' if files else ''}")
+        yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")
 
 
-def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+def check_topics(robot: Examined) -> Iterator[Finding]:
     """Checks that the topics of `topics.yaml` have been recorded lately."""
+    settings, _, snapshot, now = robot
     file = settings.recording.topics_file
     try:
         selection = load_topics(file)
-    except EpisodicError as error:
-        yield _error("topics", str(error), "correct recording.topics_file")
+    except EpisodicError as problem:
+        yield error(str(problem), "correct recording.topics_file")
         return
     heartbeat = read_heartbeat(settings.recording.bag_dir).heartbeat
     live = heartbeat if heartbeat and heartbeat.is_live(now) else None
@@ -532,10 +516,10 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         return
     entries = counted(len(selection.entries), "entry", "entries")
     if not snapshot.bags:
-        yield _ok("topics", f"{file} lists {entries}; nothing is recorded yet")
+        yield ok(f"{file} lists {entries}; nothing is recorded yet")
     elif not missing and not unoffered:
         seen = f"{entries} of {file}: all are in the newest hour of data, or latched"
-        yield _ok("topics", seen)
+        yield ok(seen)
     unknown = live.unknown_types if live else ()
     # ros2 bag record names one topic of each unknown type.
     unseen = f"{_UNOFFERED}, or its type is unknown, too" if unknown else _UNOFFERED
@@ -545,15 +529,15 @@ def check_topics(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Fi
         if of_unknown := [*filter(TopicSelection((entry,)).matches, unknown)]:
             seen = f"{entry} is in {file}; ros2 bag record does not know the type of"
             do = "name the workspace that defines it in recorder.setup_files"
-            yield _warning("topics", f"{seen} {listed(of_unknown)}", do)
+            yield warning(f"{seen} {listed(of_unknown)}", do)
             continue
         seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
         do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
-        yield _warning("topics", seen, f"{hint}{do}")
+        yield warning(seen, f"{hint}{do}")
     for entry in unoffered:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
-            yield _warning("topics", f"{entry} is in {file}; {unseen}", do)
+            yield warning(f"{entry} is in {file}; {unseen}", do)
 
 
 def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding | None:
@@ -568,7 +552,7 @@ def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Findi
         "give this command the recorder's settings (its environment and key=value arguments); "
         "a changed list is taken within seconds"
     )
-    return _warning("topics", seen, do)
+    return warning(seen, do)
 
 
 def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding:
@@ -584,7 +568,7 @@ def _changed_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Fin
         "a changed list is taken within seconds; if the recorder has another file, give this "
         "command its settings"
     )
-    return _warning("topics", f"the running recorder has another list: {'; '.join(what)}", do)
+    return warning(f"the running recorder has another list: {'; '.join(what)}", do)
 
 
 def _of_another_list(selection: TopicSelection, heartbeat: Heartbeat) -> list[str]:
@@ -630,20 +614,20 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
     for key, modules in wanted.items():
         if missing := [name for name in modules if not _is_installed(name)]:
             seen = f"{key}=true needs {', '.join(missing)}, which cannot be imported"
-            yield _error("extras", seen, do)
+            yield error(seen, do)
         else:
-            yield _ok("extras", f"what {key}=true needs is installed")
+            yield ok(f"what {key}=true needs is installed")
     if server.metrics and server.transport == "stdio":
         seen = "server.metrics=true with server.transport=stdio, which has no /metrics"
         do = "choose server.transport=sse, or set server.metrics to false"
-        yield _error("extras", seen, do)
+        yield error(seen, do)
     states = [
         f"{what} is installed"
         if _is_installed(module)
         else f"{what} is not installed: pip install '.[{extra}]' adds it"
         for what, module, extra in _COMMANDS_OF_EXTRAS
     ]
-    yield _ok("extras", "; ".join(states))
+    yield ok("; ".join(states))
 
 
 def _is_installed(module: str) -> bool:
@@ -659,31 +643,31 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     server = settings.server
     if server.transport == "stdio":
         seen = "server.transport=stdio: each client starts its own server"
-        yield _ok("server", seen)
+        yield ok(seen)
         return
     address = f"{server.host} port {server.port}"
     start = time.monotonic()
     try:
         status, reply = _health(server.host, server.port)
-    except (OSError, http.client.HTTPException) as error:
+    except (OSError, http.client.HTTPException) as problem:
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
-        yield _error("server", f"nothing answers on {address}: {error}", do)
+        yield error(f"nothing answers on {address}: {problem}", do)
         return
-    except (ValueError, EpisodicError) as error:
-        seen = f"another program answers on {address}: {error}"
-        yield _error("server", seen, "give the server another port: server.port")
+    except (ValueError, EpisodicError) as problem:
+        seen = f"another program answers on {address}: {problem}"
+        yield error(seen, "give the server another port: server.port")
         return
     duration_ms = (time.monotonic() - start) * 1000
     problems = reply.get("problems")
     if status == http.HTTPStatus.UNAUTHORIZED:
         seen = f"the server on {address} takes another token than MEMORY_API_TOKEN"
-        yield _warning("server", seen, "give doctor the token that the server was started with")
+        yield warning(seen, "give doctor the token that the server was started with")
     elif reply.get("status") == "ok":
-        yield _ok("server", f"ok on {address}, in {duration_ms:.0f} ms")
+        yield ok(f"ok on {address}, in {duration_ms:.0f} ms")
     else:
         why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
         seen = f"{reply.get('status', f'HTTP {status}')}: {why or 'it gives no reason'}"
-        yield _warning("server", seen, "the findings above and its log have the cause")
+        yield warning(seen, "the findings above and its log have the cause")
 
 
 def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
@@ -711,3 +695,20 @@ def _health(host: str, port: int) -> tuple[int, dict[str, JsonValue]]:
     if not isinstance(reply, dict) or "status" not in reply:
         raise ValueError("it gives no status")
     return response.status, reply
+
+
+_OF_BAGS: Final[Mapping[str, Check]] = {
+    "bag_dir": check_bag_dir,
+    "disk": check_disk,
+    "clock": check_clock,
+    "bags": check_bags,
+    "columns": lambda robot: check_columns(robot.memory),
+}
+_OF_RECORDER: Final[Mapping[str, Check]] = {
+    "ros": check_ros,
+    "recorder": check_recorder,
+    "shipping": check_shipping,
+    "topics": check_topics,
+}
+_OF_SETTINGS: Final = {"extras": check_extras, "server": check_server}
+"""The checks by their concerns, in the order in which they are printed."""

@@ -17,7 +17,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
 from ros2_memory.bootstrap_lake import lake_location
-from ros2_memory.cli.findings import Finding, error, in_order, warning
+from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import ConfigError, LakeError
 from ros2_memory.core.model import BagState
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.config import Settings
-    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.lake.warehouse import LakeLocation
 
 _LATE_NS: Final[Ns] = 3600 * NS_PER_S
 """A hub that is reached has confirmed closed bags after this time."""
 
 
-def check_shipping(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[Finding]:
+def check_shipping(robot: Examined) -> Iterator[Finding]:
     """Checks, where age waits until bags are shipped, whether they are."""
+    settings, _, snapshot, now = robot
     if not settings.retention.require_shipped:
         return
     bag_dir = settings.recording.bag_dir
@@ -45,7 +45,7 @@ def check_shipping(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[
         receipts = read_receipts(bag_dir)
     except OSError as problem:
         seen = f"{bag_dir / SHIPPED_FILE} cannot be read: {problem.strerror or problem}"
-        yield error("shipping", seen, "correct its permissions: until then no bag is shipped")
+        yield error(seen, "correct its permissions: until then no bag is shipped")
         return
     closed = [
         (relative(bag.file, str(bag_dir)), bag)
@@ -63,9 +63,9 @@ def check_shipping(settings: Settings, snapshot: Snapshot, now: Ns) -> Iterator[
     is_late = newest is None or now - newest > _LATE_NS
     if waiting and is_late and min(bag.end for bag in waiting) < now - _LATE_NS:
         do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
-        yield warning("shipping", seen, do)
+        yield warning(seen, do)
     else:
-        yield in_order("shipping", seen)
+        yield ok(seen)
 
 
 def check_lake(settings: Settings) -> Iterator[Finding]:
@@ -77,14 +77,14 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         committed = location.last_commit()
     except (ConfigError, LakeError) as problem:
         do = "correct lake.warehouse, lake.uri or what leads there; nothing is lost meanwhile"
-        yield error("lake", str(problem), do)
+        yield error(str(problem), do)
         return
     if committed is None:
         do = "ros2-memory ship makes it; was it there before, is its disk mounted?"
-        yield warning("lake", f"{location.warehouse} has no bag yet", do)
+        yield warning(f"{location.warehouse} has no bag yet", do)
     else:
         seen = f"{location.warehouse}; its newest commit is from {iso_local(committed)}"
-        yield in_order("lake", seen)
+        yield ok(seen)
     # A server that asks the lake ships nothing.
     if settings.lake.engine is None:
         yield from _check_writer(location, has_bags=committed is not None)
@@ -102,13 +102,13 @@ def _check_writer(location: LakeLocation, *, has_bags: bool) -> Iterator[Finding
             "bags: another machine or folder was used to write it"
         )
         do = "share that folder: the lock of the one writer is there, and what was forgotten"
-        yield warning("lake", seen, do)
+        yield warning(seen, do)
     try:
         holder = holder_of(location.state_dir)
     except LakeError as problem:
-        yield error("lake", str(problem), "choose another lake.state_dir")
+        yield error(str(problem), "choose another lake.state_dir")
         return
-    yield in_order("lake", f"{holder or 'no process'} writes into it now")
+    yield ok(f"{holder or 'no process'} writes into it now")
 
 
 def _check_receipts(name: str, bag_dir: Path) -> Iterator[Finding]:
@@ -124,5 +124,5 @@ def _check_receipts(name: str, bag_dir: Path) -> Iterator[Finding]:
                     "retention.require_shipped can never work on that robot"
                 )
                 do = "mount it writable for the user of ros2-memory ship, or do not require it"
-                yield warning("robot", seen, do)
+                yield Finding(Level.WARNING, "robot", seen, do)
             return

@@ -7,23 +7,15 @@ from dataclasses import replace
 from functools import cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, Final
 
 import typer
 
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
-    BagDir,
-    End,
-    Last,
-    Recording,
-    Start,
-    Verbose,
-    Words,
-    load_to_look,
-    open_memory,
-    parse_window,
+    Bags,
+    Times,
     print_line,
 )
 from ros2_memory.cli.output import progress_bar, with_local_times
@@ -35,7 +27,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
     UndecodableError,
 )
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
@@ -49,7 +41,6 @@ _REPORT_EVERY: Final = 512
 
 
 def export(
-    words: Words = None,
     *,
     mcap: Annotated[
         Path | None,
@@ -68,9 +59,7 @@ def export(
         list[str] | None,
         typer.Option(metavar="GLOB", help="Copy only these topics, such as /vision/*; repeatable."),
     ] = None,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     latched: Annotated[
         bool | None,
         typer.Option(
@@ -86,9 +75,7 @@ def export(
         ),
     ] = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Copy a time window to MCAP or Parquet, each message once.
 
@@ -97,10 +84,9 @@ def export(
     """
     if (mcap is None) == (parquet is None):
         raise InvalidArgumentsError("give one of --mcap FILE and --parquet DIR")
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
+    memory = bags.memory()
     view = View(memory, Call())
-    window = parse_window(memory, start, end, last)
+    window = times.window(memory)
     topics = _topics(view, topic or ())
     note_unread(view, window)
     with _progress(view, window) as report:
@@ -121,9 +107,11 @@ def export(
         undefined: list[str] = []
         if mcap is not None:
             messages = _with_definitions(messages, memory.reader, undefined)
-            done = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
+            path, files = mcap, None
+            count = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
         elif parquet is not None:
-            done = _write_parquet(parquet, messages, memory, robot)
+            path = parquet
+            count, files = _write_parquet(parquet, messages, memory, robot)
     if undefined:
         view.notes.add(
             f"{listed(undefined)} {'has' if len(undefined) == 1 else 'have'} no definition in "
@@ -131,9 +119,11 @@ def export(
             "file: other programs cannot read such messages"
         )
     if as_json:
-        print_line(json.dumps({**done.as_object(), "notes": [*view.notes.sentences()]}))
+        done = {"path": str(path), "messages": count, "files": files or 1}
+        print_line(json.dumps(done | {"notes": [*view.notes.sentences()]}))
     else:
-        print_line(str(done))
+        where = f"in {path}" if files is None else f"in {counted(files, 'file')} below {path}"
+        print_line(f"{counted(count, 'message')} {where}")
     for note in view.notes.sentences():
         typer.echo(f"note: {with_local_times(note)}", err=True)
     if undefined or not view.notes.complete or lost_in(view.snapshot, window):
@@ -226,29 +216,8 @@ def _with_definitions(
         yield each._replace(record=each.record._replace(channel=defined(each.record.channel)))
 
 
-class Exported(NamedTuple):
-    """How many messages lie where; `files` of Parquet, in a folder."""
-
-    messages: int
-    path: Path
-    files: int | None = None
-
-    def as_object(self) -> dict[str, JsonValue]:
-        """Returns it for programs."""
-        return {"path": str(self.path), "messages": self.messages, "files": self.files or 1}
-
-    def __str__(self) -> str:
-        """Returns it for people."""
-        messages = counted(self.messages, "message")
-        if self.files is None:
-            return f"{messages} in {self.path}"
-        return f"{messages} in {counted(self.files, 'file')} below {self.path}"
-
-
-def write_mcap(
-    path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE
-) -> Exported:
-    """Writes an MCAP file, which appears when it is complete.
+def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> int:
+    """Writes an MCAP file, which appears when it is complete; returns the number of messages.
 
     Raises:
         BagError: it cannot be written.
@@ -277,13 +246,13 @@ def write_mcap(
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    return Exported(written, path)
+    return written
 
 
 def _write_parquet(
     path: Path, messages: Iterator[StoredMessage], memory: Memory, robot: str | None
-) -> Exported:
-    """Writes rows of Parquet.
+) -> tuple[int, int]:
+    """Writes rows of Parquet; returns the numbers of rows and of files.
 
     Raises:
         ConfigError: the optional dependency is missing.
@@ -297,7 +266,7 @@ def _write_parquet(
         ) from error
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
-    return Exported(dataset.rows, path, dataset.files)
+    return dataset.rows, dataset.files
 
 
 def _reported(

@@ -8,13 +8,15 @@ import json
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
+from functools import wraps
+from inspect import Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias
 
 import typer
 from rich.console import Console
@@ -107,6 +109,7 @@ Verbose = Annotated[
     bool,
     typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
 ]
+Command: TypeAlias = Callable[..., None]  # type: ignore[explicit-any]  # each its own options
 _LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
@@ -163,7 +166,7 @@ def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
     return load_with_sources(bag_dir, overrides)[0]
 
 
-def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
+def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> tuple[Settings, Sources]:
     """Loads the configuration as the server does, or where a PATH is given as `load_to_look` does.
 
     Raises:
@@ -171,30 +174,8 @@ def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> Settings:
         InvalidArgumentsError: there is no such file or folder, or more than one is named.
     """
     if any(map(_is_path, words or ())):
-        return load_to_look(bag_dir, words)
-    return load_for(bag_dir, words)
-
-
-def load_given_with_sources(
-    bag_dir: Path | None, words: Sequence[str] | None
-) -> tuple[Settings, Sources]:
-    """Loads the configuration as `load_given` does, with who set each key.
-
-    Raises:
-        ConfigError: the configuration is refused.
-        InvalidArgumentsError: there is no such file or folder, or more than one is named.
-    """
-    if not any(map(_is_path, words or ())):
-        return load_with_sources(bag_dir, words)
-    settings = load_to_look(bag_dir, words)
-    _, overrides = _path_and_settings(words or ())
-    if settings.data.recording is not None:
-        overrides.append(f"data.recording={quoted(str(settings.data.recording))}")
-    own, looking = (
-        load_with_sources(settings.recording.bag_dir, [*more, *overrides])
-        for more in ((), _LOOKING)
-    )
-    return own if own[0] == settings else looking
+        return _load_to_look(bag_dir, words)
+    return load_with_sources(bag_dir, words)
 
 
 def load_to_look(
@@ -209,14 +190,20 @@ def load_to_look(
         ConfigError: the configuration is refused.
         InvalidArgumentsError: there is no such file or folder, or more than one is named.
     """
+    return _load_to_look(bag_dir, words, recording)[0]
+
+
+def _load_to_look(
+    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
+) -> tuple[Settings, Sources]:
     named, given = settings_to_look(bag_dir, words, recording)
-    is_chosen = is_deployment_chosen(given)
-    settings = load_for(named, given)
+    loaded = load_with_sources(named, given)
     by_words = any(each.partition("=")[0] in GROUPS for each in given)
     of_path = named if bag_dir is None else None
-    if by_words or not _is_of_others(settings, of_path, is_chosen=is_chosen):
-        return settings
-    return load_for(named, [*_LOOKING, *given])
+    is_chosen = is_deployment_chosen(given)
+    if by_words or not _is_of_others(loaded[0], of_path, is_chosen=is_chosen):
+        return loaded
+    return load_with_sources(named, [*_LOOKING, *given])
 
 
 def settings_to_look(
@@ -380,28 +367,6 @@ def present(memory: "Memory") -> Ns:
     return memory.now(memory.clock.now(), memory.index.snapshot().dating.latest)
 
 
-def parse_window(
-    memory: "Memory", start: str | None, end: str | None, last: float | None
-) -> TimeWindow:
-    """Returns the window of `--start`, `--end` and `--last`; a side that is not given is open.
-
-    Raises:
-        InvalidArgumentsError: the options contradict each other, or one is not a time.
-    """
-    now = unix_from_ns(present(memory))
-    if last is None:
-        first = unix_from_ns(MIN_NS) if start is None else parse_time(start, now)
-        until = unix_from_ns(MAX_NS)
-        if end is not None:
-            until = parse_time(end, now) + rest_of_text_s(end)
-        return TimeWindow.from_unix(first, until)
-    if start is not None or end is not None:
-        raise InvalidArgumentsError("give --last, or --start and --end, not both")
-    if not last > 0:
-        raise InvalidArgumentsError(f"--last is {last:g}; it must be more than 0 seconds")
-    return TimeWindow.from_unix(now - last, now)
-
-
 def parse_duration(text: str) -> float | None:
     """Returns the seconds of a duration as people write it (`90s`, `10m`, `2h`, `3d`) or None."""
     found = _AGO.fullmatch(text.strip().lower())
@@ -456,22 +421,101 @@ def day_of(memory: "Memory", day: str | None) -> TimeWindow:
     return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
 
 
-def topic_and_words(first: str, words: Sequence[str] | None, command: str) -> tuple[str, list[str]]:
-    """Returns the topic of a command and its other words: a path may stand before the topic.
+@dataclass(frozen=True, kw_only=True)
+class Bags:
+    """The options of a command that looks at bags."""
 
-    Raises:
-        InvalidArgumentsError: there is a path, and no topic.
+    words: Words = None
+    bag_dir: BagDir = None
+    recording: Recording = None
+    verbose: Verbose = False
+
+    def settings(self, *more: str) -> Settings:
+        """Loads the configuration as `load_to_look` does; `more` are further settings."""
+        return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)
+
+    def memory(self) -> "Memory":
+        """Opens the memory of these bags as `open_memory` does."""
+        return open_memory(self.settings(), verbose=self.verbose)
+
+    def with_topic(self, first: str, command: str) -> tuple[str, Self]:
+        """Returns the topic of a command, before which a path may stand, and the bags.
+
+        Raises:
+            InvalidArgumentsError: there is a path, and no topic.
+        """
+        others = self.words or []
+        if not Path(first).exists() or any(map(is_folder, others)):
+            return first, self
+        topic = next((each for each in others if "=" not in each), None)
+        if topic is None:
+            kind = "folder" if Path(first).is_dir() else "file"
+            raise InvalidArgumentsError(
+                f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
+            )
+        return topic, replace(self, words=[first, *(each for each in others if each != topic)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class Times:
+    """The options of a command that takes a time window."""
+
+    start: Start = None
+    end: End = None
+    last: Last = None
+
+    def window(self, memory: "Memory") -> TimeWindow:
+        """Returns the window; a side that is not given is open.
+
+        Raises:
+            InvalidArgumentsError: the options contradict each other, or one is not a time.
+        """
+        now = unix_from_ns(present(memory))
+        if self.last is None:
+            first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
+            until = unix_from_ns(MAX_NS)
+            if self.end is not None:
+                until = parse_time(self.end, now) + rest_of_text_s(self.end)
+            return TimeWindow.from_unix(first, until)
+        if self.start is not None or self.end is not None:
+            raise InvalidArgumentsError("give --last, or --start and --end, not both")
+        if not self.last > 0:
+            raise InvalidArgumentsError(f"--last is {self.last:g}; it must be more than 0 seconds")
+        return TimeWindow.from_unix(now - self.last, now)
+
+
+def as_command(name: str) -> Callable[[Command], Command]:
+    """Returns what makes a function a command that reports its errors under a name.
+
+    Its parameters of the types `Bags` and `Times` become the options of these, in their place.
     """
-    others = [*(words or ())]
-    if not Path(first).exists() or any(map(is_folder, others)):
-        return first, others
-    topic = next((each for each in others if "=" not in each), None)
-    if topic is None:
-        kind = "folder" if Path(first).is_dir() else "file"
-        raise InvalidArgumentsError(
-            f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
-        )
-    return topic, [first, *(each for each in others if each != topic)]
+
+    def made(command: Command) -> Command:
+        parameters = signature(command).parameters
+        groups = {
+            each.name: each.annotation
+            for each in parameters.values()
+            if each.annotation in (Bags, Times)
+        }
+
+        @wraps(command)
+        def run(**given: object) -> None:
+            for group, kind in groups.items():
+                own = {option: given.pop(option) for option in signature(kind).parameters}
+                given[group] = kind(**own)
+            command(**given)
+
+        options = [
+            option.replace(kind=option.KEYWORD_ONLY)
+            for each in parameters.values()
+            for option in (
+                signature(each.annotation).parameters.values() if each.name in groups else [each]
+            )
+        ]
+        run.__signature__ = Signature(options)  # type: ignore[attr-defined]  # typer reads it
+        return reported_errors(name)(run)
+
+    return made
 
 
 @contextmanager

@@ -5,7 +5,7 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 import typer
@@ -19,12 +19,7 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.listing.info import usual_rate
 from ros2_memory.cli.options import (
     AsJson,
-    BagDir,
-    Recording,
-    Verbose,
-    Words,
-    load_to_look,
-    open_memory,
+    Bags,
     print_line,
     stdout_console,
 )
@@ -133,14 +128,11 @@ class Observation:
 
 
 def watch(
-    words: Words = None,
     *,
     every: Annotated[float, typer.Option(metavar="S", help="Seconds between updates.")] = 2.0,
     count: Annotated[int | None, typer.Option(metavar="N", help="Exit after N updates.")] = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Show live what is being recorded: the recorder, the newest data, rates compared with usual.
 
@@ -150,8 +142,8 @@ def watch(
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")
-    settings = load_to_look(bag_dir, ["reader.include_active=true", *(words or ())], recording)
-    memory = open_memory(settings, verbose=verbose)
+    words = ["reader.include_active=true", *(bags.words or ())]
+    memory = replace(bags, words=words).memory()
     console = stdout_console()
     try:
         if as_json:

@@ -11,7 +11,7 @@ import json
 import math
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.core.timebase import (
     Ns,
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.demo.published_topics import Message, MessageSchedule, Stream
+
+T = TypeVar("T")
 
 METRES: Final = 1e-3
 DEGREES: Final = 0.05
@@ -121,10 +123,7 @@ def number(value: JsonValue, *path: str | int) -> float:
     Raises:
         WrongAnswerError: there is none.
     """
-    found = at(value, *path)
-    if isinstance(found, bool) or not isinstance(found, int | float):
-        raise WrongAnswerError(f"expected a number at {_named(path)}, not {_brief(found)}")
-    return float(found)
+    return float(_typed(value, path, "a number", int, float))
 
 
 def text(value: JsonValue, *path: str | int) -> str:
@@ -133,10 +132,7 @@ def text(value: JsonValue, *path: str | int) -> str:
     Raises:
         WrongAnswerError: there is none.
     """
-    found = at(value, *path)
-    if not isinstance(found, str):
-        raise WrongAnswerError(f"expected a string at {_named(path)}, not {_brief(found)}")
-    return found
+    return _typed(value, path, "a string", str)
 
 
 def items(value: JsonValue, *path: str | int) -> list[JsonValue]:
@@ -145,9 +141,14 @@ def items(value: JsonValue, *path: str | int) -> list[JsonValue]:
     Raises:
         WrongAnswerError: there is none.
     """
+    return _typed(value, path, "a list", list)
+
+
+def _typed(value: JsonValue, path: Sequence[str | int], what: str, *kinds: type[T]) -> T:
     found = at(value, *path)
-    if not isinstance(found, list):
-        raise WrongAnswerError(f"expected a list at {_named(path)}, not {_brief(found)}")
+    if isinstance(found, bool) or not isinstance(found, kinds):
+        named = ".".join(map(str, path)) or "the top"
+        raise WrongAnswerError(f"expected {what} at {named}, not {_brief(found)}")
     return found
 
 
@@ -221,10 +222,6 @@ def within(what: str, moment_s: float, bounds: tuple[Ns, Ns]) -> None:
 
 def _no_number(constant: str) -> float:
     raise ValueError(f"{constant} is not JSON")
-
-
-def _named(path: Sequence[str | int]) -> str:
-    return ".".join(map(str, path)) or "the top"
 
 
 def _brief(value: JsonValue) -> str:

@@ -2,20 +2,20 @@
 
 A directory with splits `<name>_<i>.mcap` (profile `ros2`, CDR, ros2msg definitions with all nested
 ones, the publishers' QoS on each channel, every channel in every split, zstd chunks small enough
-that data reaches the disk within seconds), and at a clean close `metadata.yaml` (version 9). A
-split ends when a message arrives more than the split duration after its first message, and gets
-its footer just after the next one was opened.
+that data reaches the disk within seconds), and at a clean close `metadata.yaml`. A split ends when
+a message arrives more than the split duration after its first message, and gets its footer just
+after the next one was opened.
 """
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from typing import IO, TYPE_CHECKING, Final, Self
 
 import yaml
 from mcap.writer import CompressionType, Writer
 
+from ros2_memory.bootstrap import build_repairer
 from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, unix_from_ns
 from ros2_memory.demo.messages import definition, payload
 from ros2_memory.demo.published_topics import STREAMS
@@ -87,16 +87,6 @@ class SplitWriter:
         finally:
             self._file.close()
 
-    def as_metadata(self) -> dict[str, JsonValue]:
-        """Returns the entry of this file in metadata.yaml."""
-        first, last = self.first or 0, self.last or 0
-        return {
-            "path": self.path.name,
-            "starting_time": {"nanoseconds_since_epoch": first},
-            "duration": {"nanoseconds": last - first},
-            "message_count": self.count,
-        }
-
 
 class DemoRecorder:
     """Writes a `MessageSchedule` into `directory`: at once up to now, then as time passes.
@@ -122,7 +112,6 @@ class DemoRecorder:
         self._next = next(self._due)
         self._splits: list[SplitWriter] = []
         self._closed: list[tuple[Ns, Ns]] = []
-        self._counts: Counter[str] = Counter()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._failure: OSError | None = None
@@ -189,8 +178,7 @@ class DemoRecorder:
         for split in still_open:
             self._close(split)
         if still_open:
-            text = yaml.safe_dump(self._metadata(), sort_keys=False)
-            (self.directory / "metadata.yaml").write_text(text)
+            build_repairer().correct_metadata(self.directory)
 
     def _live(self) -> None:
         try:
@@ -206,44 +194,11 @@ class DemoRecorder:
             if len(self._splits) > 1:
                 self._close(self._splits[-2])
         self._splits[-1].add(message)
-        self._counts[message.stream.topic] += 1
 
     def _close(self, split: SplitWriter) -> None:
         # Noted first: who sees the footer must find the split among the closed ones.
         self._closed.append((self._clock.now(), split.last or self.timeline.start))
         split.close()
-
-    def _metadata(self) -> dict[str, JsonValue]:
-        first = self._splits[0].first or 0
-        last = self._splits[-1].last or 0
-        return {
-            "rosbag2_bagfile_information": {
-                "version": 9,
-                "storage_identifier": "mcap",
-                "duration": {"nanoseconds": last - first},
-                "starting_time": {"nanoseconds_since_epoch": first},
-                "message_count": sum(self._counts.values()),
-                "topics_with_message_count": [
-                    {
-                        "topic_metadata": {
-                            "name": stream.topic,
-                            "type": stream.type,
-                            "serialization_format": "cdr",
-                            "offered_qos_profiles": [_qos(stream)],
-                            "type_description_hash": "",
-                        },
-                        "message_count": self._counts[stream.topic],
-                    }
-                    for stream in STREAMS
-                ],
-                "compression_format": "",
-                "compression_mode": "",
-                "relative_file_paths": [split.path.name for split in self._splits],
-                "files": [split.as_metadata() for split in self._splits],
-                "custom_data": None,
-                "ros_distro": "jazzy",
-            }
-        }
 
 
 def _qos(stream: Stream) -> dict[str, JsonValue]:

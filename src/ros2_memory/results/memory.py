@@ -304,9 +304,9 @@ _BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS
     LOCAL("local", "earliest", "latest"),
     SECONDS("newest_age_s").in_short,
     OBJECTS("fell_silent").first(_MAX_TOPICS, ""),
-    _SILENCES("silences", "newest_silences").first(_MAX_TOPICS, ""),
-    OBJECTS("gaps", "newest_gaps").first(_MAX_TOPICS, ""),
-    _CLOCK_STEPS("clock_steps", "newest_clock_steps").first(_MAX_TOPICS, ""),
+    _SILENCES("silences", lambda status: status.silences[::-1]).first(_MAX_TOPICS, ""),
+    OBJECTS("gaps", lambda status: status.gaps[::-1]).first(_MAX_TOPICS, ""),
+    _CLOCK_STEPS("clock_steps", lambda status: status.clock_steps[::-1]).first(_MAX_TOPICS, ""),
     PLAIN("never_heard").first(_MAX_TOPICS, ""),
     PLAIN("missing").first(_MAX_TOPICS, ""),
     PLAIN("damaged").in_short,
@@ -387,21 +387,6 @@ class Status(AnswerWithNotes):
     def newest_age(self) -> Ns | None:
         """How old the newest data is."""
         return None if self.heard is None else max(self.now - self.heard, 0)
-
-    @property
-    def newest_silences(self) -> tuple[Silence, ...]:
-        """The silences, newest first."""
-        return self.silences[::-1]
-
-    @property
-    def newest_gaps(self) -> tuple[Gap, ...]:
-        """The gaps, newest first."""
-        return self.gaps[::-1]
-
-    @property
-    def newest_clock_steps(self) -> tuple[ClockStep, ...]:
-        """The steps of the clock, newest first."""
-        return self.clock_steps[::-1]
 
     def _doubts(self) -> Iterator[str]:
         yield from self.problems

@@ -314,16 +314,6 @@ class StandstillPlace(NamedTuple):
     seconds: Pair
     since: tuple[Ns | None, Ns | None]
 
-    @property
-    def this_since(self) -> Ns | None:
-        """Since when it stood there in this window."""
-        return self.since[0]
-
-    @property
-    def with_since(self) -> Ns | None:
-        """Since when it stood there in the other."""
-        return self.since[1]
-
 
 class FarFromOther(NamedTuple):
     """A point of a path (m): its distance from the other, and when the robot was first there."""
@@ -339,8 +329,8 @@ _STANDSTILLS: Final = objects(
         _XY.spread("place"),
         INSIDE("inside"),
         _pair(0).spread("seconds"),
-        TIME("this_since").if_known,
-        TIME("with_since").if_known,
+        TIME("this_since", lambda stood: stood.since[0]).if_known,
+        TIME("with_since", lambda stood: stood.since[1]).if_known,
     )
 )
 _FAR: Final = an_object(

@@ -63,10 +63,16 @@ _DATE: Final = "give the date, too: now_local of data_time_range has today's"
 
 
 def _as_list(value: object) -> object:
-    """Returns a list of names, which planners also send as JSON text or as one bare name."""
-    if isinstance(value, str):
-        parsed = _parse_json(value)
-        value = parsed if isinstance(parsed, list) else [value]
+    """Returns a list, which planners also send as JSON text or as one bare text."""
+    if not isinstance(value, str):
+        return value
+    parsed = _parse_json(value)
+    return parsed if isinstance(parsed, list) else [value]
+
+
+def _as_names(value: object) -> object:
+    """Returns a list of names."""
+    value = _as_list(value)
     if isinstance(value, list) and len(value) > MOST_FIELDS:
         raise ValueError(f"has more than {MOST_FIELDS} elements")
     return value
@@ -98,12 +104,9 @@ def _read_until(value: object) -> object:
 
 
 def _as_times(value: object) -> object:
-    """Returns a list of times, which planners also send as JSON text or as one bare time."""
-    if isinstance(value, str):
-        parsed = _parse_json(value)
-        value = parsed if isinstance(parsed, list) else [value]
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        value = [value]
+    """Returns a list of times, which may also be one bare number."""
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    value = [value] if is_number else _as_list(value)
     if isinstance(value, list) and len(value) > MOST_TIMES:
         raise ValueError(f"has {len(value)} times, more than {MOST_TIMES}")
     return value
@@ -200,8 +203,7 @@ def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> Js
 
 
 _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
-_Duration: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
-_Score: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+_AtLeast0: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _Time: TypeAlias = Annotated[
@@ -219,8 +221,10 @@ _Until: TypeAlias = Annotated[
     BeforeValidator(_read_until),
     WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
+_Start: TypeAlias = Annotated[_Time | None, Field(alias="start")]
+_End: TypeAlias = Annotated[_Until | None, Field(alias="end")]
+_Before: TypeAlias = Annotated[_Until | None, Field(alias="before", description="Up to this time.")]
 _Times: TypeAlias = Annotated[tuple[_Until, ...], BeforeValidator(_as_times)]
-_Tolerance: TypeAlias = _Duration
 _Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
@@ -229,12 +233,12 @@ _SearchTopic: TypeAlias = Annotated[
 ]
 _Fields: TypeAlias = Annotated[
     tuple[_Name, ...],
-    BeforeValidator(_as_list),
+    BeforeValidator(_as_names),
     Field(description='Only these, e.g. ["position.x"].'),
 ]
 _Labels: TypeAlias = Annotated[
     tuple[_Name, ...],
-    BeforeValidator(_as_list),
+    BeforeValidator(_as_names),
     WithJsonSchema(
         {
             "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
@@ -326,7 +330,7 @@ class Ago(TimeArgument):
     replaces = "moment"
     text = "some seconds ago"
     extra_reply = "with age_s (before now)"
-    ago_s: Annotated[_Duration, Field(examples=[10], alias="seconds_ago")]
+    ago_s: Annotated[_AtLeast0, Field(examples=[10], alias="seconds_ago")]
 
 
 class Between(TimeArgument):
@@ -386,7 +390,7 @@ class TopicAtArguments(Arguments):
 
     topic: _Topic
     moment: AtTime
-    tolerance_s: _Tolerance | None = None
+    tolerance_s: _AtLeast0 | None = None
     fields: _Fields = ()
 
 
@@ -407,7 +411,7 @@ class MotionArguments(Arguments):
 
     moment: AtTime
     topic: _PoseTopic | None = None
-    tolerance_s: _Tolerance | None = None
+    tolerance_s: _AtLeast0 | None = None
 
 
 class PositionArguments(MotionArguments):
@@ -431,14 +435,14 @@ class ConditionArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
-    min_score: _Score | None = None
+    min_score: _AtLeast0 | None = None
 
 
 class LastMatchArguments(ConditionArguments):
     """A condition on a topic; the last match is returned."""
 
     fields: _Fields = ()
-    before_s: _Until | None = Field(default=None, alias="before", description="Up to this time.")
+    before_s: _Before = None
 
 
 class ValueWhenArguments(Arguments):
@@ -451,9 +455,9 @@ class ValueWhenArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
-    min_score: _Score | None = None
+    min_score: _AtLeast0 | None = None
     fields: _Fields = ()
-    before_s: _Until | None = Field(default=None, alias="before", description="Up to this time.")
+    before_s: _Before = None
 
 
 class TrajectoryArguments(Arguments):
@@ -475,7 +479,7 @@ class RecapArguments(Arguments):
     span: TimeRange
     where: _Where | None = None
     frame_id: _FrameId | None = None
-    min_score: _Score | None = None
+    min_score: _AtLeast0 | None = None
 
 
 class SaveMomentArguments(Arguments):
@@ -484,10 +488,10 @@ class SaveMomentArguments(Arguments):
     label: Annotated[
         str, Field(strict=True, examples=["charger found"]), AfterValidator(_check_label)
     ]
-    seconds_before: Annotated[_Duration, AfterValidator(partial(_check_most, LONGEST_BEFORE_S))] = (
+    seconds_before: Annotated[_AtLeast0, AfterValidator(partial(_check_most, LONGEST_BEFORE_S))] = (
         30
     )
-    seconds_after: Annotated[_Duration, AfterValidator(partial(_check_most, LONGEST_AFTER_S))] = 0
+    seconds_after: Annotated[_AtLeast0, AfterValidator(partial(_check_most, LONGEST_AFTER_S))] = 0
 
 
 class TypeArguments(Arguments):
@@ -508,8 +512,8 @@ class VisitsArguments(Arguments):
     x: _Coordinate | None = None
     y: _Coordinate | None = None
     where: _Where | None = None
-    start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Until | None = Field(default=None, alias="end")
+    start_s: _Start = None
+    end_s: _End = None
     frame_id: Annotated[_Name, Field(description="Frame of x and y; default: the map.")] | None = (
         None
     )
@@ -538,8 +542,8 @@ class MatchesArguments(ConditionArguments):
     last_s: Annotated[_Positive, Field(description="Only the last seconds.")] | None = Field(
         default=None, alias="seconds"
     )
-    start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Until | None = Field(default=None, alias="end")
+    start_s: _Start = None
+    end_s: _End = None
     oldest_first: Annotated[
         bool, Field(strict=True, description="Oldest sightings first, with total.")
     ] = False
@@ -555,9 +559,9 @@ class ThingsArguments(Arguments):
 
     labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
     where: _Where | None = None
-    start_s: _Time | None = Field(default=None, alias="start")
-    end_s: _Until | None = Field(default=None, alias="end")
-    min_score: _Score | None = None
+    start_s: _Start = None
+    end_s: _End = None
+    min_score: _AtLeast0 | None = None
     limit: _Limit = 12
 
 

@@ -54,6 +54,13 @@ class Tool:
         """Returns the JSON schema of the arguments."""
         return self._described[1]
 
+    @property
+    def arguments(self) -> dict[str, JsonObject]:
+        """Returns the JSON schema of each argument."""
+        properties = self.schema["properties"]
+        named = properties.items() if isinstance(properties, dict) else ()
+        return {name: each for name, each in named if isinstance(each, dict)}
+
     @cached_property
     def _described(self) -> tuple[str, JsonObject]:
         # Made when it is asked for: 20 ms for all tools, of which a program may call one.

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
+    from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -47,19 +48,16 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class TestAsk:
-    def test_with_json_the_reply_is_what_a_client_receives(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]) == 0
-        reply = json.loads(capsys.readouterr().out)
+    def test_with_json_the_reply_is_what_a_client_receives(self, exits: Program) -> None:
+        reply = exits(0, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json").json
         assert (reply["x"], reply["topic"]) == (1.0, "/odom")
 
-    def test_an_object_is_taken_as_it_is(self, capsys: Capture) -> None:
+    def test_an_object_is_taken_as_it_is(self, exits: Program) -> None:
         asked = '{"topic": "/chatter", "seconds": 4000}'
-        assert cli.main(["ask", "get_topic_in_last", asked, "--json"]) == 0
-        assert json.loads(capsys.readouterr().out)["total"] == 2
+        assert exits(0, "ask", "get_topic_in_last", asked, "--json").json["total"] == 2
 
-    def test_people_read_lines_and_tables_with_local_times(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
-        shown = capsys.readouterr().out
+    def test_people_read_lines_and_tables_with_local_times(self, exits: Program) -> None:
+        shown = exits(0, "ask", "get_topic_in_last", "topic=/chatter", "seconds=4000").out
         assert "std_msgs/msg/String" in shown
         assert "2023-11-1" in shown
         assert "1700000001" not in shown
@@ -134,34 +132,29 @@ class TestAsk:
                     assert stated is None, tool
         assert aged > 2
 
-    def test_what_was_recorded_cannot_command_the_terminal(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "get_topic_in_last", "topic=/chatter", "seconds=4000"]) == 0
-        shown = capsys.readouterr().out
+    def test_what_was_recorded_cannot_command_the_terminal(self, exits: Program) -> None:
+        shown = exits(0, "ask", "get_topic_in_last", "topic=/chatter", "seconds=4000").out
         assert "\x1b" not in shown
         assert "\\x1b[31mred" in shown
 
-    def test_an_error_is_shown_and_the_exit_code_is_1(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "get_topic_in_last", "topic=/nowhere", "seconds=1"]) == 1
-        assert "topic_not_recorded" in capsys.readouterr().out
+    def test_an_error_is_shown_and_the_exit_code_is_1(self, exits: Program) -> None:
+        assert (
+            "topic_not_recorded"
+            in exits(1, "ask", "get_topic_in_last", "topic=/nowhere", "seconds=1").out
+        )
 
-    def test_a_name_that_no_tool_has_lists_those_that_are(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "where_am_i"]) == 1
-        assert "get_position_seconds_ago" in capsys.readouterr().err
+    def test_a_name_that_no_tool_has_lists_those_that_are(self, exits: Program) -> None:
+        assert "get_position_seconds_ago" in exits(1, "ask", "where_am_i").err
 
-    def test_without_a_name_the_tools_are_listed_with_their_arguments(
-        self, capsys: Capture
-    ) -> None:
-        assert cli.main(["ask"]) == 0
-        assert "seconds_ago, topic?, tolerance_s?" in capsys.readouterr().out
+    def test_without_a_name_the_tools_are_listed_with_their_arguments(self, exits: Program) -> None:
+        assert "seconds_ago, topic?, tolerance_s?" in exits(0, "ask").out
 
-    def test_what_is_no_argument_is_refused_with_the_form_it_has(self, capsys: Capture) -> None:
-        assert cli.main(["ask", "get_position_seconds_ago", "10"]) == 2
-        assert "seconds_ago=10" in capsys.readouterr().err
+    def test_what_is_no_argument_is_refused_with_the_form_it_has(self, exits: Program) -> None:
+        assert "seconds_ago=10" in exits(2, "ask", "get_position_seconds_ago", "10").err
 
-    def test_settings_reach_the_tool(self, capsys: Capture) -> None:
+    def test_settings_reach_the_tool(self, exits: Program) -> None:
         words = ["ask", "get_position_seconds_ago", "seconds_ago=0", "--json"]
-        assert cli.main([*words, "--set", "data.pose_topic=/amcl_pose"]) == 1
-        assert "/amcl_pose" in capsys.readouterr().out
+        assert "/amcl_pose" in exits(1, *words, "--set", "data.pose_topic=/amcl_pose").out
 
     def test_shells_complete_its_tools(self) -> None:
         assert complete("get_pos") == ["get_position_at", "get_position_seconds_ago"]
@@ -181,8 +174,7 @@ class TestArguments:
         }
 
     def test_what_a_tool_takes_as_text_stays_text(self) -> None:
-        schema = {"properties": {"topic": {"type": "string"}}}
-        assert parse_arguments(["topic=7"], schema) == {"topic": "7"}
+        assert parse_arguments(["topic=7"], {"topic": {"type": "string"}}) == {"topic": "7"}
 
     @pytest.mark.parametrize("given", [["{]"], ["=1"], ["seconds"]])
     def test_anything_else_is_refused(self, given: list[str]) -> None:
@@ -191,30 +183,26 @@ class TestArguments:
 
 
 class TestTopics:
-    def test_rates_do_not_count_the_time_between_bags(self, capsys: Capture) -> None:
-        assert cli.main(["topics", "--json"]) == 0
-        rows = {row["topic"]: row for row in json.loads(capsys.readouterr().out)}
+    def test_rates_do_not_count_the_time_between_bags(self, exits: Program) -> None:
+        rows = {row["topic"]: row for row in exits(0, "topics", "--json").json}
         assert rows["/odom"]["rate_hz"] == pytest.approx(10.0)
         assert rows["/odom"]["count"] == 200
         assert rows["/chatter"]["rate_hz"] is None
 
-    def test_they_are_a_table(self, capsys: Capture) -> None:
-        assert cli.main(["topics"]) == 0
-        assert "nav_msgs/msg/Odometry" in capsys.readouterr().out
+    def test_they_are_a_table(self, exits: Program) -> None:
+        assert "nav_msgs/msg/Odometry" in exits(0, "topics").out
 
-    def test_of_an_empty_memory_the_exit_code_is_1(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_of_an_empty_memory_the_exit_code_is_1(self, tmp_path: Path, exits: Program) -> None:
         (tmp_path / "none").mkdir()
-        assert cli.main(["topics", "--bag-dir", str(tmp_path / "none")]) == 1
-        assert "nothing is recorded in" in capsys.readouterr().out
+        assert "nothing is recorded in" in exits(1, "topics", "--bag-dir", tmp_path / "none").out
 
 
 class TestInfo:
-    def test_it_shows_the_range_the_gaps_and_the_bags(self, bag_dir: Path, capsys: Capture) -> None:
+    def test_it_shows_the_range_the_gaps_and_the_bags(self, bag_dir: Path, exits: Program) -> None:
         # Far from where it was: the hour before it was no step of the clock.
         messages = [odom(T0 + (7200 + n) * NS_PER_S, 500.0, float(n)) for n in range(20)]
         write_mcap(bag_dir / "rec" / "rec_2.mcap", messages)
-        assert cli.main(["info", "--json"]) == 0
-        output = json.loads(capsys.readouterr().out)
+        output = exits(0, "info", "--json").json
         assert output["data_time_range"]["earliest"] == 1_700_000_000.0
         assert output["data_time_range"]["bags"] == 3
         assert len(output["data_time_range"]["clock_steps"]) == 1
@@ -223,44 +211,39 @@ class TestInfo:
 
     @pytest.mark.parametrize("there", [True, False])
     def test_of_a_memory_without_bags_the_exit_code_is_1(
-        self, there: bool, tmp_path: Path, capsys: Capture
+        self, there: bool, tmp_path: Path, exits: Program
     ) -> None:
         folder = tmp_path / "none"
         if there:
             folder.mkdir()
-        assert cli.main(["info", "--bag-dir", str(folder)]) == 1
-        assert "bags" in capsys.readouterr().out
+        assert "bags" in exits(1, "info", "--bag-dir", folder).out
 
-    def test_where_nothing_is_recorded_there_is_no_budget(self, capsys: Capture) -> None:
-        assert cli.main(["info"]) == 0
-        shown = capsys.readouterr().out
+    def test_where_nothing_is_recorded_there_is_no_budget(self, exits: Program) -> None:
+        shown = exits(0, "info").out
         assert "budget" not in shown
         assert "size_mb" in shown
 
     def test_it_lists_recordings_that_overlap_and_are_answered_together(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program
     ) -> None:
         messages = [odom(T0 + n * NS_PER_S // 10, 0.0, 0.0) for n in range(20, 120)]
         write_mcap(bag_dir / "other" / "other_0.mcap", messages)
-        assert cli.main(["info", "--json"]) == 0
-        (pair,) = json.loads(capsys.readouterr().out)["overlapping_recordings"]
+        (pair,) = exits(0, "info", "--json").json["overlapping_recordings"]
         assert (pair["recording"], pair["and"]) == ("other", "rec")
         assert (pair["from"], pair["to"]) == (1_700_000_002.0, 1_700_000_009.9)
-        assert cli.main(["info"]) == 0
-        assert "overlapping_recordings" in capsys.readouterr().out
+        assert "overlapping_recordings" in exits(0, "info").out
 
     def test_it_says_until_when_a_fresh_file_without_an_end_counts_as_being_written(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program
     ) -> None:
         copy = write_mcap(bag_dir / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
         copy.write_bytes(copy.read_bytes()[:-20])
-        assert cli.main(["info", "--json"]) == 0
-        (row,) = json.loads(capsys.readouterr().out)["counted_as_active"]
+        (row,) = exits(0, "info", "--json").json["counted_as_active"]
         assert row["file"] == "copy/copy_0.mcap"
         assert row["until"] == pytest.approx(copy.stat().st_mtime + 30.0)
 
     def test_where_something_is_it_says_for_how_long_the_budget_lasts(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program
     ) -> None:
         now = time.time_ns()
         write_heartbeat(
@@ -278,8 +261,7 @@ class TestInfo:
                 interval_s=2.0,
             ),
         )
-        assert cli.main(["info", "deployment=robot", "retention.max_total_gb=2.0"]) == 0
-        shown = capsys.readouterr().out
+        shown = exits(0, "info", "deployment=robot", "retention.max_total_gb=2.0").out
         assert "of 2 GB: bags 0" in shown
         assert "what is stored beside them 0" in shown
         assert "full in" in shown
@@ -300,28 +282,27 @@ class TestInfo:
 
 class TestConfig:
     def test_it_is_shown_as_yaml_that_a_program_would_take(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program
     ) -> None:
-        assert cli.main(["config", "show", "server.port=9300"]) == 0
-        shown = yaml.safe_load(capsys.readouterr().out)
+        shown = yaml.safe_load(exits(0, "config", "show", "server.port=9300").out)
         assert shown["server"]["port"] == 9300
         assert shown["recording"]["bag_dir"] == str(bag_dir)
         assert shown["storage"]["_target_"].startswith("ros2_memory.")
 
-    def test_a_section_or_a_key_alone(self, capsys: Capture) -> None:
-        assert cli.main(["config", "show", "server", "data.now", "server.port=9300"]) == 0
-        shown = yaml.safe_load(capsys.readouterr().out)
+    def test_a_section_or_a_key_alone(self, exits: Program) -> None:
+        shown = yaml.safe_load(
+            exits(0, "config", "show", "server", "data.now", "server.port=9300").out
+        )
         assert (shown["server"]["port"], [*shown["data"]]) == (9300, ["now"])
         assert [*shown] == ["data", "server"]
-        assert cli.main(["config", "show", "serve"]) == 2
         assert (
-            "serve: there is no such section or key; the sections are " in capsys.readouterr().err
+            "serve: there is no such section or key; the sections are "
+            in exits(2, "config", "show", "serve").err
         )
 
-    def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> None:
+    def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, exits: Program) -> None:
         monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
-        assert cli.main(["config", "show"]) == 0
-        shown = capsys.readouterr().out
+        shown = exits(0, "config", "show").out
         assert "MEMORY_API_TOKEN is set" in shown
         assert "a-secret" not in shown
 
@@ -342,50 +323,46 @@ class TestConfig:
         ],
     )
     def test_sources_say_in_a_line_which_file_or_variable_set_a_key(
-        self, monkeypatch: pytest.MonkeyPatch, capsys: Capture, bag_dir: Path, key: str, who: str
+        self, monkeypatch: pytest.MonkeyPatch, exits: Program, bag_dir: Path, key: str, who: str
     ) -> None:
         monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot_live")
         monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "recorder=none")
         monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", str(bag_dir))
-        assert cli.main(["config", "show", "--sources", "server.port=9300"]) == 0
-        rows = capsys.readouterr().out.splitlines()
+        rows = exits(0, "config", "show", "--sources", "server.port=9300").out.splitlines()
         assert rows[0].startswith("# files are those of ")
         (row,) = [each for each in rows if each.partition(" ")[0] == key]
         assert row.partition(" ")[2].lstrip().startswith(who)
 
-    def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, capsys: Capture) -> None:
-        assert cli.main(["config", "show", "server.prot=1"]) == 2
-        assert "server.prot" in capsys.readouterr().err
+    def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, exits: Program) -> None:
+        assert "server.prot" in exits(2, "config", "show", "server.prot=1").err
 
 
 class TestTheProgram:
-    def test_a_command_that_there_is_not_ends_with_2(self, capsys: Capture) -> None:
-        assert cli.main(["fly"]) == 2
-        assert "fly" in capsys.readouterr().err
+    def test_a_command_that_there_is_not_ends_with_2(self, exits: Program) -> None:
+        assert "fly" in exits(2, "fly").err
 
     def test_warnings_are_one_sentence_and_with_v_the_events(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program
     ) -> None:
         for name in "ab":
             (bag_dir / "rec" / f"{name}.mcap").write_bytes(b"")
             os.utime(bag_dir / "rec" / f"{name}.mcap", (1_700_000_000,) * 2)
-        assert cli.main(["topics"]) == 0
-        (line,) = capsys.readouterr().err.splitlines()
+        (line,) = exits(0, "topics").err.splitlines()
         assert "2 warnings logged (2 x bag_damaged); -v shows" in line
-        assert cli.main(["topics", "-v", "logging.level=warning"]) == 0
-        output = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+        output = [
+            json.loads(line)
+            for line in exits(0, "topics", "-v", "logging.level=warning").err.splitlines()
+        ]
         assert [each["event"] for each in output] == ["bag_damaged", "bag_damaged"]
 
     @pytest.mark.parametrize("command", COMMANDS)
     def test_the_help_of_every_command_says_what_its_exit_codes_mean(
-        self, capsys: Capture, command: str
+        self, exits: Program, command: str
     ) -> None:
-        assert cli.main([command, "--help"]) == 0
-        assert " ".join(capsys.readouterr().out.split()).endswith(epilog(command))
+        assert " ".join(exits(0, command, "--help").out.split()).endswith(epilog(command))
 
-    def test_it_prints_its_version(self, capsys: Capture) -> None:
-        assert cli.main(["--version"]) == 0
-        assert capsys.readouterr().out.startswith("ros2-memory ")
+    def test_it_prints_its_version(self, exits: Program) -> None:
+        assert exits(0, "--version").out.startswith("ros2-memory ")
 
     def test_it_runs_as_a_module_and_a_pipe_gets_whole_lines(self, bag_dir: Path) -> None:
         program = [sys.executable, "-m", "ros2_memory.cli", "topics", "--bag-dir", str(bag_dir)]

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from mcap.writer import Writer as McapFile
 
     from ros2_memory.history.duplicates import StoredMessage
+    from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 NOW = datetime.fromisoformat("2023-11-14T20:00:00").timestamp()
@@ -155,18 +156,20 @@ class TestMcap:
         (record,) = McapReader().records(out, ["/word"], TimeWindow.everything())
         assert (record.log_time, record.publish_time) == (T0, published)
 
-    def test_what_two_recordings_hold_is_there_once(self, bag_dir: Path, tmp_path: Path) -> None:
+    def test_what_two_recordings_hold_is_there_once(
+        self, bag_dir: Path, tmp_path: Path, exits: Program
+    ) -> None:
         copies = [
             Msg(each.topic, each.type, each.log_time + 1000, each.body, each.published)
             for each in driven(T0, 0)
         ]
         write_mcap(bag_dir / "rec_2" / "rec_2_0.mcap", copies)
         out = tmp_path / "out.mcap"
-        assert cli.main(["export", "--mcap", str(out), "--end", str(T0 / NS_PER_S + 60)]) == 0
+        exits(0, "export", "--mcap", out, "--end", T0 / NS_PER_S + 60)
         assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
 
     def test_what_latched_messages_held_at_the_start_comes_along_unless_it_is_refused(
-        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
         mounts = [
             tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
@@ -178,9 +181,8 @@ class TestMcap:
         ]
         write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [*mounts, *driven(T0 + 3, 0)])
         words = ["export", "--start", str(T0 / NS_PER_S + 5), "--end", str(T0 / NS_PER_S + 6)]
-        assert cli.main([*words, "--mcap", str(tmp_path / "without.mcap"), "--no-latched"]) == 0
-        assert cli.main([*words, "--mcap", str(tmp_path / "with.mcap")]) == 0
-        err = capsys.readouterr().err
+        exits(0, *words, "--mcap", tmp_path / "without.mcap", "--no-latched")
+        err = exits(0, *words, "--mcap", tmp_path / "with.mcap").err
         assert "2 latched messages are copied from before the window" in err
         held = [row for row in read(tmp_path / "with.mcap") if row[0] == "/tf_static"]
         assert [at for _, at, _ in held] == [T0 + 1, T0 + 2]
@@ -188,14 +190,15 @@ class TestMcap:
         assert rest == read(tmp_path / "without.mcap")
 
     def test_that_nothing_but_latched_messages_of_before_was_found_is_reported(
-        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], exits: Program
     ) -> None:
         mount = tf(T0, transform(T0, "base_link", "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
         write_mcap(bag_dir / "rec_0" / "rec_0_0.mcap", [mount, *driven(T0 + 3, 0)])
         after = str(T0 / NS_PER_S + 5000)
         nothing = ["export", "--mcap", str(tmp_path / "nothing.mcap"), "--start", after]
-        assert cli.main([*nothing, "--end", str(T0 / NS_PER_S + 6000)]) == 2
-        assert "no message is in the window" in capsys.readouterr().err
+        assert (
+            "no message is in the window" in exits(2, *nothing, "--end", T0 / NS_PER_S + 6000).err
+        )
         assert not (tmp_path / "nothing.mcap").exists()
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--start", after, "--latched"]
         assert cli.main([*words, "--end", str(T0 / NS_PER_S + 6000)]) == 0
@@ -203,14 +206,18 @@ class TestMcap:
         assert "no message is in the window" in capsys.readouterr().err
 
     def test_a_folder_that_is_missing_is_named(
-        self, bag_dir: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
-        assert cli.main(["export", "--mcap", str(tmp_path / "gone" / "out.mcap")]) == 2
-        assert f"there is no folder {tmp_path / 'gone'}" in capsys.readouterr().err
+        assert (
+            f"there is no folder {tmp_path / 'gone'}"
+            in exits(2, "export", "--mcap", tmp_path / "gone" / "out.mcap").err
+        )
 
-    def test_only_the_topics_that_were_asked_for(self, bag_dir: Path, tmp_path: Path) -> None:
+    def test_only_the_topics_that_were_asked_for(
+        self, bag_dir: Path, tmp_path: Path, exits: Program
+    ) -> None:
         out = tmp_path / "out.mcap"
-        assert cli.main(["export", "--mcap", str(out), "--topic", "/chat*", "--last", "20"]) == 0
+        exits(0, "export", "--mcap", out, "--topic", "/chat*", "--last", "20")
         assert {row[0] for row in read(out)} == {"/chatter"}
 
     @pytest.mark.parametrize("profile", ["", "px4", "ros2"])
@@ -333,13 +340,12 @@ class TestMcap:
         assert "x=1.5," in repr(values["/odom"])
 
     def test_types_without_any_definition_are_named_and_the_exit_code_is_1(
-        self, tmp_path: Path, capsys: Capture
+        self, tmp_path: Path, exits: Program
     ) -> None:
         odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\0\1\0\0\0")
         write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [odd, odd], definitions=False)
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--bag-dir"]
-        assert cli.main([*words, str(tmp_path / "bags"), "deployment=replay"]) == 1
-        err = capsys.readouterr().err
+        err = exits(1, *words, tmp_path / "bags", "deployment=replay").err
         assert err.count("nobody_msgs/msg/Knows has no definition") == 1
         assert "reader.custom_msg_paths" in err
 
@@ -365,41 +371,37 @@ class TestMcap:
         assert [*folder.iterdir()] == []
 
     def test_of_a_window_without_messages_no_file_is_made(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
         out = tmp_path / "out.mcap"
-        assert cli.main(["export", "--mcap", str(out), "--end", "1000"]) == 2
-        assert "no message" in capsys.readouterr().err
+        assert "no message" in exits(2, "export", "--mcap", out, "--end", "1000").err
         assert not out.exists()
 
     def test_what_could_not_be_read_is_reported_and_the_exit_code_is_1(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
         source = bag_dir / "rec_0" / "rec_0_0.mcap"
         left(write_mcap(source, driven(T0, 0), McapLayout(finish=False, chunk_size=500)))
-        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
-        assert "rec_0_0.mcap" in capsys.readouterr().err
+        assert "rec_0_0.mcap" in exits(1, "export", "--mcap", tmp_path / "out.mcap").err
 
     def test_a_file_of_the_window_that_is_not_read_at_all_is_reported_and_the_exit_code_is_1(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
         source = bag_dir / "rec_0" / "rec_0_0.mcap"
         source.write_bytes(b"no MCAP file")
         at = T0 / NS_PER_S + 10
         os.utime(source, (at, at))
-        assert cli.main(["export", "--mcap", str(tmp_path / "out.mcap")]) == 1
-        assert "rec_0_0.mcap" in capsys.readouterr().err
+        assert "rec_0_0.mcap" in exits(1, "export", "--mcap", tmp_path / "out.mcap").err
 
 
 class TestParquet:
     def test_duckdb_computes_the_way_that_trajectory_summary_reports(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
         start, end = T0 / NS_PER_S, T0 / NS_PER_S + 60
         asked = json.dumps({"start": start, "end": end})
-        assert cli.main(["ask", "trajectory_summary", asked, "--json"]) == 0
-        told = json.loads(capsys.readouterr().out)["distance_m"]
-        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
+        told = exits(0, "ask", "trajectory_summary", asked, "--json").json["distance_m"]
+        exits(0, "export", "--parquet", tmp_path / "rows")
         ((length,),) = queried(
             tmp_path / "rows",
             """
@@ -415,19 +417,20 @@ class TestParquet:
         assert told > 4
 
     def test_there_is_a_row_for_each_message_by_recording_and_date(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
+        self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
-        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 0
-        assert "220 messages in 2 files" in capsys.readouterr().out
+        assert "220 messages in 2 files" in exits(0, "export", "--parquet", tmp_path / "rows").out
         rows = queried(
             tmp_path / "rows",
             "SELECT recording, CAST(date AS VARCHAR), count(*) FROM memory GROUP BY ALL ORDER BY 1",
         )
         assert rows == [("rec_0", "2023-11-14", 110), ("rec_1", "2023-11-15", 110)]
 
-    def test_times_are_exact_and_values_are_json(self, bag_dir: Path, tmp_path: Path) -> None:
+    def test_times_are_exact_and_values_are_json(
+        self, bag_dir: Path, tmp_path: Path, exits: Program
+    ) -> None:
         words = ["export", "--parquet", str(tmp_path / "rows"), "--robot", "r2"]
-        assert cli.main([*words, "--topic", "/chatter", "--end", str(T0 / NS_PER_S)]) == 0
+        exits(0, *words, "--topic", "/chatter", "--end", T0 / NS_PER_S)
         rows = queried(
             tmp_path / "rows",
             "SELECT robot, type, epoch_ns(log_time), epoch_ns(publish_time), value->>'value', x "
@@ -445,24 +448,23 @@ class TestParquet:
         assert len([*tmp_path.glob("rows/*/*/*")]) == 2
 
     def test_what_cannot_be_decoded_has_a_row_that_says_why(
-        self, tmp_path: Path, capsys: Capture
+        self, tmp_path: Path, exits: Program
     ) -> None:
         odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\x00\x01\x00\x00\x00")
         layout = McapLayout(definitions=False)
         write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
         words = ["export", "--parquet", str(tmp_path / "rows"), "--bag-dir", str(tmp_path / "bags")]
-        assert cli.main([*words, "deployment=replay"]) == 0
+        exits(0, *words, "deployment=replay")
         ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
         assert reason
         assert value is None
 
     def test_without_the_optional_part_it_says_how_to_get_it(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+        self, bag_dir: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
         monkeypatch.setitem(sys.modules, "pyarrow", None)
-        assert cli.main(["export", "--parquet", str(tmp_path / "rows")]) == 2
-        assert "pip install '.[parquet]'" in capsys.readouterr().err
+        assert "pip install '.[parquet]'" in exits(2, "export", "--parquet", tmp_path / "rows").err
 
 
 def queried(folder: Path, query: str) -> list[tuple[object, ...]]:
@@ -486,10 +488,9 @@ class TestWindows:
         ],
     )
     def test_what_makes_no_sense_is_refused(
-        self, bag_dir: Path, capsys: Capture, words: list[str]
+        self, bag_dir: Path, exits: Program, words: list[str]
     ) -> None:
-        assert cli.main(["export", *words]) == 2
-        assert capsys.readouterr().err
+        assert exits(2, "export", *words).err
 
     @pytest.mark.parametrize(
         ("written", "expected"),

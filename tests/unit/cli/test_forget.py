@@ -27,7 +27,12 @@ from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
 from tests.support.housekeepers import OURS, embedding, made_moment, own_all
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
+
+    from tests.support.program import Printed, Program
+
+    Forget = Callable[..., Printed]
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -57,10 +62,15 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def forget(first: float, last: float, *more: str) -> int:
+@pytest.fixture
+def forget(exits: Program) -> Forget:
     """`ros2-memory forget`, from and to so many seconds after the first message."""
-    start, end = T0 / NS_PER_S + first, T0 / NS_PER_S + last
-    return cli.main(["forget", "--start", str(start), "--end", str(end), *more])
+
+    def run(code: int, first: float, last: float, *more: str) -> Printed:
+        start, end = T0 / NS_PER_S + first, T0 / NS_PER_S + last
+        return exits(code, "forget", "--start", start, "--end", end, *more)
+
+    return run
 
 
 def bags(bag_dir: Path) -> list[str]:
@@ -73,21 +83,20 @@ def known(bag_dir: Path) -> int:
         return int(base.execute("SELECT count(*) FROM bag").fetchone()[0])
 
 
-def test_bags_that_lie_wholly_inside_go(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(20, 55, "--yes") == 0
+def test_bags_that_lie_wholly_inside_go(bag_dir: Path, forget: Forget) -> None:
+    shown = forget(0, 20, 55, "--yes").out
     assert bags(bag_dir) == ["rec_0.mcap", "rec_3.mcap"]
-    assert "deleted: 2 bags" in capsys.readouterr().out
+    assert "deleted: 2 bags" in shown
 
 
-def test_what_reaches_beyond_the_window_is_kept_and_named(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(25, 55, "--yes") == 1
+def test_what_reaches_beyond_the_window_is_kept_and_named(bag_dir: Path, forget: Forget) -> None:
+    shown = forget(1, 25, 55, "--yes").out
     assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_3.mcap"]
-    assert "stays: rec_0/rec_1.mcap: it reaches beyond the window" in capsys.readouterr().out
+    assert "stays: rec_0/rec_1.mcap: it reaches beyond the window" in shown
 
 
-def test_a_dry_run_only_reports(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(20, 35, "--dry-run") == 0
-    output = capsys.readouterr().out
+def test_a_dry_run_only_reports(bag_dir: Path, forget: Forget) -> None:
+    output = forget(0, 20, 35, "--dry-run").out
     assert "would be deleted: 1 bag" in output
     assert "rec_0/rec_1.mcap" in output
     assert len(bags(bag_dir)) == 4
@@ -97,106 +106,110 @@ def test_a_dry_run_only_reports(bag_dir: Path, capsys: Capture) -> None:
     ("answer", "left_over", "code"), [("y\n", 3, 0), ("n\n", 4, 1), ("", 4, 1)]
 )
 def test_it_asks_before(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, answer: str, left_over: int, code: int
+    bag_dir: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    left_over: int,
+    code: int,
+    forget: Forget,
 ) -> None:
     read, write = os.pipe()
     os.write(write, answer.encode())
     os.close(write)
     with os.fdopen(read) as stdin:
         monkeypatch.setattr("sys.stdin", stdin)
-        assert forget(20, 35) == code
+        forget(code, 20, 35)
     assert len(bags(bag_dir)) == left_over
 
 
-def test_a_recording_without_a_bag_goes_too(bag_dir: Path) -> None:
+def test_a_recording_without_a_bag_goes_too(bag_dir: Path, forget: Forget) -> None:
     (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    assert forget(40, 75, "--yes") == 0
+    forget(0, 40, 75, "--yes")
     assert not (bag_dir / "rec_1").exists()
     assert (bag_dir / "rec_0").is_dir()
 
 
 def test_latched_messages_that_later_answers_need_are_carried_on(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
-    assert forget(0, 15, "--yes") == 0
-    assert "1 latched message is carried on" in capsys.readouterr().out
+    assert "1 latched message is carried on" in forget(0, 0, 15, "--yes").out
     (record,) = McapReader().records(
         bag_dir / "latched" / "carried.mcap", ["/tf_static"], TimeWindow.everything()
     )
     assert record.log_time == T0
     asked = json.dumps({"parent": "base_link", "child": "laser", "timestamp": T0 / NS_PER_S + 25})
-    assert cli.main(["ask", "get_transform_at", asked, "--json"]) == 0
+    exits(0, "ask", "get_transform_at", asked, "--json")
 
 
-def test_what_was_carried_on_from_the_window_is_reported(bag_dir: Path, capsys: Capture) -> None:
-    forget(0, 15, "--yes")
-    capsys.readouterr()
-    assert forget(0, 15, "--yes") == 1
-    assert "latched messages that later answers need" in capsys.readouterr().out
+def test_what_was_carried_on_from_the_window_is_reported(bag_dir: Path, forget: Forget) -> None:
+    forget(0, 0, 15, "--yes")
+    assert "latched messages that later answers need" in forget(1, 0, 15, "--yes").out
     assert (bag_dir / "latched" / "carried.mcap").is_file()
 
 
 def test_beside_a_recorder_bags_with_latched_messages_are_kept(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget
 ) -> None:
     lock = BagDirLock.acquire(bag_dir)
     try:
-        assert forget(0, 35, "--yes") == 1
+        shown = forget(1, 0, 35, "--yes").out
     finally:
         lock.release()
     assert bags(bag_dir) == ["rec_0.mcap", "rec_2.mcap", "rec_3.mcap"]
-    assert "stop the recorder, and forget again" in capsys.readouterr().out
+    assert "stop the recorder, and forget again" in shown
 
 
-def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, capsys: Capture) -> None:
+def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, forget: Forget) -> None:
     start = T0 + 80 * NS_PER_S
     path = bag_dir / "rec_1" / "rec_4.mcap"
     write_mcap(path, [odom(start, 0.0, 0.0)], McapLayout(finish=False, chunk_size=10))
-    assert forget(60, 100, "--yes") == 1
+    shown = forget(1, 60, 100, "--yes").out
     assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_2.mcap", "rec_4.mcap"]
-    assert "rec_4.mcap" in capsys.readouterr().out
+    assert "rec_4.mcap" in shown
 
 
-def test_a_bag_with_another_name_is_reported(bag_dir: Path, capsys: Capture) -> None:
+def test_a_bag_with_another_name_is_reported(bag_dir: Path, forget: Forget) -> None:
     kept = made_moment(bag_dir / "moments" / "20231114T221320Z-x") / "rec_0" / "rec_1.mcap"
     kept.parent.mkdir()
     kept.hardlink_to(bag_dir / "rec_0" / "rec_1.mcap")
-    assert forget(20, 35, "--yes") == 1
+    shown = forget(1, 20, 35, "--yes").out
     assert kept.is_file()
-    assert "moment" in capsys.readouterr().out
-    assert forget(20, 35, "--yes") == 1
+    assert "moment" in shown
+    shown = forget(1, 20, 35, "--yes").out
     assert kept.is_file()
-    assert "delete the moment's folder" in capsys.readouterr().out
+    assert "delete the moment's folder" in shown
 
 
-def test_the_store_forgets_with_them(bag_dir: Path, capsys: Capture) -> None:
-    assert cli.main(["index"]) == 0
+def test_the_store_forgets_with_them(bag_dir: Path, exits: Program, forget: Forget) -> None:
+    exits(0, "index")
     assert known(bag_dir) == 4
-    assert forget(20, 35, "--yes") == 0
-    assert cli.main(["index"]) == 0
+    forget(0, 20, 35, "--yes")
+    exits(0, "index")
     assert known(bag_dir) == 3
     asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
-    assert cli.main(["ask", "find_last_match", asked, "--json"]) == 0
-    assert capsys.readouterr().out.strip().splitlines()[-1] == "null"
+    assert (
+        exits(0, "ask", "find_last_match", asked, "--json").out.strip().splitlines()[-1] == "null"
+    )
 
 
 def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
     assert cli.main(["index"]) == 0
     store = bag_dir / OWN_FOLDER / FILE
     assert all(f"secret{n}".encode() in unpacked(store) for n in range(4))
-    assert forget(20, 35, "--yes") == 0
+    forget(0, 20, 35, "--yes")
     assert b"secret1" not in unpacked(store) + all_bytes(bag_dir)
     (bag_dir / "rec_1" / "rec_2.mcap").unlink()
-    assert forget(40, 55, "--yes") == 0
-    assert "nothing to delete" in capsys.readouterr().out
+    assert "nothing to delete" in forget(0, 40, 55, "--yes").out
     assert b"secret2" not in unpacked(store) + all_bytes(bag_dir / OWN_FOLDER)
-    assert cli.main(["index"]) == 0
+    exits(0, "index")
     assert b"secret3" in unpacked(store)
 
 
-def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(bag_dir: Path) -> None:
+def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(
+    bag_dir: Path, forget: Forget
+) -> None:
     folder, beside = bag_dir / OWN_FOLDER, bag_dir / CATALOGUE
     folder.mkdir(exist_ok=True)
     old, lakes = folder / CATALOGUE, folder / f"lake-{CATALOGUE}"
@@ -208,16 +221,16 @@ def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(bag_dir: P
             base.commit()
     with closing(sqlite3.connect(lakes)) as base:
         base.execute("CREATE TABLE iceberg_tables (content TEXT)")
-    assert forget(20, 35, "--yes") == 0
+    forget(0, 20, 35, "--yes")
     assert sorted(path.name for path in folder.glob("*catalogue*")) == [lakes.name]
     assert beside.is_file()
 
 
-def test_a_dry_run_leaves_the_columns(bag_dir: Path) -> None:
+def test_a_dry_run_leaves_the_columns(bag_dir: Path, forget: Forget) -> None:
     assert cli.main(["index"]) == 0
     store = bag_dir / OWN_FOLDER / FILE
     (bag_dir / "rec_1" / "rec_2.mcap").unlink()
-    forget(40, 55, "--dry-run")
+    forget(0, 40, 55, "--dry-run")
     assert b"secret2" in unpacked(store)
 
 
@@ -235,105 +248,100 @@ def all_bytes(folder: Path) -> bytes:
 
 @pytest.mark.parametrize("deployment", ["query_only", "replay"])
 def test_bags_that_others_record_are_refused(
-    bag_dir: Path, capsys: Capture, deployment: str
+    bag_dir: Path, forget: Forget, deployment: str
 ) -> None:
-    assert forget(0, 100, "--yes", f"deployment={deployment}") == 2
-    assert "recorder=none" in capsys.readouterr().err
+    assert "recorder=none" in forget(2, 0, 100, "--yes", f"deployment={deployment}").err
     assert len(bags(bag_dir)) == 4
 
 
-def test_without_a_window_nothing_is_forgotten(bag_dir: Path, capsys: Capture) -> None:
-    assert cli.main(["forget", "--yes"]) == 2
-    assert cli.main(["forget", "--yes", "--start", "0"]) == 2
-    assert "--last" in capsys.readouterr().err
+def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
+    exits(2, "forget", "--yes")
+    assert "--last" in exits(2, "forget", "--yes", "--start", "0").err
     assert len(bags(bag_dir)) == 4
 
 
-def test_of_an_empty_window_it_says_so(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(-100, -50, "--yes") == 0
-    assert "no closed bag" in capsys.readouterr().out
+def test_of_an_empty_window_it_says_so(bag_dir: Path, forget: Forget) -> None:
+    assert "no closed bag" in forget(0, -100, -50, "--yes").out
 
 
 def test_of_a_recording_that_has_gone_no_metadata_is_reported(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, forget: Forget
 ) -> None:
     (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    assert forget(40, 75, "--yes") == 0
-    assert "metadata.yaml" not in capsys.readouterr().out
+    assert "metadata.yaml" not in forget(0, 40, 75, "--yes").out
 
 
 class TestForeignBags:
     """Bags that this deployment's recorder did not make."""
 
     def test_they_are_kept_and_are_named_with_what_to_do(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, forget: Forget
     ) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
         (bag_dir / "rec_0" / "rec_1.mcap").rename(bag_dir / "loose.mcap")
-        assert forget(0, 100, "--yes") == 1
+        shown = forget(1, 0, 100, "--yes").out
         assert sorted(path.name for path in bag_dir.rglob("*.mcap")) == [
             "carried.mcap",
             "loose.mcap",
             "rec_2.mcap",
             "rec_3.mcap",
         ]
-        output = capsys.readouterr().out
+        output = shown
         assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in output
         assert "`ros2-memory adopt session` first" in output
         assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in output
 
     def test_one_that_reaches_beyond_the_window_is_not_sent_to_be_adopted(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, forget: Forget
     ) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
-        assert forget(39, 65, "--dry-run") == 1
-        output = capsys.readouterr().out
+        output = forget(1, 39, 65, "--dry-run").out
         assert "stays: session/rec_2.mcap: this recorder did not make it" in output
         assert "stays: session/rec_3.mcap: it reaches beyond the window" in output
         assert "each bag with messages in the window stays, for the reason above" in output
 
-    def test_one_that_was_adopted_goes(self, bag_dir: Path) -> None:
+    def test_one_that_was_adopted_goes(self, bag_dir: Path, forget: Forget) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
         assert cli.main(["adopt", "session"]) == 0
-        assert forget(40, 100, "--yes") == 0
+        forget(0, 40, 100, "--yes")
         assert not (bag_dir / "session").exists()
 
-    def test_with_delete_they_go_too(self, bag_dir: Path) -> None:
+    def test_with_delete_they_go_too(self, bag_dir: Path, forget: Forget) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
-        assert forget(40, 100, "--yes", "retention.foreign=delete") == 0
+        forget(0, 40, 100, "--yes", "retention.foreign=delete")
         assert not (bag_dir / "session").exists()
 
     def test_without_a_list_nothing_goes_before_it_is_adopted(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, exits: Program, forget: Forget
     ) -> None:
         # What a recorder embeds, a copy without its list embeds as well.
         shutil.rmtree(bag_dir / ".episodic")
         name = "rec_20231114T221320Z"
         path = embedding(bag_dir / name / f"{name}_0.mcap", OURS, start=T0 + 200 * NS_PER_S)
         left(path)
-        assert forget(190, 300, "--yes") == 1
+        shown = forget(1, 190, 300, "--yes").out
         assert path.exists()
-        assert f"`ros2-memory adopt {name}` first" in capsys.readouterr().out
-        assert cli.main(["adopt", name]) == 0
-        assert forget(190, 300, "--yes") == 0
+        assert f"`ros2-memory adopt {name}` first" in shown
+        exits(0, "adopt", name)
+        forget(0, 190, 300, "--yes")
         assert not path.exists()
 
     @pytest.mark.parametrize(
         "name", ["latched/latched_0.mcap", "moments/x/x_0.mcap", "rec_1/x.mcap"]
     )
     def test_bags_of_others_beside_the_recorders_stay(
-        self, bag_dir: Path, capsys: Capture, name: str
+        self, bag_dir: Path, name: str, forget: Forget
     ) -> None:
         path = left(write_mcap(bag_dir / name, [odom(T0 + 65 * NS_PER_S, 1.0, 0.0)]))
-        assert forget(40, 100, "--yes") == 1
+        shown = forget(1, 40, 100, "--yes").out
         assert path.exists()
         assert not [*(bag_dir / "rec_1").glob("rec_*.mcap")]
-        assert f"stays: {name}: this recorder did not make it" in capsys.readouterr().out
-        assert forget(40, 100, "--yes", "--topic", "/odom") == 1
+        assert f"stays: {name}: this recorder did not make it" in shown
+        forget(1, 40, 100, "--yes", "--topic", "/odom")
         assert McapReader().summarize(path).count == 1
 
     def test_a_copy_without_its_list_of_which_one_file_is_damaged_is_kept(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, forget: Forget
     ) -> None:
         shutil.rmtree(bag_dir / ".episodic")
         name = "rec_20231114T221320Z"
@@ -347,14 +355,12 @@ class TestForeignBags:
         write_heartbeat(
             bag_dir, Heartbeat(1, T0, RecorderState.STOPPED, (name,), T0, 0, (), (), None, 2.0)
         )
-        assert forget(190, 300, "--yes") == 1
+        shown = forget(1, 190, 300, "--yes").out
         assert path.exists()
-        assert (
-            f"stays: {name}/{path.name}: this recorder did not make it" in capsys.readouterr().out
-        )
+        assert f"stays: {name}/{path.name}: this recorder did not make it" in shown
 
     def test_one_that_took_the_place_of_another_while_it_was_asked_is_kept(
-        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+        self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
     ) -> None:
         def meanwhile(*_: object, **__: object) -> None:
             shutil.copytree(bag_dir / "rec_1", bag_dir / "copy")
@@ -362,7 +368,7 @@ class TestForeignBags:
             (bag_dir / "copy").rename(bag_dir / "rec_1")
 
         monkeypatch.setattr("typer.confirm", meanwhile)
-        forget(40, 100)
+        forget(0, 40, 100)
         assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
 
 
@@ -387,24 +393,23 @@ class TestCopies:
         own_all(tmp_path)
         return tmp_path
 
-    def test_bags_of_copies_alone_go_too(self, recordings: Path) -> None:
-        assert forget(-1, 100, "--yes") == 0
+    def test_bags_of_copies_alone_go_too(self, recordings: Path, forget: Forget) -> None:
+        forget(0, -1, 100, "--yes")
         assert bags(recordings) == []
 
     def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
-        self, recordings: Path, capsys: Capture
+        self, recordings: Path, forget: Forget
     ) -> None:
         # What counts of rec_a_1 ends at 9 s; its copies at 10 s.
-        assert forget(-1, 9.05, "--yes") == 1
+        shown = forget(1, -1, 9.05, "--yes").out
         assert bags(recordings) == ["rec_a_1.mcap", "rec_b_1.mcap"]
-        output = capsys.readouterr().out
+        output = shown
         assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in output
 
     def test_a_bag_of_which_only_copies_reach_into_the_window_is_named(
-        self, recordings: Path, capsys: Capture
+        self, recordings: Path, forget: Forget
     ) -> None:
-        assert forget(9.5, 20, "--yes") == 1
-        assert "stays: rec_a/rec_a_1.mcap" in capsys.readouterr().out
+        assert "stays: rec_a/rec_a_1.mcap" in forget(1, 9.5, 20, "--yes").out
 
 
 class TestMetadata:
@@ -438,33 +443,31 @@ class TestMetadata:
         path.write_text(yaml.safe_dump({"rosbag2_bagfile_information": info}))
         return path
 
-    def test_it_lists_what_is_left(self, metadata: Path, capsys: Capture) -> None:
-        assert forget(0, 15, "--yes") == 0
+    def test_it_lists_what_is_left(self, metadata: Path, forget: Forget) -> None:
+        shown = forget(0, 0, 15, "--yes").out
         info = yaml.safe_load(metadata.read_text())["rosbag2_bagfile_information"]
         assert (info["relative_file_paths"], info["message_count"]) == (["rec_1.mcap"], 11)
-        assert "rec_0/metadata.yaml lists the remaining bags" in capsys.readouterr().out
+        assert "rec_0/metadata.yaml lists the remaining bags" in shown
 
     def test_where_that_cannot_be_it_says_so_and_what_to_do(
-        self, metadata: Path, capsys: Capture
+        self, metadata: Path, forget: Forget
     ) -> None:
         metadata.write_text(metadata.read_text().replace("message_count: 12", "message_count: 13"))
         before = metadata.read_text()
-        assert forget(0, 15, "--yes") == 0
-        output = capsys.readouterr().out
+        output = forget(0, 0, 15, "--yes").out
         assert "rec_0/metadata.yaml still lists deleted bags (its numbers" in output
         assert f"ros2 bag reindex {metadata.parent}" in output
         assert metadata.read_text() == before
 
     def test_that_of_a_recording_that_is_being_written_is_its_recorders(
-        self, bag_dir: Path, capsys: Capture
+        self, bag_dir: Path, forget: Forget
     ) -> None:
         now = time.time_ns()
         beat = Heartbeat(1, now, RecorderState.RECORDING, ("rec_0",), now, 0, (), (), None, 2.0)
         write_heartbeat(bag_dir, beat)
-        assert forget(20, 35, "--yes") == 0
-        assert "rec_0/metadata.yaml will list deleted bags" in capsys.readouterr().out
+        assert "rec_0/metadata.yaml will list deleted bags" in forget(0, 20, 35, "--yes").out
 
-    def test_a_dry_run_leaves_it(self, metadata: Path) -> None:
+    def test_a_dry_run_leaves_it(self, metadata: Path, forget: Forget) -> None:
         before = metadata.read_text()
-        assert forget(0, 15, "--dry-run") == 0
+        forget(0, 0, 15, "--dry-run")
         assert metadata.read_text() == before

@@ -30,13 +30,11 @@ from tests.support.shared_bags import REAL, needs_real
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from ros2_memory.core.reply import JsonObject
+    from tests.support.program import Program
+
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
-
-
-def run(capsys: Capture, *words: object) -> tuple[int, str]:
-    code = cli.main([str(each) for each in words])
-    return code, capsys.readouterr().out
 
 
 def seconds(first: int, count: int, x: float = 0.0) -> list[Msg]:
@@ -61,37 +59,37 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, capsys: Capture) -> None:
-    assert cli.main(["cat", "/od*", str(folder)]) == 2
-    assert "/od* is a pattern; matching: /odom" in capsys.readouterr().err
+def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Program) -> None:
+    assert "/od* is a pattern; matching: /odom" in exits(2, "cat", "/od*", folder).err
 
 
 def test_where_another_program_made_all_recordings_it_is_said_once(
-    folder: Path, capsys: Capture
+    folder: Path, exits: Program
 ) -> None:
-    _, shown = run(capsys, "recordings", folder)
-    assert shown.count("another program") == 1
+    assert exits(0, "recordings", folder).out.count("another program") == 1
 
 
 class TestPaths:
     @pytest.mark.parametrize("path", [".", "a", "a/a_0.mcap", "loose/red.mcap"])
     def test_info_and_topics_take_a_folder_or_a_bag(
-        self, folder: Path, capsys: Capture, path: str
+        self, folder: Path, exits: Program, path: str
     ) -> None:
         counts = {".": (5, 19), "a": (2, 10), "a/a_0.mcap": (1, 5), "loose/red.mcap": (1, 2)}
         bags, poses = counts[path]
-        code, shown = run(capsys, "info", folder / path, "--json")
-        assert (code, json.loads(shown)["data_time_range"]["bags"]) == (0, bags)
-        assert json.loads(shown)["memory_status"]["recorder"] is None
-        _, shown = run(capsys, "topics", folder / path, "--json")
-        counted = {row["topic"]: row["count"] for row in json.loads(shown)}
+        shown = exits(0, "info", folder / path, "--json").json
+        assert shown["data_time_range"]["bags"] == bags
+        assert shown["memory_status"]["recorder"] is None
+        counted = {
+            row["topic"]: row["count"] for row in exits(0, "topics", folder / path, "--json").json
+        }
         # The two loose files hold the same messages, and lie in one folder.
         assert counted["/odom"] == poses
 
-    def test_a_metadata_file_is_its_folder(self, folder: Path, capsys: Capture) -> None:
+    def test_a_metadata_file_is_its_folder(self, folder: Path, exits: Program) -> None:
         (folder / "b" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-        code, shown = run(capsys, "info", folder / "b" / "metadata.yaml", "--json")
-        assert (code, json.loads(shown)["held"]["messages"]) == (0, 4)
+        assert (
+            exits(0, "info", folder / "b" / "metadata.yaml", "--json").json["held"]["messages"] == 4
+        )
 
     @pytest.mark.parametrize(
         ("name", "words"),
@@ -103,71 +101,69 @@ class TestPaths:
         ],
     )
     def test_what_is_no_bag_is_refused_by_name(
-        self, folder: Path, capsys: Capture, name: str, words: str
+        self, folder: Path, exits: Program, name: str, words: str
     ) -> None:
         (folder / "notes.txt").write_text("not a bag")
-        code = cli.main(["info", *(str(folder / each) for each in name.split())])
-        assert code == 2
-        assert words in capsys.readouterr().err
+        assert words in exits(2, "info", *(folder / each for each in name.split())).err
 
-    def test_of_an_empty_folder_one_line_says_so(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_of_an_empty_folder_one_line_says_so(self, tmp_path: Path, exits: Program) -> None:
         (tmp_path / "empty").mkdir()
         for command in ("info", "topics", "recordings"):
-            code, shown = run(capsys, command, tmp_path / "empty")
-            assert (code, len(shown.splitlines())) == (1, 1)
+            shown = exits(1, command, tmp_path / "empty").out
+            assert len(shown.splitlines()) == 1
             assert str(tmp_path / "empty") in shown
 
     def test_where_an_error_names_a_tool_people_read_the_command(
-        self, folder: Path, tmp_path: Path, capsys: Capture
+        self, folder: Path, tmp_path: Path, exits: Program
     ) -> None:
         (tmp_path / "empty").mkdir()
         for topic, path, command in (("/odom", "empty", "info"), ("/nothing", "a", "topics")):
-            assert cli.main(["cat", topic, str(folder / path)]) == 2
-            shown = capsys.readouterr().err
+            shown = exits(2, "cat", topic, folder / path).err
             assert f"; `ros2-memory {command}` lists" in shown
             assert "data_time_range" not in shown
             assert "list_recorded_topics" not in shown
 
     def test_what_is_wrong_with_a_bag_is_noted_once_and_not_for_each_topic(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
         bag = folder / "a" / "a_0.mcap"
         bag.write_bytes(bag.read_bytes()[:-20])
         os.utime(bag, (1.7e9, 1.7e9))
-        _, shown = run(capsys, "topics", folder)
+        shown = exits(0, "topics", folder).out
         assert shown.count("readable part is used") == 1
         assert "2 topics: 1 unfinished bag" in shown
-        _, shown = run(capsys, "topics", folder, "--json")
-        assert [len(row["notes"]) for row in json.loads(shown)] == [1, 1]
+        assert [len(row["notes"]) for row in exits(0, "topics", folder, "--json").json] == [1, 1]
 
-    def test_errors_have_no_control_characters(self, folder: Path, capsys: Capture) -> None:
-        assert cli.main(["cat", "/\x1b[31m", str(folder)]) == 2
-        assert "\x1b" not in capsys.readouterr().err
+    def test_errors_have_no_control_characters(self, folder: Path, exits: Program) -> None:
+        assert "\x1b" not in exits(2, "cat", "/\x1b[31m", folder).err
 
     def test_bags_of_others_need_no_recorder_and_no_preset(
-        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        code, shown = run(capsys, "doctor", folder / "a", "--json")
-        findings = {each["about"]: each for each in json.loads(shown)["findings"]}
-        assert code == 0
+        findings = {
+            each["about"]: each
+            for each in exits(0, "doctor", folder / "a", "--json").json["findings"]
+        }
         assert "recorder=none" in findings["recorder"]["seen"]
         assert "ros" not in findings
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        _, shown = run(capsys, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json")
-        assert json.loads(shown)["age_s"] == 0
+        assert (
+            exits(0, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json").json["age_s"]
+            == 0
+        )
 
     def test_a_deployment_that_records_there_is_looked_at_as_it_is(
-        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         own_all(folder)
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        _, shown = run(capsys, "info", "--json")
-        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] == 5.0
+        assert exits(0, "info", "--json").json["memory_status"]["budget"]["max_gb"] == 5.0
         monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        _, shown = run(capsys, "info", folder, "--json")
-        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] == 5.0
-        _, shown = run(capsys, "info", folder / "a", "--json")
-        assert json.loads(shown)["memory_status"]["budget"]["max_gb"] is None
+        assert exits(0, "info", folder, "--json").json["memory_status"]["budget"]["max_gb"] == 5.0
+        assert (
+            exits(0, "info", folder / "a", "--json").json["memory_status"]["budget"]["max_gb"]
+            is None
+        )
 
     def test_nothing_is_written_beside_them(self, folder: Path, capsys: Capture) -> None:
         before = sorted(folder.rglob("*"))
@@ -188,38 +184,33 @@ class TestPaths:
         ],
     )
     def test_bags_of_other_projects_are_read_whatever_kind_they_are(
-        self, path: str, recordings: int, messages: int, capsys: Capture
+        self, path: str, recordings: int, messages: int, exits: Program
     ) -> None:
-        code, shown = run(capsys, "info", REAL / path, "--json")
-        held = json.loads(shown)["held"]
-        assert (code, held["recordings"], held["messages"]) == (0, recordings, messages)
+        held = exits(0, "info", REAL / path, "--json").json["held"]
+        assert (held["recordings"], held["messages"]) == (recordings, messages)
 
     def test_topics_without_messages_are_named_and_many_faults_of_clocks_are_one_row(
-        self, tmp_path: Path, capsys: Capture
+        self, tmp_path: Path, exits: Program
     ) -> None:
         declared = [("/idle", "std_msgs/msg/Bool"), ("/lost", "std_msgs/msg/Bool")]
         write_mcap(tmp_path / "a" / "a_0.mcap", seconds(0, 3), declared=declared)
         for nth in range(7):
             boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
             write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
-        _, shown = run(capsys, "info", tmp_path)
-        words = " ".join(shown.split())
+        words = " ".join(exits(0, "info", tmp_path).out.split())
         assert "topics_without_messages /idle, /lost" in words
         assert "silent_topics" not in words
         assert words.count("the clock was not set") == 1
-        _, shown = run(capsys, "info", tmp_path, "--json")
-        reply = json.loads(shown)
+        reply = exits(0, "info", tmp_path, "--json").json
         assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
         assert len(reply["data_time_range"]["clock_faults"]) == 7
 
 
 class TestRecordings:
     def test_folders_are_recordings_and_so_are_files_that_lie_loose(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        code, shown = run(capsys, "recordings", folder, "--json")
-        rows = {row["recording"]: row for row in json.loads(shown)}
-        assert code == 0
+        rows = {row["recording"]: row for row in exits(0, "recordings", folder, "--json").json}
         assert {name: row["bags"] for name, row in rows.items()} == {
             "a": 2,
             "b": 1,
@@ -230,53 +221,53 @@ class TestRecordings:
         assert (rows["a"]["messages"], rows["a"]["topics"], rows["a"]["storage"]) == (11, 2, "mcap")
 
     def test_it_says_whose_they_are_and_names_what_is_not_read(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
         own_all(folder)
         write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
         (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
         os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
-        _, shown = run(capsys, "recordings", folder, "--json")
-        rows = {row["recording"]: row for row in json.loads(shown)}
+        rows = {row["recording"]: row for row in exits(0, "recordings", folder, "--json").json}
         assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another program")
         assert rows["c"]["not_read"] == 1
-        _, shown = run(capsys, "info", folder)
-        assert "1 damaged bag file; see below" in " ".join(shown.split())
+        assert "1 damaged bag file; see below" in " ".join(exits(0, "info", folder).out.split())
 
-    def test_one_without_a_message_is_named_too(self, folder: Path, capsys: Capture) -> None:
+    def test_one_without_a_message_is_named_too(self, folder: Path, exits: Program) -> None:
         write_mcap(folder / "caught_nothing" / "caught_nothing_0.mcap", [])
         write_mcap(folder / "b" / "b_1.mcap", [])  # the end of a recording that has messages
         write_mcap(folder / "lies_loose.mcap", [])
-        _, shown = run(capsys, "recordings", folder, "--json")
-        silent = [row["recording"] for row in json.loads(shown) if row["messages"] == 0]
+        silent = [
+            row["recording"]
+            for row in exits(0, "recordings", folder, "--json").json
+            if row["messages"] == 0
+        ]
         assert silent == ["caught_nothing", "lies_loose.mcap"]
-        _, shown = run(capsys, "recordings", folder)
-        assert "no message was recorded" in shown
-        _, shown = run(capsys, "info", folder, "--json")
-        assert json.loads(shown)["held"]["empty_bags"] == 3
-        code, shown = run(capsys, "recordings", folder / "caught_nothing")
-        assert (code, len(shown.splitlines())) == (1, 1)
+        assert "no message was recorded" in exits(0, "recordings", folder).out
+        assert exits(0, "info", folder, "--json").json["held"]["empty_bags"] == 3
+        assert len(exits(1, "recordings", folder / "caught_nothing").out.splitlines()) == 1
 
     @pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
     def test_each_can_be_looked_at_alone(
-        self, folder: Path, capsys: Capture, name: str, count: int
+        self, folder: Path, exits: Program, name: str, count: int
     ) -> None:
-        code, shown = run(capsys, "cat", "/odom", folder, "--recording", name, "--json")
-        assert (code, len(shown.splitlines())) == (0, count)
-        _, shown = run(capsys, "recordings", folder, "--recording", name, "--json")
-        assert [row["recording"] for row in json.loads(shown)] == [name]
+        assert (
+            len(exits(0, "cat", "/odom", folder, "--recording", name, "--json").out.splitlines())
+            == count
+        )
+        assert [
+            row["recording"]
+            for row in exits(0, "recordings", folder, "--recording", name, "--json").json
+        ] == [name]
 
     def test_a_name_that_there_is_not_is_refused_with_one_like_it(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
         write_mcap(folder / "kitchen_run" / "kitchen_run_0.mcap", seconds(400, 1))
-        assert cli.main(["info", str(folder), "--recording", "kitchen_rum"]) == 2
-        assert "similar: kitchen_run" in capsys.readouterr().err
-        assert cli.main(["info", str(folder), "--recording", "../a"]) == 2
-        assert "data.recording" in capsys.readouterr().err
+        assert "similar: kitchen_run" in exits(2, "info", folder, "--recording", "kitchen_rum").err
+        assert "data.recording" in exits(2, "info", folder, "--recording", "../a").err
 
     def test_what_is_forgotten_is_forgotten_of_one_recording_too(
-        self, folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+        self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         own_all(folder)
         for bag in folder.rglob("*.mcap"):  # one that changed just now is not stored yet
@@ -284,63 +275,70 @@ class TestRecordings:
         monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
         monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
-        _, shown = run(capsys, "index", "data.recording=a", "--json")
-        assert json.loads(shown) == {"bags": 2, "stored": 2, "refused": 0}
+        assert exits(0, "index", "data.recording=a", "--json").json == {
+            "bags": 2,
+            "stored": 2,
+            "refused": 0,
+        }
         (store,) = folder.rglob("columns.sqlite")
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (2,)
         forgetting = ["forget", "--last", "9000", "--topic", "/chatter", "--yes", "--json"]
-        code, shown = run(capsys, *forgetting)
-        assert (code, json.loads(shown)["stays"]) == (0, [])
+        assert exits(0, *forgetting).json["stays"] == []
         # Without the bag that had some of it, and what has a part in common with that.
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
-    def test_what_deletes_looks_at_all_of_them(self, folder: Path, capsys: Capture) -> None:
+    def test_what_deletes_looks_at_all_of_them(self, folder: Path, exits: Program) -> None:
         words = ["forget", "--last", "9000", "--yes", "deployment=robot", "data.recording=a"]
-        assert cli.main([*words, f"recording.bag_dir={folder}"]) == 2
-        assert "data.recording=null" in capsys.readouterr().err
+        assert "data.recording=null" in exits(2, *words, f"recording.bag_dir={folder}").err
         assert (folder / "a" / "a_0.mcap").exists()
 
 
 class TestCat:
     def test_lines_for_people_have_a_time_that_can_be_pasted_back(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        _, shown = run(capsys, "cat", "/odom", folder / "a")
-        lines = shown.splitlines()
+        lines = exits(0, "cat", "/odom", folder / "a").out.splitlines()
         assert len(lines) == 10
         third = lines[2].split()[0]
-        _, shown = run(capsys, "cat", "odom", folder / "a", "--start", third, "--end", third)
-        assert shown.splitlines() == lines[2:3]
+        assert (
+            exits(0, "cat", "odom", folder / "a", "--start", third, "--end", third).out.splitlines()
+            == lines[2:3]
+        )
 
-    def test_json_lines_are_whole_and_strict(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_json_lines_are_whole_and_strict(self, tmp_path: Path, exits: Program) -> None:
         messages = [odom(T0 + 1, math.nan, 0.123456789), odom(T0 + 2, 1.0, 2.0)]
         write_mcap(tmp_path / "r" / "r_0.mcap", messages)
-        _, shown = run(capsys, "cat", "/odom", tmp_path, "--json")
         first, second = (
-            json.loads(line, parse_constant=pytest.fail) for line in shown.splitlines()
+            json.loads(line, parse_constant=pytest.fail)
+            for line in exits(0, "cat", "/odom", tmp_path, "--json").out.splitlines()
         )
         assert (first["time_ns"], second["time_ns"]) == (T0 + 1, T0 + 2)
         assert first["value"]["position"] == {"x": None, "y": 0.123456789, "z": 0.0}
 
-    def test_csv_has_a_column_for_each_field(self, folder: Path, capsys: Capture) -> None:
+    def test_csv_has_a_column_for_each_field(self, folder: Path, exits: Program) -> None:
         words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
-        _, shown = run(capsys, "cat", "/odom", folder / "b", *words)
-        rows = [*csv.reader(shown.splitlines())]
+        rows = [*csv.reader(exits(0, "cat", "/odom", folder / "b", *words).out.splitlines())]
         assert rows[0] == ["time", "position.y", "header.frame_id"]
         assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
 
-    def test_levels_of_a_log_have_their_names(self, tmp_path: Path, capsys: Capture) -> None:
+    def test_levels_of_a_log_have_their_names(self, tmp_path: Path, exits: Program) -> None:
         lines = [log_entry(T0 + level, level, "nav", "said") for level in (30, 35)]
         write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
-        _, shown = run(capsys, "cat", "/rosout", tmp_path)
-        assert [line.split("level: ")[1].split(";")[0] for line in shown.splitlines()] == [
+        assert [
+            line.split("level: ")[1].split(";")[0]
+            for line in exits(0, "cat", "/rosout", tmp_path).out.splitlines()
+        ] == [
             "WARN (30)",
             "35",
         ]
-        _, shown = run(capsys, "cat", "/rosout", tmp_path, "--field", "level", "--limit", "1")
-        assert shown.split("level: ")[1] == "WARN (30)\n"
+        assert (
+            exits(0, "cat", "/rosout", tmp_path, "--field", "level", "--limit", "1").out.split(
+                "level: "
+            )[1]
+            == "WARN (30)\n"
+        )
 
     @pytest.mark.parametrize(
         ("words", "expected"),
@@ -353,25 +351,29 @@ class TestCat:
         ],
     )
     def test_some_can_be_chosen(
-        self, folder: Path, capsys: Capture, words: list[str], expected: list[int]
+        self, folder: Path, exits: Program, words: list[str], expected: list[int]
     ) -> None:
-        _, shown = run(capsys, "cat", "/odom", folder / "a", "--json", *words)
-        times = [json.loads(line)["time_ns"] for line in shown.splitlines()]
+        times = [
+            json.loads(line)["time_ns"]
+            for line in exits(0, "cat", "/odom", folder / "a", "--json", *words).out.splitlines()
+        ]
         assert times == [T0 + n * NS_PER_S for n in expected]
 
     def test_a_topic_or_a_field_that_there_is_not_is_named_with_those_there_are(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        assert cli.main(["cat", "/odon", str(folder)]) == 2
-        assert "/odom" in capsys.readouterr().err
-        assert cli.main(["cat", "/odom", str(folder), "--csv", "--field", "pose.nothing"]) == 2
-        assert "position" in capsys.readouterr().err
+        assert "/odom" in exits(2, "cat", "/odon", folder).err
+        assert (
+            "position" in exits(2, "cat", "/odom", folder, "--csv", "--field", "pose.nothing").err
+        )
 
     def test_where_nothing_lies_in_the_time_the_exit_code_is_1(
-        self, folder: Path, capsys: Capture
+        self, folder: Path, exits: Program
     ) -> None:
-        assert cli.main(["cat", "/odom", str(folder / "a"), "--end", "2001-01-01"]) == 1
-        assert "no message of /odom" in capsys.readouterr().err
+        assert (
+            "no message of /odom"
+            in exits(1, "cat", "/odom", folder / "a", "--end", "2001-01-01").err
+        )
 
     def test_a_reader_that_ends_early_is_no_error(self, folder: Path) -> None:
         program = [sys.executable, "-m", "ros2_memory.cli", "cat", "/odom", str(folder / "a")]
@@ -389,13 +391,11 @@ def test_a_time_that_is_printed_is_read_back_to_the_microsecond(us: int) -> None
 
 
 def test_times_and_durations_of_tools_may_be_words() -> None:
-    schema = {
-        "properties": {
-            "start": {"type": ["number", "string"]},
-            "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
-            "seconds": {"type": "number"},
-            "topic": {"type": "string"},
-        }
+    known: dict[str, JsonObject] = {
+        "start": {"type": ["number", "string"]},
+        "timestamps": {"type": "array", "items": {"type": ["number", "string"]}},
+        "seconds": {"type": "number"},
+        "topic": {"type": "string"},
     }
     given_words = {
         "start": "10m",
@@ -403,20 +403,20 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
         "seconds": "2h",
         "topic": "3d",
     }
-    assert with_times(given_words, schema, 1_700_000_000.0) == {
+    assert with_times(given_words, known, 1_700_000_000.0) == {
         "start": 1_700_000_000.0 - 600,
         "timestamps": [1_699_999_999.0, 1_700_000_000.0 - 3600],
         "seconds": 7200.0,
         "topic": "3d",
     }
     with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
-        with_times({"start": "soon"}, schema, 1_700_000_000.0)
+        with_times({"start": "soon"}, known, 1_700_000_000.0)
 
 
 def test_a_text_time_is_left_to_the_tool_that_knows_what_its_last_decimal_is() -> None:
-    schema = {"properties": {"start": {"type": ["number", "string"]}}}
+    known: dict[str, JsonObject] = {"start": {"type": ["number", "string"]}}
     asked: dict[str, object] = {"start": "2026-11-20T14:05:03.745"}
-    assert with_times(asked, schema, 1_700_000_000.0) == asked
+    assert with_times(asked, known, 1_700_000_000.0) == asked
 
 
 def test_one_parser_reads_all_times_and_knows_nanoseconds() -> None:
@@ -427,54 +427,49 @@ def test_one_parser_reads_all_times_and_knows_nanoseconds() -> None:
         parse_time("1795163910500000000", now)
 
 
-def test_where_the_topic_is_forgotten_the_command_is_named(folder: Path, capsys: Capture) -> None:
-    for words in (["cat"], ["plot", "signal", "-o", "x.svg"]):
-        assert cli.main([*words, str(folder / "a")]) == 2
-        command = " ".join(words[:2] if words[0] == "plot" else words)
-        expected = f"is a folder, not a topic; write `ros2-memory {command} {folder / 'a'} TOPIC`"
-        assert expected in capsys.readouterr().err
+@pytest.mark.parametrize("words", [["cat"], ["plot", "signal", "-o", "x.svg"]])
+def test_where_the_topic_is_forgotten_the_command_is_named(
+    folder: Path, exits: Program, words: list[str]
+) -> None:
+    expected = f"write `ros2-memory {' '.join(words[:2])} {folder / 'a'} TOPIC`"
+    assert f"is a folder, not a topic; {expected}" in exits(2, *words, folder / "a").err
 
 
-def test_a_path_may_come_first(folder: Path, capsys: Capture, tmp_path: Path) -> None:
+def test_a_path_may_come_first(folder: Path, exits: Program, tmp_path: Path) -> None:
     bags = folder / "a"
     for first, last in (
         (["cat", bags, "/odom"], ["cat", "/odom", bags]),
         (["ask", bags, "data_time_range"], ["ask", "data_time_range", bags]),
     ):
-        assert cli.main([*map(str, first)]) == 0
-        shown = capsys.readouterr().out
-        assert cli.main([*map(str, last)]) == 0
-        assert shown == capsys.readouterr().out
+        shown = exits(0, *first).out
+        assert shown == exits(0, *last).out
     for words in ([bags], [bags, "timeline"], [bags, "signal", "/odom"]):
         picture = tmp_path / "picture.svg"
-        assert cli.main(["plot", *map(str, words), "-o", str(picture)]) == 0
+        exits(0, "plot", *words, "-o", picture)
         picture.unlink()
 
 
-def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, capsys: Capture) -> None:
-    _, shown = run(capsys, "ask", "visits", "--help")
+def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, exits: Program) -> None:
+    shown = exits(0, "ask", "visits", "--help").out
     assert "ros2-memory ask visits key=value" in shown
     assert "  where?" in shown
-    _, shown = run(capsys, "ask", folder / "a", "--json")
-    assert all(each["purpose"] for each in json.loads(shown))
+    assert all(each["purpose"] for each in exits(0, "ask", folder / "a", "--json").json)
 
 
 def test_commands_take_a_path_and_the_log_is_shown_on_request(
-    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    assert run(capsys, "index", folder / "a")[0] == 0
-    code, shown = run(capsys, "config", "show", folder / "a", "--json")
-    assert (code, json.loads(shown)["recording.bag_dir"]) == (0, str(folder / "a"))
-    assert cli.main(["config", "show", "foo=[bar"]) == 2
-    assert "expecting" not in capsys.readouterr().err
-    assert cli.main(["-v", "info", str(folder / "a")]) == 0
-    assert "index_scanned" in capsys.readouterr().err
+    exits(0, "index", folder / "a")
+    assert exits(0, "config", "show", folder / "a", "--json").json["recording.bag_dir"] == str(
+        folder / "a"
+    )
+    assert "expecting" not in exits(2, "config", "show", "foo=[bar").err
+    assert "index_scanned" in exits(0, "-v", "info", folder / "a").err
 
 
-def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, capsys: Capture) -> None:
-    _, shown = run(capsys, "ask", "recap", folder / "b", "--json")
-    reply = json.loads(shown)
+def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, exits: Program) -> None:
+    reply = exits(0, "ask", "recap", folder / "b", "--json").json
     assert reply["start"] <= T0 / NS_PER_S + 100 < reply["end"]
     assert reply["end"] - reply["start"] >= 23 * 3600
 
@@ -497,12 +492,12 @@ def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, capsys: Captu
     ids=" ".join,
 )
 def test_every_command_prints_json(
-    folder: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch, words: list[str]
+    folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, words: list[str]
 ) -> None:
     own_all(folder)
     monkeypatch.chdir(folder)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
     monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    _, shown = run(capsys, *words, "--json")
-    assert json.loads(shown)
+    code = 1 if words[0] == "forget" else 0  # bags of others stay
+    assert exits(code, *words, "--json").json

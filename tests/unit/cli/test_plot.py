@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from typing import TYPE_CHECKING
@@ -12,7 +11,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory import cli
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import Geodetic, TimeWindow
@@ -25,10 +23,11 @@ pytest.importorskip("matplotlib", reason="needs the extra plot")
 
 from ros2_memory.cli.options import day_of
 from ros2_memory.cli.plot import scene
-from ros2_memory.cli.plot.without_poses import east_north
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
@@ -60,21 +59,25 @@ def no_deployment(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_where_the_poses_are_on_several_other_topics_it_names_the_option(
-    tmp_path: Path, capsys: Capture
+    tmp_path: Path, exits: Program
 ) -> None:
     other = [odom(T0, 0.0, 0.0, topic=name) for name in ("/base/odometry", "/slam/odometry")]
     write_mcap(tmp_path / "bag.mcap", other)
-    assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 2
-    assert "set data.pose_topic to one of them, or give --topic" in capsys.readouterr().err
+    assert (
+        "set data.pose_topic to one of them, or give --topic"
+        in exits(2, "plot", "path", tmp_path, "--out", tmp_path / "x.svg").err
+    )
 
 
 def test_where_the_poses_are_on_one_other_topic_it_is_drawn_and_named(
-    tmp_path: Path, capsys: Capture
+    tmp_path: Path, exits: Program
 ) -> None:
     driven = [odom(T0 + n * S, float(n), 0.0, topic="/base/odometry") for n in range(3)]
     write_mcap(tmp_path / "bag.mcap", driven)
-    assert cli.main(["plot", "path", str(tmp_path), "--out", str(tmp_path / "x.svg")]) == 0
-    assert "by /base/odometry, the only topic for it" in capsys.readouterr().err
+    assert (
+        "by /base/odometry, the only topic for it"
+        in exits(0, "plot", "path", tmp_path, "--out", tmp_path / "x.svg").err
+    )
 
 
 def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> None:
@@ -129,14 +132,13 @@ def test_metres_east_and_north_lead_back_to_the_fix(
     north = latitude + math.degrees(metres[1] / radius)
     east = longitude + math.degrees(metres[0] / radius / math.cos(math.radians(latitude)))
     wrapped = (east + 180) % 360 - 180
-    found = east_north(origin, Geodetic(north, wrapped, 0.0))
+    found = scene.east_north(origin, Geodetic(north, wrapped, 0.0))
     assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3
 
 
-def test_times_in_errors_are_printed_as_they_are_typed(bags: Path, capsys: Capture) -> None:
+def test_times_in_errors_are_printed_as_they_are_typed(bags: Path, exits: Program) -> None:
     words = ["plot", "path", str(bags), "--start", "1700000040", "--end", "1700000050"]
-    assert cli.main([*words, "--out", str(bags / "none.svg")]) == 2
-    shown = capsys.readouterr().err
+    shown = exits(2, *words, "--out", bags / "none.svg").err
     assert format_time(1_700_000_060.0) in shown
     assert "1700000060" not in shown
 
@@ -151,23 +153,22 @@ def scene_of(bags: Path) -> scene.Scene:
     ids=lambda words: words[0],
 )
 def test_each_is_a_picture_of_the_asked_kind(
-    bags: Path, tmp_path: Path, capsys: Capture, words: list[str]
+    bags: Path, tmp_path: Path, exits: Program, words: list[str]
 ) -> None:
     kind, *topic = words
     drawn = tmp_path / f"{kind}.svg"
-    assert cli.main(["plot", kind, *topic, str(bags), "--out", str(drawn), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["path"] == str(drawn)
+    assert exits(0, "plot", kind, *topic, bags, "--out", drawn, "--json").json["path"] == str(drawn)
     assert ET.parse(drawn).getroot().tag.endswith("svg")  # noqa: S314 - written just now
 
 
 def test_a_png_begins_as_one_and_no_home_is_written_to(
-    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    bags: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
     home = tmp_path / "home"
     home.mkdir()
     monkeypatch.setenv("HOME", str(home))
     drawn = tmp_path / "path.png"
-    assert cli.main(["plot", "path", str(bags), "-o", str(drawn), "--last", "5"]) == 0
+    exits(0, "plot", "path", bags, "-o", drawn, "--last", "5")
     assert drawn.read_bytes().startswith(b"\x89PNG")
     assert [*home.iterdir()] == []
 
@@ -243,25 +244,25 @@ def test_a_day_is_one_of_this_machines_calendar(bags: Path) -> None:
     ],
 )
 def test_where_there_can_be_no_picture_it_says_why(
-    bags: Path, tmp_path: Path, capsys: Capture, words: list[str], reason: str
+    bags: Path, tmp_path: Path, exits: Program, words: list[str], reason: str
 ) -> None:
     words = [str(tmp_path / each) if re.search(r"\.(svg|jpeg)$", each) else each for each in words]
-    assert cli.main(["plot", *words, f"recording.bag_dir={bags}"]) == 2
-    assert reason in capsys.readouterr().err
+    assert reason in exits(2, "plot", *words, f"recording.bag_dir={bags}").err
     assert [*tmp_path.iterdir()] == []
 
 
 def test_without_the_extra_it_names_the_command_that_installs_it(
-    bags: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+    bags: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.cli.plot.commands.find_spec", lambda name: None)
-    assert cli.main(["plot", "path", str(bags), "--out", str(tmp_path / "a.svg")]) == 2
-    assert "pip install '.[plot]'" in capsys.readouterr().err
+    assert (
+        "pip install '.[plot]'" in exits(2, "plot", "path", bags, "--out", tmp_path / "a.svg").err
+    )
 
 
-def test_a_recap_without_poses_has_the_rest(tmp_path: Path) -> None:
+def test_a_recap_without_poses_has_the_rest(tmp_path: Path, exits: Program) -> None:
     words = [text(T0 + n * S, f"word {n}") for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", words)
     drawn = tmp_path / "recap.svg"
-    assert cli.main(["plot", "recap", str(tmp_path / "rec"), "--out", str(drawn)]) == 0
+    exits(0, "plot", "recap", tmp_path / "rec", "--out", drawn)
     assert drawn.stat().st_size > 1000

@@ -10,7 +10,6 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from ros2_memory import cli
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
@@ -21,6 +20,8 @@ from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    from tests.support.program import Program
 
 S = 10**9
 T0 = 1_790_000_000 * S
@@ -277,39 +278,37 @@ def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path
 class TestTheProgram:
     @pytest.mark.parametrize("answer", ["n\n", ""])
     def test_asks_before_it_changes_what_another_program_made(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answer: str, exits: Program
     ) -> None:
         empty = tmp_path / "rec" / "rec_0.mcap"
         empty.parent.mkdir()
         empty.write_bytes(b"")
         monkeypatch.setattr("sys.stdin", io.StringIO(answer))
-        assert cli.main(["recover", str(tmp_path), "--force"]) == 1
-        assert cli.main(["recover", str(tmp_path), "--force", "--json"]) == 2
+        exits(1, "recover", tmp_path, "--force")
+        exits(2, "recover", tmp_path, "--force", "--json")
         assert empty.exists()
-        assert cli.main(["recover", str(tmp_path), "--force", "--yes"]) == 0
+        exits(0, "recover", tmp_path, "--force", "--yes")
         assert not empty.exists()
 
-    def test_does_not_ask_where_this_recorder_made_the_recording(self, tmp_path: Path) -> None:
+    def test_does_not_ask_where_this_recorder_made_the_recording(
+        self, tmp_path: Path, exits: Program
+    ) -> None:
         left_open(tmp_path / "rec/rec_0.mcap")
         own_all(tmp_path)
-        assert cli.main(["recover", str(tmp_path), "--force"]) == 0
+        exits(0, "recover", tmp_path, "--force")
 
-    def test_exits_0_where_nothing_is_left_unfinished(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_exits_0_where_nothing_is_left_unfinished(self, tmp_path: Path, exits: Program) -> None:
         left_open(tmp_path / "a_0.mcap")
-        assert cli.main(["recover", str(tmp_path), "--force", "--yes"]) == 0
-        assert "1 repaired" in capsys.readouterr().out
+        assert "1 repaired" in exits(0, "recover", tmp_path, "--force", "--yes").out
 
-    def test_exits_1_where_a_file_could_not_be_repaired(self, tmp_path: Path) -> None:
-        (tmp_path / "a_0.mcap").write_bytes(b"a letter")
-        assert cli.main(["recover", str(tmp_path)]) == 1
-
-    def test_exits_2_where_there_is_nothing(
-        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    def test_exits_1_where_a_file_could_not_be_repaired(
+        self, tmp_path: Path, exits: Program
     ) -> None:
-        assert cli.main(["recover", str(tmp_path / "gone")]) == 2
-        assert "ros2-memory recover: " in capsys.readouterr().err
+        (tmp_path / "a_0.mcap").write_bytes(b"a letter")
+        exits(1, "recover", tmp_path)
+
+    def test_exits_2_where_there_is_nothing(self, tmp_path: Path, exits: Program) -> None:
+        assert "ros2-memory recover: " in exits(2, "recover", tmp_path / "gone").err
 
 
 @needs_recorded

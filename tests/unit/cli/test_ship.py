@@ -23,6 +23,10 @@ from tests.support.lakes import lake_column
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from tests.support.program import Printed, Program
+
+    Ship = Callable[..., Printed]
+
 Capture = pytest.CaptureFixture[str]
 ROBOTS = ("hall", "kitchen")
 
@@ -36,72 +40,55 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
-    """Runs one pass into a lake of its own."""
+def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Program) -> Ship:
+    """Runs one pass into a lake of its own, which must end with a code."""
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    def run(*more: str) -> int:
-        robots = f"fleet.robots={fleet}/*"
-        settings = ["lake.commit_interval_s=0", f"lake.warehouse={tmp_path}/lake", *more]
-        return cli.main(["ship", "--once", "--json", robots, *settings])
+    def run(code: int, *more: object) -> Printed:
+        settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake", *more]
+        return exits(code, "ship", "--once", "--json", "lake.commit_interval_s=0", *settings)
 
     return run
 
 
-def test_one_pass_ships_every_closed_bag(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
-) -> None:
-    assert ship() == 0
-    done = json.loads(capsys.readouterr().out)
+def test_one_pass_ships_every_closed_bag(ship: Ship, tmp_path: Path) -> None:
+    done = ship(0).json
     assert (done["bags"], done["waiting"], done["problems"]) == (4, 0, [])
     labels = [label for name in ROBOTS for _, label in seeded(name).seen]
     assert lake_column(tmp_path / "lake", "sightings", "label") == sorted(labels)
-    assert ship() == 0
-    assert json.loads(capsys.readouterr().out)["bags"] == 0
+    assert ship(0).json["bags"] == 0
 
 
-def test_a_time_is_forgotten_and_stays_so(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
-) -> None:
-    assert ship() == 0
+def test_a_time_is_forgotten_and_stays_so(ship: Ship, tmp_path: Path) -> None:
+    ship(0)
     hall = seeded("hall")
     times = ("--start", str(hall.start_s), "--end", str(hall.start_s + 5))
-    capsys.readouterr()
-    assert ship("--forget", "hall", *times) == 0
-    assert json.loads(capsys.readouterr().out)["bags"] == 1
+    assert ship(0, "--forget", "hall", *times).json["bags"] == 1
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
-    assert ship() == 1
-    [problem] = json.loads(capsys.readouterr().out)["problems"]
+    [problem] = ship(1).json["problems"]
     assert "rec_0.mcap has messages that were forgotten" in problem
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 3
-    assert ship("--forget", "hall") == 2
-    assert "--start" in capsys.readouterr().err
+    assert "--start" in ship(2, "--forget", "hall").err
 
 
-def test_a_robot_that_nobody_knows_is_not_forgotten(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
-) -> None:
+def test_a_robot_that_nobody_knows_is_not_forgotten(ship: Ship, tmp_path: Path) -> None:
     """A mistyped name would look like success, and leave a tombstone for ever."""
-    assert ship() == 0
-    capsys.readouterr()
-    assert ship("--forget", "hal", "--start", "0", "--end", "1") == 2
-    assert "hall" in capsys.readouterr().err
+    ship(0)
+    assert "hall" in ship(2, "--forget", "hal", "--start", "0", "--end", "1").err
     assert not (tmp_path / "lake" / ".ros2-memory" / TOMBSTONES_FILE).exists()
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 4
 
 
-def test_a_second_writer_ends_and_names_the_first(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
-) -> None:
+def test_a_second_writer_ends_and_names_the_first(ship: Ship, tmp_path: Path) -> None:
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
-        assert ship() == 2
+        refused = ship(2).err
         with (
             pytest.raises(LakeError, match="one writer"),
             writing_alone(tmp_path / "lake" / ".ros2-memory"),
         ):
             pass
-    assert "process" in capsys.readouterr().err
+    assert "process" in refused
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
         pass
 
@@ -155,7 +142,7 @@ def test_a_service_ships_robots_that_come_while_it_runs(
 
 
 def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
-    ship: Callable[..., int],
+    ship: Ship,
     fleet: Path,
     tmp_path: Path,
     capsys: Capture,
@@ -175,8 +162,7 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
 
     assert "has no bag yet" in found()["lake warning"][0]
     assert not lake.exists()
-    assert ship(robots) == 0
-    capsys.readouterr()
+    ship(0, robots)
     with writing_alone(lake / ".ros2-memory"):
         told = found()
     assert [*told] == ["lake ok"]
@@ -200,36 +186,29 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     assert "looking into the lake failed" in found()["lake error"][0]
 
 
-def test_without_the_extra_it_names_the_extra(
-    ship: Callable[..., int], monkeypatch: pytest.MonkeyPatch, capsys: Capture
-) -> None:
+def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
         bootstrap_lake, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
     )
-    assert ship() == 2
-    assert "pip install '.[lake]'" in capsys.readouterr().err
+    assert "pip install '.[lake]'" in ship(2).err
 
 
-def test_without_a_warehouse_it_says_how_to_name_one(
-    ship: Callable[..., int], capsys: Capture
-) -> None:
-    assert ship("lake.warehouse=null") == 2
-    assert "lake.warehouse=/srv/lake" in capsys.readouterr().err
+def test_without_a_warehouse_it_says_how_to_name_one(ship: Ship) -> None:
+    assert "lake.warehouse=/srv/lake" in ship(2, "lake.warehouse=null").err
 
 
 def test_a_robot_whose_folder_is_gone_is_named_and_the_others_are_shipped(
-    ship: Callable[..., int], fleet: Path, tmp_path: Path, capsys: Capture
+    ship: Ship, fleet: Path, tmp_path: Path
 ) -> None:
     robots = f"fleet.robots={{hall: {fleet}/hall, attic: {tmp_path}/attic}}"
-    assert ship(robots) == 1
-    done = json.loads(capsys.readouterr().out)
+    done = ship(1, robots).json
     assert done["bags"] == 2
     assert "attic" in done["problems"][0]
 
 
 def test_no_secret_is_in_an_error_or_in_the_configuration(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
+    ship: Ship, tmp_path: Path, exits: Program
 ) -> None:
     secrets = tmp_path / "secrets.yaml"
     secrets.write_text('s3.secret-access-key: "hunter2hunter2"\n')
@@ -240,16 +219,11 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
     with pytest.raises(LakeError) as failed, location.translated("writing"):
         raise RuntimeError("the store refused hunter2hunter2")
     assert "hunter2" not in str(failed.value)
-    assert cli.main(["config", "show", "fleet.robots={r1: /r1}", given]) == 0
-    assert "hunter2" not in capsys.readouterr().out
+    assert "hunter2" not in exits(0, "config", "show", "fleet.robots={r1: /r1}", given).out
     secrets.write_text("[hunter2hunter2]")
-    assert ship(given) == 2
-    assert "hunter2" not in capsys.readouterr().err
+    assert "hunter2" not in ship(2, given).err
 
 
-def test_a_lake_that_cannot_be_opened_is_reported(
-    ship: Callable[..., int], tmp_path: Path, capsys: Capture
-) -> None:
+def test_a_lake_that_cannot_be_opened_is_reported(ship: Ship, tmp_path: Path) -> None:
     (tmp_path / "lake").write_text("a file in its place")
-    assert ship() == 2
-    assert str(tmp_path / "lake") in capsys.readouterr().err
+    assert str(tmp_path / "lake") in ship(2).err

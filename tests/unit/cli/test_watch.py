@@ -22,6 +22,8 @@ from tests.support.bags import boolean, log_entry, odom, text, write_mcap
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from tests.support.program import Program
+
 Capture = pytest.CaptureFixture[str]
 
 
@@ -61,9 +63,8 @@ def test_a_rate_is_assessed_by_what_is_usual(
     assert TopicRate("/x", rate, usual, age_s).assessment == assessment
 
 
-def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture) -> None:
-    assert cli.main(["watch", "--count", "2", "--every", "0.01"]) == 0
-    lines = capsys.readouterr().out.splitlines()
+def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(exits: Program) -> None:
+    lines = exits(0, "watch", "--count", "2", "--every", "0.01").out.splitlines()
     assert len(lines) == 2
     assert "1 topic at its usual rate" in lines[0]
     assert "/chatter silent (0 Hz, usually 1" in lines[0]
@@ -72,28 +73,25 @@ def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(capsys: Capture)
 
 
 def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
-    bag_dir: Path, capsys: Capture
+    bag_dir: Path, exits: Program
 ) -> None:
     begin = time.time_ns() - 70 * NS_PER_S
     lines = [log_entry(begin + n * NS_PER_S, 20, "nav", "hello") for n in range(30)]
     write_mcap(bag_dir / "log" / "log_0.mcap", lines)
     append_losses(bag_dir, [Loss("/chatter", begin, begin + 65 * NS_PER_S, 30, "forgotten")])
-    assert cli.main(["watch", "--count", "1"]) == 0
-    line = capsys.readouterr().out
+    line = exits(0, "watch", "--count", "1").out
     assert "silent" not in line
     assert "/bumper slow (0.2 Hz" in line
 
 
-def test_an_empty_memory_can_be_watched(tmp_path: Path, capsys: Capture) -> None:
+def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "none").mkdir()
-    assert cli.main(["watch", "--count", "1", "--bag-dir", str(tmp_path / "none")]) == 0
-    assert "no data" in capsys.readouterr().out
+    assert "no data" in exits(0, "watch", "--count", "1", "--bag-dir", tmp_path / "none").out
 
 
 @pytest.mark.parametrize("words", [["--every", "0"], ["--count", "0"]])
-def test_what_makes_no_sense_is_refused(capsys: Capture, words: list[str]) -> None:
-    assert cli.main(["watch", *words]) == 2
-    assert "more than 0" in capsys.readouterr().err
+def test_what_makes_no_sense_is_refused(exits: Program, words: list[str]) -> None:
+    assert "more than 0" in exits(2, "watch", *words).err
 
 
 def test_a_terminal_gets_a_table() -> None:
@@ -115,16 +113,13 @@ def test_a_terminal_gets_a_table() -> None:
     assert b"silent" in shown
 
 
-def test_restarts_and_topics_that_nobody_offers_are_reported(
-    bag_dir: Path, capsys: Capture
-) -> None:
+def test_restarts_and_topics_that_nobody_offers_are_reported(bag_dir: Path, exits: Program) -> None:
     now = time.time_ns()
     beat = Heartbeat(
         1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")
     )
     write_heartbeat(bag_dir, beat)
-    assert cli.main(["watch", "--count", "1"]) == 0
-    output = capsys.readouterr().out
+    output = exits(0, "watch", "--count", "1").out
     assert "recorder: recording, restarted 2 times;" in output
     assert "offered by no publisher: /gone, /lost" in output
 
@@ -138,9 +133,8 @@ class TestOldData:
         os.utime(folder / "rec" / "rec_0.mcap", (1_700_000_010,) * 2)
         return folder
 
-    def test_is_not_judged_by_what_is_usual(self, old: Path, capsys: Capture) -> None:
-        assert cli.main(["watch", "--count", "1", "--bag-dir", str(old)]) == 0
-        output = capsys.readouterr().out
+    def test_is_not_judged_by_what_is_usual(self, old: Path, exits: Program) -> None:
+        output = exits(0, "watch", "--count", "1", "--bag-dir", old).out
         assert "as usual" not in output
         assert "days old; no new data; rates not checked for 1 topic" in output
 

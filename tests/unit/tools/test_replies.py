@@ -95,28 +95,152 @@ def trajectory(**other: Any) -> results.TrajectorySummary:
     return results.TrajectorySummary("/odom", "odom", T0, T0 + 1, Trajectory(**way | other))
 
 
-def test_topics_are_a_bare_list() -> None:
-    rows = (row(1), results.TopicRow("/x", "a/msg/B", T0, T0, 1, "no definition"))
-    assert said(rows) == [
-        {
-            "topic": "/topic_0001",
-            "type": "std_msgs/msg/String",
-            "first_ts": 1784023200.0,
-            "last_ts": 1784023200.000001,
-            "count": 7,
-        },
-        {
-            "topic": "/x",
-            "type": "a/msg/B",
-            "first_ts": 1784023200.0,
-            "last_ts": 1784023200.0,
-            "count": 1,
-        },
-    ]
+HALF = math.sqrt(0.5)
+NOWHERE = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, HALF, HALF), "odom")
 
 
-def test_no_topics_are_an_empty_list() -> None:
-    assert said(()) == []
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        pytest.param((), "[]", id="no topics are an empty list"),
+        pytest.param(
+            (row(1), results.TopicRow("/x", "a/msg/B", T0, T0, 1, "no definition")),
+            '[{"topic":"/topic_0001","type":"std_msgs/msg/String","first_ts":1784023200.0,'
+            '"last_ts":1784023200.000001,"count":7},{"topic":"/x","type":"a/msg/B",'
+            '"first_ts":1784023200.0,"last_ts":1784023200.0,"count":1}]',
+            id="topics are a bare list",
+        ),
+        pytest.param(
+            value(),
+            '{"topic":"/a","type":"std_msgs/msg/Float64","timestamp":1784023200.0,"value":1.5}',
+            id="a topic's value has no age and no notes unless there are some",
+        ),
+        pytest.param(
+            value(age=1_234_567_890, notes=("thinned",)),
+            '{"topic":"/a","type":"std_msgs/msg/Float64","timestamp":1784023200.0,"value":1.5,'
+            '"age_s":1.235,"notes":["thinned"]}',
+            id="a topic's value with its age",
+        ),
+        pytest.param(
+            results.Position("/odom", T0, NOWHERE, age=2 * NS_PER_S),
+            '{"x":1.2346,"y":null,"z":0.0,"yaw_deg":90.0,"timestamp":1784023200.0,'
+            '"topic":"/odom","frame_id":"odom","age_s":2.0}',
+            id="a position is in metres and degrees, with null for what is not known",
+        ),
+        pytest.param(
+            results.Velocity(
+                "/odom",
+                T0,
+                Twist((0.50001, 0.0, math.inf), (0.0, 0.0, -0.12345), "base_link"),
+                notes=("odd",),
+            ),
+            '{"linear":{"x":0.5,"y":0.0,"z":null},"angular":{"x":0.0,"y":0.0,"z":-0.1235},'
+            '"timestamp":1784023200.0,"topic":"/odom","frame_id":"base_link","notes":["odd"]}',
+            id="a velocity has a linear and an angular part",
+        ),
+        pytest.param(
+            results.TransformAt(
+                "odom", "laser", T0, Transform((0.123456, 0.0, 0.2), (0.0, 0.0, -HALF, HALF)), "log"
+            ),
+            '{"translation":{"x":0.1235,"y":0.0,"z":0.2},'
+            '"rotation":{"x":0.0,"y":0.0,"z":-0.707107,"w":0.707107},"yaw_deg":-90.0,'
+            '"timestamp":1784023200.0,"parent":"odom","child":"laser","clock":"log"}',
+            id="a transform has translation, rotation and yaw",
+        ),
+        pytest.param(
+            results.Frames((FrameEdge("odom", "base", False), FrameEdge("base", "laser", True))),
+            '{"frames":["base","laser","odom"],"transforms":['
+            '{"parent":"base","child":"laser","static":true},'
+            '{"parent":"odom","child":"base","static":false}]}',
+            id="frames are named once and sorted",
+        ),
+        pytest.param(results.Match(None), "null", id="a complete search without a match"),
+        pytest.param(results.ValueWhen(None), "null", id="a complete search for a value"),
+        *(
+            pytest.param(
+                kind(None, notes=("a.mcap is damaged",)),
+                '{"timestamp":null,"value":null,"notes":["a.mcap is damaged"]}',
+                id=f"an incomplete search without a {kind.__name__} says what it missed",
+            )
+            for kind in (results.Match, results.ValueWhen)
+        ),
+        pytest.param(
+            results.Match(
+                value(age=NS_PER_S, notes=("b.mcap was left open", "thinned")),
+                notes=("b.mcap was left open",),
+            ),
+            '{"timestamp":1784023200.0,"value":1.5,"topic":"/a","type":"std_msgs/msg/Float64",'
+            '"age_s":1.0,"notes":["b.mcap was left open","thinned"]}',
+            id="a match says when, what and where, with each note once",
+        ),
+        pytest.param(
+            results.ValueWhen(
+                value(T0, {"data": True}),
+                results.TopicValue(
+                    "/odom", "nav_msgs/msg/Odometry", Sample(T0 - NS_PER_S, {"x": 1})
+                ),
+                notes=("1 s older",),
+            ),
+            '{"timestamp":1784023200.0,"matched":{"data":true},"value":{"x":1},'
+            '"value_timestamp":1784023199.0,"condition_topic":"/a","value_topic":"/odom",'
+            '"notes":["1 s older"]}',
+            id="a value when another matched has both",
+        ),
+        pytest.param(
+            results.ValueWhen(value(), notes=("/odom held no message yet",)),
+            '{"timestamp":1784023200.0,"matched":1.5,"value":null,"value_timestamp":null,'
+            '"condition_topic":"/a","value_topic":null,"notes":["/odom held no message yet"]}',
+            id="a topic that held nothing yet gives a null value",
+        ),
+        pytest.param(
+            trajectory(),
+            '{"distance_m":12.3457,"avg_speed":0.2058,"max_speed":0.5,"duration_s":60.0,'
+            '"waypoints":[{"timestamp":1784023200.0,"x":0.0,"y":1.0,"z":0.0,"yaw_deg":90.0},'
+            '{"timestamp":1784023200.000001,"x":1.0,"y":2.0,"z":0.0,"yaw_deg":null}],'
+            '"topic":"/odom","frame_id":"odom","start":1784023200.0,"end":1784023200.000001,'
+            '"poses":3000}',
+            id="a trajectory is rounded to sense",
+        ),
+    ],
+)
+def test_the_text_of_an_answer(answer: Answer, text: str) -> None:
+    assert REPLIES.answer(answer).text == text
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (
+            NoDataError(NoDataReason.GAP, "the nearest is 3 s off"),
+            '{"error":"no_data","reason":"gap","detail":"the nearest is 3 s off"}',
+        ),
+        (
+            NoDataError(NoDataReason.GAP, "nothing", ("1 file is damaged",)),
+            '{"error":"no_data","reason":"gap","detail":"nothing","notes":["1 file is damaged"]}',
+        ),
+        (
+            UndecodableError("/x", "a/msg/B", "no definition"),
+            '{"error":"no_data","reason":"undecodable","detail":"/x (a/msg/B): no definition"}',
+        ),
+        (InvalidArgumentsError("say a"), '{"error":"invalid_arguments","detail":"say a"}'),
+        (QueryTimeoutError("say a"), '{"error":"timeout","detail":"say a"}'),
+        (ConfigError("say a"), '{"error":"invalid_config","detail":"say a"}'),
+    ],
+)
+def test_having_no_data_is_an_answer_with_its_reason(error: EpisodicError, text: str) -> None:
+    """Other errors are errors for the protocol, too."""
+    reply = REPLIES.error(error)
+    assert (reply.text, reply.is_error) == (
+        text,
+        not isinstance(error, (NoDataError, UndecodableError)),
+    )
+
+
+def test_a_bag_error_names_the_file_but_no_path_of_the_machine() -> None:
+    reply = Replies(Path("/data/bags"), 1000).error(
+        BagVanishedError("/data/bags/r1/r1_0.mcap", "it is gone")
+    )
+    assert json.loads(reply.text)["detail"] == "r1/r1_0.mcap: it is gone; ask again"
 
 
 ROW_KEYS = ["topic", "type", "first_ts", "last_ts", "count"]
@@ -173,18 +297,6 @@ def test_a_timestamp_is_rounded_up_so_that_it_finds_its_own_message() -> None:
     at = T0 + 123_456_001
     assert ns_from_unix(said(value(at))["timestamp"]) >= at
     assert said(value(at))["timestamp"] == 1784023200.123457
-
-
-def test_a_topic_value_has_no_age_and_no_notes_unless_there_are_some() -> None:
-    assert said(value()) == {
-        "topic": "/a",
-        "type": "std_msgs/msg/Float64",
-        "timestamp": 1784023200.0,
-        "value": 1.5,
-    }
-    shown = said(value(age=1_234_567_890, notes=("thinned",)))
-    assert shown["age_s"] == 1.235
-    assert shown["notes"] == ["thinned"]
 
 
 def test_an_empty_memory_has_nulls_for_its_span() -> None:
@@ -382,126 +494,11 @@ def test_a_range_beyond_the_cap_is_thinned_and_keeps_its_ends() -> None:
     assert "of 100 kept, evenly spaced" in shown["notes"][0]
 
 
-def test_a_position_is_in_metres_and_degrees_with_null_for_what_is_not_known() -> None:
-    pose = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), "odom")
-    assert said(results.Position("/odom", T0, pose, age=2 * NS_PER_S)) == {
-        "x": 1.2346,
-        "y": None,
-        "z": 0.0,
-        "yaw_deg": 90.0,
-        "timestamp": 1784023200.0,
-        "topic": "/odom",
-        "frame_id": "odom",
-        "age_s": 2.0,
-    }
-
-
 @pytest.mark.parametrize("orientation", [None, (0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
 def test_a_position_without_a_rotation_has_no_yaw(orientation: Any) -> None:
     shown = said(results.Position("/gps", T0, Pose((1.0, 2.0, 3.0), orientation)))
     assert shown["yaw_deg"] is None
     assert shown["frame_id"] is None
-
-
-def test_a_velocity_has_a_linear_and_an_angular_part() -> None:
-    twist = Twist((0.50001, 0.0, math.inf), (0.0, 0.0, -0.12345), "base_link")
-    assert said(results.Velocity("/odom", T0, twist, notes=("odd",))) == {
-        "linear": {"x": 0.5, "y": 0.0, "z": None},
-        "angular": {"x": 0.0, "y": 0.0, "z": -0.1235},
-        "timestamp": 1784023200.0,
-        "topic": "/odom",
-        "frame_id": "base_link",
-        "notes": ["odd"],
-    }
-
-
-def test_a_transform_has_translation_rotation_and_yaw() -> None:
-    half = math.sqrt(0.5)
-    transform = Transform((0.123456, 0.0, 0.2), (0.0, 0.0, -half, half))
-    assert said(results.TransformAt("odom", "laser", T0, transform, "log")) == {
-        "translation": {"x": 0.1235, "y": 0.0, "z": 0.2},
-        "rotation": {"x": 0.0, "y": 0.0, "z": -0.707107, "w": 0.707107},
-        "yaw_deg": -90.0,
-        "timestamp": 1784023200.0,
-        "parent": "odom",
-        "child": "laser",
-        "clock": "log",
-    }
-
-
-def test_frames_are_named_once_and_sorted() -> None:
-    edges = (FrameEdge("odom", "base", static=False), FrameEdge("base", "laser", static=True))
-    assert said(results.Frames(edges)) == {
-        "frames": ["base", "laser", "odom"],
-        "transforms": [
-            {"parent": "base", "child": "laser", "static": True},
-            {"parent": "odom", "child": "base", "static": False},
-        ],
-    }
-
-
-def test_a_complete_search_without_a_match_is_null() -> None:
-    assert REPLIES.answer(results.Match(None)).text == "null"
-    assert REPLIES.answer(results.ValueWhen(None)).text == "null"
-
-
-@pytest.mark.parametrize("kind", [results.Match, results.ValueWhen])
-def test_an_incomplete_search_without_a_match_says_what_it_missed(kind: Any) -> None:
-    assert said(kind(None, notes=("a.mcap is damaged",))) == {
-        "timestamp": None,
-        "value": None,
-        "notes": ["a.mcap is damaged"],
-    }
-
-
-def test_a_match_says_when_what_and_where_with_each_note_once() -> None:
-    found = value(age=NS_PER_S, notes=("b.mcap was left open", "thinned"))
-    assert said(results.Match(found, notes=("b.mcap was left open",))) == {
-        "timestamp": 1784023200.0,
-        "value": 1.5,
-        "topic": "/a",
-        "type": "std_msgs/msg/Float64",
-        "age_s": 1.0,
-        "notes": ["b.mcap was left open", "thinned"],
-    }
-
-
-def test_a_value_when_another_matched_has_both() -> None:
-    matched = value(T0, {"data": True})
-    held = results.TopicValue("/odom", "nav_msgs/msg/Odometry", Sample(T0 - NS_PER_S, {"x": 1}))
-    assert said(results.ValueWhen(matched, held, notes=("1 s older",))) == {
-        "timestamp": 1784023200.0,
-        "matched": {"data": True},
-        "value": {"x": 1},
-        "value_timestamp": 1784023199.0,
-        "condition_topic": "/a",
-        "value_topic": "/odom",
-        "notes": ["1 s older"],
-    }
-
-
-def test_a_topic_that_held_nothing_yet_gives_a_null_value() -> None:
-    shown = said(results.ValueWhen(value(), notes=("/odom held no message yet",)))
-    assert shown["value"] is None
-    assert shown["value_timestamp"] is None
-
-
-def test_a_trajectory_is_rounded_to_sense() -> None:
-    assert said(trajectory()) == {
-        "distance_m": 12.3457,
-        "avg_speed": 0.2058,
-        "max_speed": 0.5,
-        "duration_s": 60.0,
-        "waypoints": [
-            {"timestamp": 1784023200.0, "x": 0.0, "y": 1.0, "z": 0.0, "yaw_deg": 90.0},
-            {"timestamp": 1784023200.000001, "x": 1.0, "y": 2.0, "z": 0.0, "yaw_deg": None},
-        ],
-        "topic": "/odom",
-        "frame_id": "odom",
-        "start": 1784023200.0,
-        "end": 1784023200.000001,
-        "poses": 3000,
-    }
 
 
 def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
@@ -551,52 +548,6 @@ def test_a_mean_above_the_highest_speed_is_told() -> None:
     [note] = said(trajectory(avg_speed=0.9, max_speed=0.5))["notes"]
     assert note.startswith("avg_speed, by the positions, is above max_speed")
     assert "notes" not in said(trajectory(avg_speed=0.501, max_speed=0.5))
-
-
-def test_no_data_tells_what_could_not_be_read() -> None:
-    error = NoDataError(NoDataReason.GAP, "nothing", ("1 bag file could not be read",))
-    shown = json.loads(REPLIES.error(error).text)
-    assert shown["notes"] == ["1 bag file could not be read"]
-
-
-def test_having_no_data_is_an_answer_with_its_reason() -> None:
-    reply = REPLIES.error(NoDataError(NoDataReason.GAP, "the nearest is 3 s off"))
-    assert json.loads(reply.text) == {
-        "error": "no_data",
-        "reason": "gap",
-        "detail": "the nearest is 3 s off",
-    }
-    assert not reply.is_error
-
-
-def test_an_undecodable_message_is_no_data() -> None:
-    reply = REPLIES.error(UndecodableError("/x", "a/msg/B", "no definition"))
-    assert json.loads(reply.text) == {
-        "error": "no_data",
-        "reason": "undecodable",
-        "detail": "/x (a/msg/B): no definition",
-    }
-    assert not reply.is_error
-
-
-@pytest.mark.parametrize(
-    ("error", "code"),
-    [
-        (InvalidArgumentsError("say a"), "invalid_arguments"),
-        (QueryTimeoutError("say a"), "timeout"),
-        (ConfigError("say a"), "invalid_config"),
-    ],
-)
-def test_other_errors_are_errors_for_the_protocol_too(error: EpisodicError, code: str) -> None:
-    reply = REPLIES.error(error)
-    assert json.loads(reply.text) == {"error": code, "detail": "say a"}
-    assert reply.is_error
-
-
-def test_a_bag_error_names_the_file_but_no_path_of_the_machine() -> None:
-    replies = Replies(Path("/data/bags"), 1000)
-    reply = replies.error(BagVanishedError("/data/bags/r1/r1_0.mcap", "it is gone"))
-    assert json.loads(reply.text)["detail"] == "r1/r1_0.mcap: it is gone; ask again"
 
 
 def test_a_fault_of_the_server_tells_nothing_but_the_id_of_its_log() -> None:

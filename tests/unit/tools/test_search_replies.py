@@ -65,13 +65,15 @@ def numbers(ns: int, *held: int) -> Msg:
     return Msg("/numbers", "std_msgs/msg/Int32MultiArray", ns, body)
 
 
+def recalling(bag_dir: Path, recalls: bool, **more: Any) -> Memory:
+    """A memory of the bags, which has stored their columns where it recalls them."""
+    memory = memory_of(bag_dir, **more)
+    return with_store(memory, bag_dir) if recalls else memory
+
+
 def last(bag_dir: Path, recalls: bool, topic: str, kind: str, value: JsonValue, **more: Any) -> Any:
-    memory = memory_of(bag_dir)
-    if recalls:
-        memory = with_store(memory, bag_dir)
-    return asked(
-        memory, bag_dir, "find_last_match", topic=topic, condition_type=kind, value=value, **more
-    )
+    given = {"topic": topic, "condition_type": kind, "value": value, **more}
+    return asked(recalling(bag_dir, recalls), bag_dir, "find_last_match", **given)
 
 
 @pytest.fixture
@@ -199,8 +201,7 @@ def test_a_search_that_could_not_read_a_closed_bag_says_which(
         kind = "ros2_vision_interfaces/msg/VisionDetectionArray"
         write_mcap(path, [Msg("/vision/scene/scene_objects", kind, T0 + 10 * S, body)])
     os.utime(path, ns=(T0 + 20 * S,) * 2)
-    memory = memory_of(bag_dir)
-    reply = never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    reply = never(recalling(bag_dir, recalls), bag_dir, tool)
     assert [*reply] == ["timestamp", "value", "notes"]
     assert (reply["timestamp"], reply["value"]) == (None, None)
     shown = "could not be decoded" if fault == "undecodable" else "rec/rec_1.mcap"
@@ -227,8 +228,7 @@ def test_a_copy_that_cannot_be_read_may_hold_what_is_older_than_the_copy(
         copied.write_bytes(b"X" + copied.read_bytes()[1:])
     for path in tmp_path.rglob("*.*"):
         os.utime(path, ns=(T0 - HOUR,) * 2)
-    memory = memory_of(tmp_path, clock=SettableClock(T0))
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = recalling(tmp_path, recalls, clock=SettableClock(T0))
     given: dict[str, Any] = {"condition_type": "equals", "value": False}
     if before_h is not None:
         given["before"] = T0_S - before_h * 3600
@@ -265,11 +265,9 @@ def test_never_is_not_the_answer_beside_a_split_that_is_listed_and_not_there(
     bag_dir: Path, tool: str, recalls: bool, gone: int
 ) -> None:
     list_splits(bag_dir / "rec", 3)
-    memory = memory_of(bag_dir)
-    assert never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool) is None
+    assert never(recalling(bag_dir, recalls), bag_dir, tool) is None
     (bag_dir / "rec" / f"rec_{gone}.mcap").unlink()
-    memory = memory_of(bag_dir)
-    reply = never(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool)
+    reply = never(recalling(bag_dir, recalls), bag_dir, tool)
     lacking = (
         f"1 bag file could not be read and may hold more: rec/rec_{gone}.mcap "
         "(metadata.yaml lists it, but it is missing)"
@@ -346,9 +344,7 @@ def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
     bag_dir: Path, tool: str, recalls: bool, lie: Callable[[Path], None]
 ) -> None:
     lie(bag_dir / "rec" / "rec_1.mcap")
-    memory = memory_of(bag_dir)
-    memory = with_store(memory, bag_dir) if recalls else memory
-    assert never(memory, bag_dir, tool) is None
+    assert never(recalling(bag_dir, recalls), bag_dir, tool) is None
 
 
 @pytest.mark.parametrize("known", [0, 2])

@@ -13,17 +13,8 @@ import typer
 
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
-    BagDir,
-    End,
-    Last,
-    Recording,
-    Start,
-    Verbose,
-    Words,
-    load_to_look,
-    open_memory,
-    parse_window,
-    topic_and_words,
+    Bags,
+    Times,
 )
 from ros2_memory.cli.output import format_time, format_value, with_local_times
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -51,7 +42,6 @@ def cat(
     topic: Annotated[
         str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /odom.")
     ],
-    words: Words = None,
     *,
     field: Annotated[
         list[str] | None,
@@ -59,9 +49,7 @@ def cat(
             metavar="PATH", help="Print only this field, such as pose.covariance; repeatable."
         ),
     ] = None,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     limit: Annotated[
         int | None,
         typer.Option("--limit", "-n", metavar="N", help="Print only the first N messages."),
@@ -76,9 +64,7 @@ def cat(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print JSON lines: time (Unix s), time_ns, value.")
     ] = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Print the messages of a topic in a time window, each once, by log time.
 
@@ -89,11 +75,11 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
-    topic, words = topic_and_words(topic, words, "cat")
-    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
+    topic, bags = bags.with_topic(topic, "cat")
+    memory = bags.memory()
     view = View(memory, Call())
     name = _one_topic(view, topic)
-    window = parse_window(memory, start, end, last)
+    window = times.window(memory)
     messages = view.stream.messages([name], window, newest_first=tail is not None)
     chosen = islice(messages, limit if tail is None else tail)
     exact = as_csv or as_json

@@ -2,7 +2,8 @@
 
 import json
 import re
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -12,23 +13,21 @@ import typer
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
-from ros2_memory.cli.ask import call_tools, is_error
+from ros2_memory.cli.ask import call_tools
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
     AsJson,
-    BagDir,
-    Recording,
-    Verbose,
-    Words,
-    load_to_look,
+    Bags,
     open_memory,
     print_line,
     stdout_console,
 )
 from ros2_memory.cli.output import format_value, print_reply
 from ros2_memory.config import Settings
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
@@ -41,6 +40,7 @@ from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import TopicRow
+from ros2_memory.tools.replies import Replies
 
 _WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
 """A planner's context is short; a person's screen scrolls."""
@@ -57,38 +57,34 @@ _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 def topics(
-    words: Words = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    *,
+    bags: Bags,
 ) -> None:
     """List every recorded topic: type, messages, usual rate, first and last message.
 
     The rate is that of the topic's newest hour, from its first to its last message in each bag;
     latched topics and logs have none.
     """
-    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY], recording)
-    memory = open_memory(settings, verbose=verbose)
-    dispatcher = build_dispatcher(settings, memory)
-    (answer,) = call_tools(dispatcher, {"list_recorded_topics": {}})
-    reply: JsonValue = json.loads(answer.text)
-    rows: list[JsonValue] = []
-    if isinstance(reply, list) and reply:
-        known = list_recorded_topics(memory, Call())
-        rows = [_topic_row(memory, *each) for each in zip(reply, known, strict=True)]
+    memory = bags.memory()
+    rows: list[JsonObject] = []
+    try:
+        rows += [_topic_row(memory, each) for each in list_recorded_topics(memory, Call())]
+        text = json.dumps(rows)
+    except NoDataError as error:
+        text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
     if as_json:
-        print_line(json.dumps(rows) if rows else answer.text)
+        print_line(text)
     elif rows:
         console = stdout_console()
-        shown, notes = _notes_apart(rows)
-        print_reply(console, shown)
+        listed_topics, notes = _notes_apart(rows)
+        print_reply(console, listed_topics)
         if notes:
             print_reply(console, {"notes": notes})
-    elif is_error(reply):
-        print_reply(stdout_console(), reply)
+    elif text != "[]":
+        print_reply(stdout_console(), json.loads(text))
     else:
-        print_line(f"nothing is recorded in {settings.recording.bag_dir}")
+        print_line(f"nothing is recorded in {memory.index.bag_dir}")
         snapshot = memory.index.snapshot()
         for each in (*snapshot.damaged, *snapshot.unread):
             print_line(f"  {each.path.name}: {each.reason}")
@@ -96,9 +92,9 @@ def topics(
         raise typer.Exit(EXIT_NEGATIVE)
 
 
-def _topic_row(memory: Memory, reply: JsonValue, known: TopicRow) -> JsonValue:
+def _topic_row(memory: Memory, known: TopicRow) -> JsonObject:
     """Returns a row of the tool's reply, with what planners read in `data_time_range` instead."""
-    row = {**reply} if isinstance(reply, dict) else {}
+    row = shown(known, Scope())
     if known.undecodable is not None:
         row["undecodable"] = known.undecodable
     if known.notes:
@@ -107,21 +103,19 @@ def _topic_row(memory: Memory, reply: JsonValue, known: TopicRow) -> JsonValue:
     return row
 
 
-def _notes_apart(rows: list[JsonValue]) -> tuple[list[JsonValue], list[JsonValue]]:
+def _notes_apart(rows: Sequence[JsonObject]) -> tuple[list[JsonValue], list[JsonValue]]:
     """Returns the rows without their notes, and the notes, each once with how many topics it is on.
 
     What is wrong with one bag is noted on each topic in it.
     """
     on: dict[str, list[str]] = {}
-    shown: list[JsonValue] = []
+    others: list[JsonValue] = []
     for row in rows:
-        if not isinstance(row, dict):
-            continue
         notes = row.get("notes")
         for note in notes if isinstance(notes, list) else []:
             on.setdefault(str(note), []).append(str(row["topic"]))
-        shown.append({key: value for key, value in row.items() if key != "notes"})
-    return shown, [
+        others.append({key: value for key, value in row.items() if key != "notes"})
+    return others, [
         f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
         for note, topics in on.items()
     ]
@@ -151,17 +145,15 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
 
 
 def info(
-    words: Words = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    *,
+    bags: Bags,
 ) -> None:
     """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
-    settings = load_to_look(bag_dir, [*(words or ()), _WHOLE_REPLY, "server.tools=all"], recording)
+    settings = bags.settings(_WHOLE_REPLY, "server.tools=all")
     robots = settings.fleet.robots
     if not robots:
-        report = _report(settings, verbose=verbose)
+        report = _report(settings, verbose=bags.verbose)
         if as_json:
             print_line(json.dumps(report.as_json()))
         else:
@@ -169,7 +161,9 @@ def info(
         are_bags = report.are_bags
     else:
         every = {
-            name: _report(robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING)
+            name: _report(
+                robot_settings(settings, name), verbose=bags.verbose, setting=ROBOTS_SETTING
+            )
             for name in robots
         }
         if as_json:

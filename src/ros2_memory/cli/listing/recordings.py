@@ -12,12 +12,7 @@ from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     MB,
     AsJson,
-    BagDir,
-    Recording,
-    Verbose,
-    Words,
-    load_to_look,
-    open_memory,
+    Bags,
     print_line,
     stdout_console,
 )
@@ -36,20 +31,17 @@ _EMPTY = "no message was recorded"
 
 
 def recordings(
-    words: Words = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    *,
+    bags: Bags,
 ) -> None:
     """List every recording of a folder: start, length, size, and which program made it.
 
     To use one of them only, give --recording NAME to the other commands, or data.recording=NAME to
     the server.
     """
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
-    snapshot, root = memory.index.snapshot(), settings.recording.bag_dir
+    memory = bags.memory()
+    snapshot, root = memory.index.snapshot(), memory.index.bag_dir
     rows = [*_rows(snapshot, root)]
     empty: list[JsonValue] = [*_empty_rows(snapshot, root)]
     if as_json:

@@ -39,15 +39,12 @@ from ros2_memory.cli.options import (
     MB,
     AsJson,
     BagDir,
-    End,
-    Last,
     Overrides,
-    Start,
+    Times,
     Verbose,
     collect_lines,
     load_for,
     open_memory,
-    parse_window,
     print_line,
     require_recorder,
     spinner,
@@ -82,9 +79,7 @@ PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
 def forget(
     overrides: Overrides = None,
     *,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     topic: Annotated[
         list[str] | None,
         typer.Option(
@@ -120,13 +115,13 @@ def forget(
     collect_lines(as_json, is_answered=yes or dry_run)
     settings = load_for(bag_dir, overrides)
     require_recorder(settings)
-    if last is None and (start is None or end is None):
+    if times.last is None and None in (times.start, times.end):
         raise InvalidArgumentsError("give a time window: --start and --end, or --last")
     memory = open_memory(settings, verbose=verbose)
     snapshot = memory.index.snapshot()
     if snapshot.problem:
         raise RecorderError(snapshot.problem)
-    window = parse_window(memory, start, end, last)
+    window = times.window(memory)
     taking = _Taking(settings, memory, _recorder_of(settings.recording.bag_dir), dry_run=dry_run)
     interrupted = taking.finish()
     if topic or where is not None:

@@ -62,7 +62,7 @@ def index(
     Uses the settings of the server, which also does this in the background. What is stored changes
     only the speed of answers.
     """
-    settings = load_given(bag_dir, words)
+    settings, _ = load_given(bag_dir, words)
     if for_server is not None:
         _fill_for_server(settings, for_server)
     elif settings.fleet.robots:

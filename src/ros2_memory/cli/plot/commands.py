@@ -11,25 +11,17 @@ import typer
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import (
     AsJson,
-    BagDir,
-    End,
-    Last,
-    Recording,
-    Start,
-    Verbose,
-    Words,
+    Bags,
+    Times,
+    as_command,
     day_of,
-    load_to_look,
-    open_memory,
-    parse_window,
     print_line,
-    reported_errors,
     spinner,
-    topic_and_words,
 )
 from ros2_memory.cli.output import with_local_times
 from ros2_memory.cli.plot.scene import (
     MOST_TOPICS,
+    DrawnPath,
     Stop,
     event_lines,
     event_rows,
@@ -47,8 +39,6 @@ from ros2_memory.core.text import counted
 from ros2_memory.history.no_data import resolve_topic
 
 if TYPE_CHECKING:
-    from ros2_memory.cli.plot.drawing import Picture
-    from ros2_memory.cli.plot.without_poses import DrawnPath
     from ros2_memory.core.regions import Place
 
 FORMATS: Final = (".svg", ".png", ".pdf")
@@ -71,14 +61,11 @@ Out = Annotated[
 
 
 @plot.command("path", epilog=epilog("plot"))
-@reported_errors("plot path")
+@as_command("plot path")
 def plot_path(
-    words: Words = None,
     *,
     out: Out,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     topic: Annotated[
         str | None,
         typer.Option(metavar="TOPIC", help="The topic of the poses (default: data.pose_topic)."),
@@ -91,32 +78,28 @@ def plot_path(
         ),
     ] = None,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
-    asked = opened(memory, parse_window(memory, start, end, last))
+    memory = bags.memory()
+    asked = opened(memory, times.window(memory))
     with spinner("looking for the path"):
         path, subtitle, notes = path_in(asked, topic, frame)
         stops = stops_along(recap_in(asked), path)
-    picture = drawing.Picture(f"Path, {asked.title}", subtitle, (8.5, 7.0))
-    drawing.draw_path(picture, path, places_in(memory, path.frame), stops)
-    _finish(picture, out, notes, as_json=as_json)
+    with drawing.picture(out, f"Path, {asked.title}", subtitle, (8.5, 7.0)) as figure:
+        drawing.draw_path(figure.add_subplot(), path, places_in(memory, path.frame), stops)
+    _finish(out, notes, as_json=as_json)
 
 
 @plot.command("signal", epilog=epilog("plot"))
-@reported_errors("plot signal")
+@as_command("plot signal")
 def plot_signal(
     topic: Annotated[
         str, typer.Argument(metavar="TOPIC", help="The name of the topic, such as /battery.")
     ],
-    words: Words = None,
     *,
     out: Out,
     field: Annotated[
@@ -125,65 +108,55 @@ def plot_signal(
             metavar="PATH", help="A numeric field; repeatable (default: all that change)."
         ),
     ] = None,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     _check(out)
-    topic, words = topic_and_words(topic, words, "plot signal")
+    topic, bags = bags.with_topic(topic, "plot signal")
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = open_memory(load_to_look(bag_dir, words, recording), verbose=verbose)
-    asked = opened(memory, parse_window(memory, start, end, last))
+    memory = bags.memory()
+    asked = opened(memory, times.window(memory))
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         total, signals, notes = signals_of(asked, name, field or ())
-    shown = f"{counted(total, 'message')}"
-    picture = drawing.Picture(f"{name}, {asked.title}", shown, (10.0, 1.2 + 1.9 * len(signals)))
-    drawing.draw_signals(picture, signals, asked.span)
-    _finish(picture, out, notes, as_json=as_json)
+    title, size = f"{name}, {asked.title}", (10.0, 1.2 + 1.9 * len(signals))
+    with drawing.picture(out, title, counted(total, "message"), size) as figure:
+        drawing.draw_signals(figure, signals, asked.span)
+    _finish(out, notes, as_json=as_json)
 
 
 @plot.command("timeline", epilog=epilog("plot"))
-@reported_errors("plot timeline")
+@as_command("plot timeline")
 def plot_timeline(
-    words: Words = None,
     *,
     out: Out,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
-    asked = opened(memory, parse_window(memory, start, end, last))
+    memory = bags.memory()
+    asked = opened(memory, times.window(memory))
     with spinner("looking what was recorded when"):
         found = recap_in(asked)
         rows = [*event_rows(asked, found), *topic_rows(asked)]
     left_out = len(asked.view.snapshot.timeline.topics()) - MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
-    picture = drawing.Picture(f"Recorded, {asked.title}", subtitle, (11.0, 1.3 + 0.27 * len(rows)))
-    drawing.draw_timeline(picture, rows, asked.span)
-    _finish(picture, out, () if found is None else found.notes, as_json=as_json)
+    size = (11.0, 1.3 + 0.27 * len(rows))
+    with drawing.picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
+        drawing.draw_rows(figure.add_subplot(), rows, asked.span)
+    _finish(out, () if found is None else found.notes, as_json=as_json)
 
 
 @plot.command("recap", epilog=epilog("plot"))
-@reported_errors("plot recap")
+@as_command("plot recap")
 def plot_recap(
-    words: Words = None,
     *,
     out: Out,
     day: Annotated[
@@ -192,24 +165,19 @@ def plot_recap(
             metavar="TIME", help="today, yesterday or a date, 2026-11-20 (default: the newest day)."
         ),
     ] = None,
-    start: Start = None,
-    end: End = None,
-    last: Last = None,
+    times: Times,
     as_json: AsJson = False,
-    bag_dir: BagDir = None,
-    recording: Recording = None,
-    verbose: Verbose = False,
+    bags: Bags,
 ) -> None:
     """Draw a day in one picture: where the robot drove, what happened, what was recorded."""
     _check(out)
     from ros2_memory.cli.plot import drawing  # noqa: PLC0415 - an extra that few install
 
-    settings = load_to_look(bag_dir, words, recording)
-    memory = open_memory(settings, verbose=verbose)
-    if all(each is None for each in (start, end, last)):
+    memory = bags.memory()
+    if times == Times():
         window = day_of(memory, day)
     elif day is None:
-        window = parse_window(memory, start, end, last)
+        window = times.window(memory)
     else:
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
     asked = opened(memory, window)
@@ -222,9 +190,9 @@ def plot_recap(
             path = (drawn, places_in(memory, drawn.frame), stops_along(found, drawn))
         except (InvalidArgumentsError, NoDataError) as error:
             path = f"the path is unknown: {error}"
-    picture = drawing.Picture(f"Recap, {asked.title}", totals_line(found), (12.0, 8.0))
-    drawing.draw_recap(picture, path, rows, asked.span, [*event_lines(found)])
-    _finish(picture, out, () if found is None else found.notes, as_json=as_json)
+    with drawing.picture(out, f"Recap, {asked.title}", totals_line(found), (12.0, 8.0)) as figure:
+        drawing.draw_recap(figure, path, rows, asked.span, event_lines(found))
+    _finish(out, () if found is None else found.notes, as_json=as_json)
 
 
 def _check(out: Path) -> None:
@@ -243,8 +211,7 @@ def _check(out: Path) -> None:
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
 
 
-def _finish(picture: "Picture", out: Path, notes: Sequence[str], *, as_json: bool) -> None:
-    picture.save(out)
+def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
     print_line(json.dumps({"path": str(out), "notes": [*notes]}) if as_json else str(out))
     for note in () if as_json else notes:
         typer.echo(f"note: {with_local_times(note)}", err=True)

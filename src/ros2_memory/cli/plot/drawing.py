@@ -10,7 +10,7 @@ import logging
 import os
 import textwrap
 import warnings
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import mkdtemp
@@ -47,12 +47,11 @@ from ros2_memory.core.regions import Circle, Polygon  # noqa: E402
 from ros2_memory.core.text import shortened  # noqa: E402
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from matplotlib.axes import Axes
 
-    from ros2_memory.cli.plot.scene import Signal, Stop, TimelineRow
-    from ros2_memory.cli.plot.without_poses import DrawnPath
+    from ros2_memory.cli.plot.scene import DrawnPath, Signal, Stop, TimelineRow
     from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
@@ -78,41 +77,26 @@ _SECONDS_BELOW_S: Final = 600
 """Beside the colours of a shorter path seconds alone would not be read as such."""
 
 
-class Picture:
-    """A figure that is saved once.
+@contextmanager
+def picture(path: Path, title: str, subtitle: str, size: tuple[float, float]) -> Iterator[Figure]:
+    """Yields a figure, and writes what the block has drawn in the format that the suffix names.
 
-    Args:
-        title: of the whole; `subtitle` has the details.
-        size: width and height in inches.
+    `subtitle` has the details of the whole, and `size` is its width and height in inches.
+
+    Raises:
+        OSError: it cannot be written.
     """
-
-    def __init__(self, title: str, subtitle: str, size: tuple[float, float]) -> None:
-        with rc_context(_STYLE):
-            self.figure = Figure(figsize=size, layout="constrained")
-            shown = f"{title}\n{subtitle}" if subtitle else title
-            self.figure.suptitle(shown, x=0.01, ha="left", fontsize=11)
-
-    def save(self, path: Path) -> None:
-        """Writes the picture in the format that the suffix names.
-
-        Raises:
-            OSError: it cannot be written.
-        """
+    with rc_context(_STYLE), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on letters that no font here has
+        figure = Figure(figsize=size, layout="constrained")
+        shown = f"{title}\n{subtitle}" if subtitle else title
+        figure.suptitle(shown, x=0.01, ha="left", fontsize=11)
+        yield figure
         metadata = {"Date": None} if path.suffix.lower() == ".svg" else None
-        with rc_context(_STYLE), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # on letters that no font here has
-            self.figure.savefig(path, dpi=_DPI, metadata=metadata)
+        figure.savefig(path, dpi=_DPI, metadata=metadata)
 
 
 def draw_path(
-    picture: Picture, path: DrawnPath, places: Sequence[Place], stops: Sequence[Stop]
-) -> None:
-    """Draws a path on a plane that fills the picture."""
-    with rc_context(_STYLE):
-        draw_plane(picture.figure.add_subplot(), path, places, stops)
-
-
-def draw_plane(
     axes: Axes, path: DrawnPath, places: Sequence[Place] = (), stops: Sequence[Stop] = ()
 ) -> None:
     """Draws a path, coloured by time, with named places and standstills of the same frame."""
@@ -180,12 +164,6 @@ def _draw_place(axes: Axes, place: Place) -> None:
     axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
 
 
-def draw_timeline(picture: Picture, rows: Sequence[TimelineRow], span: tuple[float, float]) -> None:
-    """Draws rows on a timeline that fills the picture, the first one on top."""
-    with rc_context(_STYLE):
-        draw_rows(picture.figure.add_subplot(), rows, span)
-
-
 def draw_rows(axes: Axes, rows: Sequence[TimelineRow], span: tuple[float, float]) -> None:
     """Draws rows, the first one on top."""
     start, end = span
@@ -204,49 +182,45 @@ def draw_rows(axes: Axes, rows: Sequence[TimelineRow], span: tuple[float, float]
     _format_times(axes, start, end + least)
 
 
-def draw_signals(picture: Picture, signals: Sequence[Signal], span: tuple[float, float]) -> None:
+def draw_signals(figure: Figure, signals: Sequence[Signal], span: tuple[float, float]) -> None:
     """Draws each signal in a row of its own, over one axis of time."""
-    with rc_context(_STYLE):
-        rows = picture.figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
-        for number, (axes, signal) in enumerate(zip(rows, signals, strict=True)):
-            times = np.array(signal.times) / _DAY_S
-            marker = "." if len(times) < 60 else ""
-            color = _PALETTE[number % len(_PALETTE)]
-            axes.plot(times, signal.values, color=color, linewidth=1.1, marker=marker)
-            axes.set_title(signal.name)
-            axes.grid(visible=True, **_GRID)
-            axes.ticklabel_format(axis="y", useOffset=False)
-        _format_times(rows[-1], *span)
+    rows = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+    for number, (axes, signal) in enumerate(zip(rows, signals, strict=True)):
+        times = np.array(signal.times) / _DAY_S
+        marker = "." if len(times) < 60 else ""
+        color = _PALETTE[number % len(_PALETTE)]
+        axes.plot(times, signal.values, color=color, linewidth=1.1, marker=marker)
+        axes.set_title(signal.name)
+        axes.grid(visible=True, **_GRID)
+        axes.ticklabel_format(axis="y", useOffset=False)
+    _format_times(rows[-1], *span)
 
 
 def draw_recap(
-    picture: Picture,
+    figure: Figure,
     path: tuple[DrawnPath, Sequence[Place], Sequence[Stop]] | str,
     rows: Sequence[TimelineRow],
     span: tuple[float, float],
-    lines: Sequence[str],
+    lines: Iterable[str],
 ) -> None:
     """Draws a path, or why there is none, beside lines of text, and a timeline below."""
-    with rc_context(_STYLE):
-        height = 0.35 + 0.3 * len(rows)
-        grid = picture.figure.add_gridspec(
-            2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
-        )
-        plane = picture.figure.add_subplot(grid[0, 0])
-        if isinstance(path, str):
-            plane.set_axis_off()
-            shown = textwrap.fill(path, 50)
-            plane.text(0.5, 0.5, shown, ha="center", va="center", color="#6b7280")
-        else:
-            draw_plane(plane, *path)
-            plane.set_adjustable("datalim")  # it fills its part of the picture
-        beside = picture.figure.add_subplot(grid[0, 1])
-        beside.set_axis_off()
-        wrapped = "\n".join(
-            textwrap.fill(each, 62, subsequent_indent="            ") for each in lines
-        )
-        beside.text(0, 1, wrapped, ha="left", va="top", fontsize=8.5, linespacing=1.5)
-        draw_rows(picture.figure.add_subplot(grid[1, :]), rows, span)
+    height = 0.35 + 0.3 * len(rows)
+    grid = figure.add_gridspec(
+        2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
+    )
+    plane = figure.add_subplot(grid[0, 0])
+    if isinstance(path, str):
+        plane.set_axis_off()
+        shown = textwrap.fill(path, 50)
+        plane.text(0.5, 0.5, shown, ha="center", va="center", color="#6b7280")
+    else:
+        draw_path(plane, *path)
+        plane.set_adjustable("datalim")  # it fills its part of the picture
+    beside = figure.add_subplot(grid[0, 1])
+    beside.set_axis_off()
+    wrapped = "\n".join(textwrap.fill(each, 62, subsequent_indent="            ") for each in lines)
+    beside.text(0, 1, wrapped, ha="left", va="top", fontsize=8.5, linespacing=1.5)
+    draw_rows(figure.add_subplot(grid[1, :]), rows, span)
 
 
 def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:

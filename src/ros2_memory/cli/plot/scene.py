@@ -6,11 +6,12 @@ import math
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice, pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
 
 from ros2_memory.analysis.motion.trajectory import Waypoint
 from ros2_memory.cli.output import format_duration
-from ros2_memory.cli.plot.without_poses import DrawnPath, path_without_poses
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import without
@@ -18,8 +19,14 @@ from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import recording_gaps
-from ros2_memory.history.driven_path import body_by_transforms
-from ros2_memory.history.no_data import GIVE_TOPIC, require_bags
+from ros2_memory.history.driven_path import Body, body_by_transforms, robot_body
+from ros2_memory.history.no_data import (
+    GIVE_TOPIC,
+    require_bags,
+    topics_that_show_poses,
+    topics_with,
+)
+from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.places.pose_frames import placed_waypoints
@@ -28,7 +35,7 @@ from ros2_memory.queries import trajectory_summary
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import Geodetic, JsonValue
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Event, Recap, TrajectorySummary
@@ -70,6 +77,14 @@ _ROWS: Final = {
 _TOPIC: Final = "#94a3b8"
 
 
+_MOST_MOMENTS: Final = 300
+"""Transforms that are looked up: each takes some milliseconds."""
+_MOST_FIXES: Final = 4000
+_RADIUS_M: Final = 6_378_137.0
+_ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
+"""Of the ellipsoid of WGS 84."""
+
+
 class TimelineRow(NamedTuple):
     """A row of a timeline: stretches from one time to another; equal ones are a moment."""
 
@@ -92,6 +107,28 @@ class Stop(NamedTuple):
     x: float
     y: float
     length: float
+
+
+@dataclass(frozen=True, slots=True)
+class DrawnPath:
+    """A driven path in a frame: where (m) and when, and which points the robot jumped to."""
+
+    frame: str
+    times: tuple[float, ...]
+    xs: tuple[float, ...]
+    ys: tuple[float, ...]
+    jumps: tuple[bool, ...]
+
+    def at(self, time: float) -> tuple[float, float]:
+        """Returns where the robot was, between two points on the line between them."""
+        return (
+            float(np.interp(time, self.times, self.xs)),
+            float(np.interp(time, self.times, self.ys)),
+        )
+
+
+FoundPath: TypeAlias = tuple[DrawnPath, str, "Sequence[str]"]
+"""A path, a line on it, and notes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +198,7 @@ def path_in(
     """
     by_transforms = topic is None and body_by_transforms(asked.view) is not None
     if topic is not None or by_transforms:
-        other = path_without_poses(asked.view, asked.window, topic, frame)
+        other = _path_without_poses(asked.view, asked.window, topic, frame)
         if other is not None:
             return other
     map_frame = asked.memory.limits.map_frame
@@ -178,7 +215,7 @@ def path_in(
             break
         except NoDataError as error:
             is_unknown = topic is None and error.reason is NoDataReason.TOPIC_NOT_RECORDED
-            if is_unknown and (other := path_without_poses(asked.view, asked.window, None, frame)):
+            if is_unknown and (other := _path_without_poses(asked.view, asked.window, None, frame)):
                 return other
             detail = error.detail.replace(GIVE_TOPIC, "give --topic").replace(
                 "; give topic", "; give --topic"
@@ -203,6 +240,106 @@ def path_in(
         f"at most {found.trajectory.max_speed:.2f} m/s; by {found.topic}"
     )
     return path, line, found.notes
+
+
+def _path_without_poses(
+    view: View, window: TimeWindow, topic: str | None, frame: str | None
+) -> FoundPath | None:
+    """Returns the path by transforms or by fixes, if that is what the topic has, or all there is.
+
+    `topic`: None where the topic of poses is not recorded.
+
+    Raises:
+        NoDataError: there is nothing of it in this time, or it leads to no frame.
+    """
+    fixes = [each.partition(" ")[0] for each in topics_with(view, "geodetic")]
+    body = robot_body(view)
+    if topic is not None:
+        if topic in fixes:
+            return _by_fixes(view, window, topic)
+        if body is None or topic not in view.memory.limits.tf_topics:
+            return None
+        return _by_transforms(view, window, body, frame)
+    if topics_with(view, "position") or topics_that_show_poses(view):
+        return None
+    if body is not None:
+        return _by_transforms(view, window, body, frame)
+    return _by_fixes(view, window, fixes[0]) if fixes else None
+
+
+def _by_transforms(
+    view: View, window: TimeWindow, found_body: Body, frame: str | None
+) -> FoundPath:
+    """Returns the path of the robot's body in the map, or in the root of its frames."""
+    parent, body, others = found_body
+    parent = parent if frame is None else frame
+    found: list[tuple[Ns, float, float]] = []
+    failure: NoDataError | None = None
+    for at in np.linspace(window.start, window.stop - 1, _MOST_MOMENTS).astype(np.int64).tolist():
+        try:
+            explains = failure is None
+            x, y, _ = transform_at(view, parent, body, at, explains=explains).transform.translation
+        except NoDataError as error:
+            failure = failure or error
+            continue
+        found.append((at, x, y))
+    if not found:
+        raise failure or NoDataError(NoDataReason.OUTSIDE_RANGE, "no transform in this time")
+    path = _drawn(parent, found)
+    notes = [*view.notes.sentences()]
+    if others:
+        notes.append(f"other frames that move: {', '.join(others[:5])}; get_transform_at has them")
+    by = f"{body} in {parent} by transforms, at {len(found)} times"
+    return path, f"{_line(path)}; {by}", notes
+
+
+def _by_fixes(view: View, window: TimeWindow, topic: str) -> FoundPath:
+    """Returns the path of a satellite receiver, in metres east and north of its first fix."""
+    total, messages = view.pick(topic, window, _MOST_FIXES)
+    fixes: list[tuple[Ns, Geodetic]] = []
+    for each in messages:
+        message = view.bags.decode(each)
+        extractor = view.memory.extractor
+        fix = None if message is None else extractor.geodetic(message, each.record.channel.type)
+        if fix is not None and math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
+            fixes.append((each.time, fix))
+    if not fixes:
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} has a position")
+    first = fixes[0][1]
+    path = _drawn(
+        f"east and north of {first.latitude:.6f}, {first.longitude:.6f}",
+        [(at, *east_north(first, fix)) for at, fix in fixes],
+    )
+    return (
+        path,
+        f"{_line(path)}; by {len(fixes)} of {total} fixes of {topic}",
+        view.notes.sentences(),
+    )
+
+
+def east_north(origin: Geodetic, fix: Geodetic) -> tuple[float, float]:
+    """Returns how far (m) a fix lies east and north of another, on the plane that touches there.
+
+    By the ellipsoid's radii of curvature; off by 1 m some 10 km away.
+    """
+    latitude = math.radians(origin.latitude)
+    flat = 1 - _ECCENTRICITY_SQUARED * math.sin(latitude) ** 2
+    across = _RADIUS_M / math.sqrt(flat) * math.cos(latitude)
+    along = _RADIUS_M * (1 - _ECCENTRICITY_SQUARED) / flat**1.5
+    degrees_east = (fix.longitude - origin.longitude + 180) % 360 - 180
+    degrees_north = fix.latitude - origin.latitude
+    return math.radians(degrees_east) * across, math.radians(degrees_north) * along
+
+
+def _drawn(frame: str, points: Sequence[tuple[Ns, float, float]]) -> DrawnPath:
+    times, xs, ys = zip(*points, strict=True)
+    return DrawnPath(frame, tuple(map(unix_from_ns, times)), xs, ys, (False,) * len(points))
+
+
+def _line(path: DrawnPath) -> str:
+    points = [*zip(path.xs, path.ys, strict=True)]
+    driven = sum(math.dist(one, other) for one, other in pairwise(points))
+    return f"{driven:.1f} m in {format_duration(path.times[-1] - path.times[0])}"
 
 
 def _every_pose(asked: Scene, found: TrajectorySummary) -> Sequence[Waypoint]:
