@@ -14,6 +14,7 @@ from pyiceberg.exceptions import NoSuchTableError
 from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions, locations
 from ros2_memory.lake.tables import NAMESPACE, TABLES
+from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
 
 _EVER: Final = (date.min, date.max)
+_MESSAGE_BYTES: Final = 64 << 20
 
 
 def _as_they_are(_: str) -> AbstractContextManager[None]:
@@ -40,6 +42,9 @@ class Lake:
         engine: what runs selects.
         namespace: of the tables in the catalogue.
         translated: turns the errors of catalogues and stores into those of this program.
+
+    Attributes:
+        messages: packed ones that were read last, of all robots.
     """
 
     def __init__(
@@ -49,6 +54,7 @@ class Lake:
         namespace: str = NAMESPACE,
         translated: Callable[[str], AbstractContextManager[None]] = _as_they_are,
     ) -> None:
+        self.messages: ByteLru[bytes] = ByteLru(_MESSAGE_BYTES)
         self._translated = translated
         self._catalog = catalog
         self._engine = engine

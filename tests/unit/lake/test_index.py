@@ -17,6 +17,7 @@ from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.tables import day_of
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
@@ -124,7 +125,7 @@ def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shippin
     assert same is bag
     assert late.file != bag.file
     [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
-    assert "cup" in record.payload.decode()
+    assert b"cup" in record.payload
 
 
 def test_the_newest_days_move_on_and_older_ones_are_still_found(
@@ -137,7 +138,8 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=1,
         most_bags=1,
@@ -162,7 +164,8 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=1,
         most_bags=1,
@@ -206,7 +209,8 @@ def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=2,
         most_bags=1,
