@@ -106,17 +106,19 @@ class Lake:
         *,
         robots: Collection[str] | None = None,
         days: tuple[date, date] | None = None,
+        bags: tuple[str, str] | None = None,
     ) -> pa.Table:
         """Returns the rows of a select (see `LakeEngine`) over tables by their names.
 
         Only files of these robots and days (inclusive) are read, and no row of others is in them:
-        every table is partitioned so.
+        every table is partitioned so. Files that can have no row of `bags`, from one id to another
+        (inclusive), are not read.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            files = {name: self._files(name, robots, days or _EVER) for name in tables}
+            files = {name: self._files(name, robots, days or _EVER, bags) for name in tables}
         return self._engine.select(sql, files, parameters or {})
 
     def _table(self, name: str) -> IcebergTable | None:
@@ -132,10 +134,16 @@ class Lake:
         return {} if table is None else self._partitions[name].look(table)
 
     def _files(
-        self, name: str, robots: Collection[str] | None, days: tuple[date, date]
+        self,
+        name: str,
+        robots: Collection[str] | None,
+        days: tuple[date, date],
+        bags: tuple[str, str] | None,
     ) -> DataFiles:
         of_robot, table = self._days(name), self._table(name)
         among = of_robot if robots is None else sorted(robots)
         files = [each for robot in among for each in of_robot.get(robot, NO_DAYS).files(*days)]
+        if bags is not None:
+            files = [each for each in files if each.first <= bags[1] and bags[0] <= each.last]
         store = {} if table is None else dict(table.io.properties)
         return DataFiles(TABLES[name].arrow_schema(), locations(files), store)

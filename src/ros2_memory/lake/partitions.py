@@ -25,14 +25,21 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
 _EPOCH: Final = date(1970, 1, 1)
+_LAST: Final = "\U0010ffff"
+"""After all ids of bags."""
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file, how many rows it has, and how many bytes."""
+    """A Parquet file, how many rows it has, and how many bytes.
+
+    No id of a bag is before `first`, nor after `last`.
+    """
 
     location: str
     rows: int
     size: int
+    first: str = ""
+    last: str = _LAST
 
 
 Partition: TypeAlias = tuple[str, date]
@@ -157,10 +164,16 @@ class Partitions:
             )
         spec = table.specs()[manifest.partition_spec_id]
         robot, day = (self._position(table, spec, column) for column in ("robot", "day"))
+        bag_id = table.schema().find_field("bag_id").field_id
         found: dict[Partition, list[LakeFile]] = {}
         for each in (entry.data_file for entry in entries):
             when = _EPOCH + timedelta(days=each.partition[day])
-            file = LakeFile(each.file_path, each.record_count, each.file_size_in_bytes)
+            first, last = (
+                bytes(bounds.get(bag_id) or b"").decode()
+                for bounds in (each.lower_bounds or {}, each.upper_bounds or {})
+            )
+            size = each.record_count, each.file_size_in_bytes
+            file = LakeFile(each.file_path, *size, first, last or _LAST)
             found.setdefault((str(each.partition[robot]), when), []).append(file)
         return found
 

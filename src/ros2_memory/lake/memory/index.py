@@ -138,7 +138,6 @@ class LakeIndex:
         self._fewest_days = days
         self._most_bags = most_bags
         self._lock = threading.Lock()
-        self._ids: dict[str, str] = {}
         self._newest = _Window()
         self._older: dict[date, _Window] = {}
         self._snapshot: Snapshot | None = None
@@ -174,8 +173,13 @@ class LakeIndex:
             days = self._lake.days("bags", self._robot)
             span = days.newest(date.max, self._most_bags, self._fewest_days)
             self._newest = self._window(days, span, self._newest)
+            timeline = self._newest.timeline
+            silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
-                self._newest.timeline, scanned_at=self._clock.now(), older=self._newest.older
+                timeline,
+                silent_topics=frozenset(silent.difference(timeline.topics())),
+                scanned_at=self._clock.now(),
+                older=self._newest.older,
             )
             return self._snapshot
 
@@ -187,6 +191,12 @@ class LakeIndex:
         found: date = getattr(self._asked, "since", date.min)
         self._asked.since = date.max
         return found if date.min < found < date.max else None
+
+    def take_unread(self) -> int:
+        """Returns how many bags without messages this thread was shown since it asked."""
+        found: int = getattr(self._asked, "unread", 0)
+        self._asked.unread = 0
+        return found
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -209,14 +219,10 @@ class LakeIndex:
                 return found
         raise BagVanishedError(str(path), "it is not in the lake any more")
 
-    @property
-    def unread(self) -> int:
-        """How many bags of the newest days were shipped without messages, and are in no answer."""
-        return self._newest.unread
-
     def _note(self, window: _Window) -> None:
         known: date = getattr(self._asked, "since", date.max)
         self._asked.since = min(known, window.since or date.min)
+        self._asked.unread = max(getattr(self._asked, "unread", 0), window.unread)
 
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
@@ -247,9 +253,10 @@ class LakeIndex:
         }
         if days.keys() == made_of.keys() == known.days.keys():
             return bounds
+        paths = _Paths(known.files)
         for is_known, run in groupby(made_of, key=days.keys().__contains__):
             if not is_known:
-                days |= self._read({day: made_of[day] for day in run}, known.files)
+                days |= self._read({day: made_of[day] for day in run}, paths)
         files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
         before = {file: bag for file, (_, bag) in known.files.items()}
         now = {file: bag for file, (_, bag) in files.items()}
@@ -264,20 +271,18 @@ class LakeIndex:
             unread=sum(each.unread for each in days.values()),
         )
 
-    def _read(
-        self, made_of: Mapping[date, tuple[str, ...]], known: Mapping[str, tuple[LakeBag, BagFile]]
-    ) -> dict[date, _Day]:
+    def _read(self, made_of: Mapping[date, tuple[str, ...]], paths: _Paths) -> dict[date, _Day]:
         """Returns what the lake has of days between which there is no other; known bags stay."""
         span = min(made_of), max(made_of)
         found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
         rows: dict[date, list[Mapping[str, object]]] = {day: [] for day in made_of}
         unread = Counter[date]()
-        schemas: dict[str, SummarySchema] = {}
         for row in found.to_pylist():
             if row["summary"] is None:
                 unread[row["day"]] += 1
             else:
                 rows[row["day"]].append(row)
+        schemas: dict[str, SummarySchema] = {}
         days: dict[date, _Day] = {}
         for day, of_day in rows.items():
             bags: list[tuple[LakeBag, BagFile]] = []
@@ -285,35 +290,52 @@ class LakeIndex:
                 some = of_day[begin : begin + _TOGETHER]
                 states = {str(row["bag_id"]): _state(row) for row in some}
                 for row in some:
-                    bag = self._file(row, schemas)
-                    before = known.get(bag.file)
-                    # The same object, so that what is known of it stays.
-                    bag = before[1] if before is not None and before[1] == bag else bag
-                    bags.append((LakeBag(str(row["bag_id"]), day, states), bag))
+                    bag_id = str(row["bag_id"])
+                    name = str(row["file"]).removesuffix(COMPRESSED)
+                    path = paths.of(f"{self.bag_dir}/{name}", bag_id)
+                    bag = paths.known(_file(path, row, schemas))
+                    bags.append((LakeBag(bag_id, day, states), bag))
             days[day] = _Day(made_of[day], bags, unread[day])
         return days
 
-    def _file(self, row: Mapping[str, object], schemas: dict[str, SummarySchema]) -> BagFile:
-        text, counts = str(row["summary"]), row["counts"]
-        if text not in schemas:
-            schemas[text] = SummarySchema.from_json(text)
-        numbers = counts if isinstance(counts, bytes) else b""
-        return BagFile(
-            f"{self.bag_dir}/{self._path(row)}",
-            _whole(row["size"]),
-            _whole(row["mtime_ns"]),
-            BagState.CLOSED,
-            BagSummary.decoded(schemas[text], numbers),
-            _whole(row["start_ns"]),
-            _whole(row["end_ns"]),
-            _state(row),
-        )
 
-    def _path(self, row: Mapping[str, object]) -> str:
-        """Returns the path of a bag, which no other bag of the robot has."""
-        path, bag_id = str(row["file"]).removesuffix(COMPRESSED), str(row["bag_id"])
-        first = self._ids.setdefault(path, bag_id)
+class _Paths:
+    """Gives each bag a path of its own, and bags that are known their objects.
+
+    Args:
+        files: those that are known, by their paths.
+    """
+
+    def __init__(self, files: Mapping[str, tuple[LakeBag, BagFile]]) -> None:
+        self._files = files
+        self._taken: dict[str, str] = {}
+
+    def of(self, path: str, bag_id: str) -> str:
+        """Returns a path; another one where another bag has it, whose name was used again."""
+        known = self._files.get(path)
+        first = self._taken.setdefault(path, bag_id if known is None else known[0].bag_id)
         return path if first == bag_id else f"{path}-{bag_id}"
+
+    def known(self, bag: BagFile) -> BagFile:
+        """Returns the object that is known of a bag: what was remembered of it stays."""
+        known = self._files.get(bag.file)
+        return known[1] if known is not None and known[1] == bag else bag
+
+
+def _file(path: str, row: Mapping[str, object], schemas: dict[str, SummarySchema]) -> BagFile:
+    text, counts = str(row["summary"]), row["counts"]
+    if text not in schemas:
+        schemas[text] = SummarySchema.from_json(text)
+    return BagFile(
+        path,
+        _whole(row["size"]),
+        _whole(row["mtime_ns"]),
+        BagState.CLOSED,
+        BagSummary.decoded(schemas[text], counts if isinstance(counts, bytes) else b""),
+        _whole(row["start_ns"]),
+        _whole(row["end_ns"]),
+        _state(row),
+    )
 
 
 def _state(row: Mapping[str, object]) -> int:

@@ -105,9 +105,10 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone.
         """
-        batches = list(self._batches(path, topics, window))
-        ordered = heapq.merge(*map(_records, batches), key=attrgetter("log_time"))
-        yield from reversed([*ordered]) if newest_first else ordered
+        step = -1 if newest_first else 1
+        batches = [*self._batches(path, topics, window)][::step]
+        found = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
+        yield from heapq.merge(*found, key=attrgetter("log_time"), reverse=newest_first)
 
     def batches(
         self,
@@ -225,17 +226,15 @@ class LakeReader(BagReader):
             "keys": [*map(topic_key, topics)],
         }
         days = (bag.day, bag.day)
-        return self._lake.select(sql, ["channels"], asked, robots=[self._robot], days=days)
+        return self._lake.select(
+            sql, ["channels"], asked, robots=[self._robot], days=days, bags=(min(bags), max(bags))
+        )
 
     def _shared(self, channel: Channel) -> Channel:
         """Returns the first channel that was equal: bags of one robot declare the same."""
         if len(self._channels) > _MOST_CHANNELS:
             self._channels.clear()
         return self._channels.setdefault(channel, channel)
-
-
-def _records(batch: Batch) -> Iterator[Record]:
-    return map(batch.record, range(len(batch.log_times)))
 
 
 def _not_shipped(topic: str) -> NotInLakeError:

@@ -90,7 +90,7 @@ class LakeRobot:
                 f"the lake has days before {since}, which were not looked at: an end (or before, "
                 "or a time) there has them looked at"
             )
-        if unread := self._index.unread:
+        if unread := self._index.take_unread():
             yield (
                 f"not in the answer: {counted(unread, 'bag')} that an earlier version shipped, "
                 "without messages"
