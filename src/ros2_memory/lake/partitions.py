@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from datetime import date, timedelta
-from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -30,14 +29,13 @@ _LAST: Final = "\U0010ffff"
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file, how many rows it has, and how many bytes.
+    """A Parquet file, and how many rows it has.
 
-    No id of a bag is before `first`, nor after `last`.
+    No id of a bag in it is before `first`, nor after `last`.
     """
 
     location: str
     rows: int
-    size: int
     first: str = ""
     last: str = _LAST
 
@@ -84,37 +82,6 @@ class Days:
                 break
             first = day
         return first, last
-
-    def part(self, day: date, size: int) -> tuple[date, date]:
-        """Returns the first and last of the days that are read together with one.
-
-        They are consecutive days with rows, all together of at most `size` bytes, or one alone.
-        New days at the end change no part but the last.
-        """
-        at = max(bisect_right(self._starts(size), day) - 1, 0)
-        starts = self._starts(size)
-        if not starts:
-            return day, day
-        end = starts[at + 1] if at + 1 < len(starts) else None
-        last = self._days[-1] if end is None else self._days[bisect_left(self._days, end) - 1]
-        return min(starts[at], day), max(last, day)
-
-    def _starts(self, size: int) -> list[date]:
-        known = self._parts.get(size)
-        if known is None:
-            known, total = [], 0
-            for day in self._days:
-                own = sum(each.size for each in self._files[day])
-                total += own
-                if not known or total > size:
-                    known.append(day)
-                    total = own
-            self._parts[size] = known
-        return known
-
-    @cached_property
-    def _parts(self) -> dict[int, list[date]]:
-        return {}
 
 
 NO_DAYS: Final = Days({})
@@ -172,8 +139,7 @@ class Partitions:
                 bytes(bounds.get(bag_id) or b"").decode()
                 for bounds in (each.lower_bounds or {}, each.upper_bounds or {})
             )
-            size = each.record_count, each.file_size_in_bytes
-            file = LakeFile(each.file_path, *size, first, last or _LAST)
+            file = LakeFile(each.file_path, each.record_count, first, last or _LAST)
             found.setdefault((str(each.partition[robot]), when), []).append(file)
         return found
 
