@@ -449,13 +449,36 @@ def column_paths(settings: Settings) -> tuple[Path, ...]:
     bag_dir = settings.recording.bag_dir
     records = not isinstance(settings.recorder, NullRecorderNode) and has_recorded(bag_dir)
     beside = (bag_dir / OWN_FOLDER / FILE,) if records else ()
+    return (*beside, *_cached(os.fsencode(bag_dir.absolute())))
+
+
+def _cached(name: bytes) -> tuple[Path, ...]:
+    """Returns the path of a store in the cache folder, by what it is of; none without one."""
+    from ros2_memory.columns.store import FILE
+
     given = os.environ.get("XDG_CACHE_HOME")
     try:
         cache = Path(given) if given else Path.home() / ".cache"
     except RuntimeError:  # a user without a home
-        return beside
-    name = hashlib.sha256(os.fsencode(bag_dir.absolute())).hexdigest()[:16]
-    return (*beside, cache / PACKAGE / name / FILE) if cache.is_absolute() else beside
+        return ()
+    folder = cache / PACKAGE / hashlib.sha256(name).hexdigest()[:16]
+    return (folder / FILE,) if cache.is_absolute() else ()
+
+
+def build_columns_of_lake(settings: Settings, robot: str, decoder: BagReader) -> ColumnStore | None:
+    """Returns the store of columns of a lake's robot, which is in the cache folder; None for none.
+
+    It is made again from the lake.
+    """
+    from ros2_memory.columns.store import ColumnStore
+
+    if not settings.store.enabled:
+        return None
+    return ColumnStore(
+        _cached(f"{settings.lake.warehouse} {robot}".encode()),
+        decoder.definition,
+        definitions=_hash_of(_definitions_of(settings)),
+    )
 
 
 def delete_catalogues(settings: Settings) -> None:
@@ -514,19 +537,32 @@ def build_backfill(settings: Settings, memory: Memory) -> Backfill:
 
     Deletes the catalogues of earlier versions, whose place the store takes.
     """
-    from ros2_memory.columns.fill import Filling, StoreLimits
-    from ros2_memory.serving.backfill import Backfill
-
     try:
         delete_catalogues(settings)
     except BagError as error:
         log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
+    return _backfill(settings, memory, settings.recording.bag_dir)
+
+
+def build_backfill_of_lake(settings: Settings, memory: Memory) -> Backfill:
+    """Returns what fills the store of columns of a lake's robot, if it has one."""
+    return _backfill(settings, memory, memory.index.bag_dir, are_files=False)
+
+
+def _backfill(
+    settings: Settings, memory: Memory, bag_dir: Path, *, are_files: bool = True
+) -> Backfill:
+    from ros2_memory.columns.fill import Filling, StoreLimits
+    from ros2_memory.serving.backfill import Backfill
+
     scanner, store = memory.columns, settings.store
-    if scanner is None or scanner.store is None:
+    if scanner.store is None:
         return Backfill(memory, None)
     limits = StoreLimits(store.max_share, round(store.max_gb * GB))
-    bag_dir = settings.recording.bag_dir
-    return Backfill(memory, Filling(scanner, memory.reader, bag_dir, memory.clock, limits))
+    return Backfill(
+        memory,
+        Filling(scanner, memory.reader, bag_dir, memory.clock, limits, are_files=are_files),
+    )
 
 
 def query_settings_of(settings: Settings) -> QuerySettings:

@@ -8,7 +8,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bootstrap import build_memory, places_of, query_settings_of, shared_parts
+from ros2_memory.bootstrap import (
+    build_columns_of_lake,
+    build_memory,
+    places_of,
+    query_settings_of,
+    reading_of,
+    shared_parts,
+)
 from ros2_memory.config import NullRecorderNode, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
@@ -110,7 +117,10 @@ def _source_of(
         name,
         WallClock(),
         limits if _has_places(settings, own) else replace(limits, places=(), places_file=""),
-        shared.extractor,
+        extractor=shared.extractor,
+        decoder=shared.reader,
+        store=build_columns_of_lake(own, name, shared.reader),
+        settings=reading_of(own, shared.schemas),
         refresh_s=LAKE_REFRESH_S,
     )
 

@@ -202,7 +202,7 @@ def _parts_of_fleet(
     overrides: Sequence[str],
 ) -> _Parts:
     """Returns the parts of a fleet's server, which has no page: that shows one robot."""
-    from ros2_memory.bootstrap import build_backfill, build_server
+    from ros2_memory.bootstrap import build_backfill, build_backfill_of_lake, build_server
     from ros2_memory.bootstrap_fleet import robot_settings
     from ros2_memory.serving.health import FleetHealth, Health
 
@@ -218,7 +218,14 @@ def _parts_of_fleet(
     return _Parts(
         build_server(settings, memory, telemetry, fleet=fleet),
         FleetHealth(reports, package_version()),
-        partial(_fleet_in_background, fleet, robots, settings.reader.index_refresh_s, overrides),
+        partial(
+            _fleet_in_background,
+            fleet,
+            robots,
+            partial(build_backfill_of_lake, settings),
+            settings.reader.index_refresh_s,
+            overrides,
+        ),
         None,
     )
 
@@ -289,7 +296,11 @@ async def _in_background(
 
 
 async def _fleet_in_background(
-    fleet: Fleet, robots: Mapping[Robot, Backfill], every_s: float, overrides: Sequence[str]
+    fleet: Fleet,
+    robots: Mapping[Robot, Backfill],
+    of_lake: Callable[[Memory], Backfill],
+    every_s: float,
+    overrides: Sequence[str],
 ) -> None:
     """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
     import anyio
@@ -303,9 +314,18 @@ async def _fleet_in_background(
         )
         for each, backfill in robots.items()
     ]
+    shipped: dict[str, tuple[Memory, Filler]] = {}
+
+    def all_fillers() -> list[tuple[Memory, Filler]]:
+        for each in [*fleet.robots.values()]:  # more robots may have joined
+            memory = each.lake_memory
+            if memory is not None and each.name not in shipped:
+                shipped[each.name] = memory, Filler(of_lake(memory))
+        return [*fillers, *shipped.values()]
+
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(keep_fleet_fresh, fleet, every_s)
-        tasks.start_soon(keep_all_backfilled, fillers, every_s)
+        tasks.start_soon(keep_all_backfilled, all_fillers, every_s)
 
 
 async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_LOOKED_AT_S) -> None:

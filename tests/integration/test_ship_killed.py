@@ -122,7 +122,7 @@ def check(folder: Path, bags: int) -> None:
         ids = {row["bag_id"] for row in here["bags"]}
         assert len(here["bags"]) == len(ids) == bags
         assert Counter(row["bag_id"] for row in here["sightings"]) == dict.fromkeys(ids, 1)
-        packed = Counter((row["bag_id"], row["topic"], row["kind"]) for row in here["digests"])
+        packed = Counter((row["bag_id"], row["channel"]) for row in here["channels"])
         assert set(packed.values()) == {1}
         assert {bag_id for bag_id, *_ in packed} == ids
         receipts = read_receipts(folder / "fleet" / name)

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from pyiceberg.catalog.sql import SqlCatalog
 
+from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
@@ -16,6 +18,8 @@ from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.rows import BagContent, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables, to_arrow
+from ros2_memory.serving.backfill import make_fragments
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW
 from tests.support.memories import extractor
@@ -28,7 +32,7 @@ def lake_in(folder: Path) -> SqlCatalog:
 
 
 def fill(catalog: SqlCatalog, robots: Mapping[str, Memory], messages: Sequence[str] = ()) -> None:
-    """Writes the rows of all bags of robots' memories, which have digests."""
+    """Writes the rows of all bags of robots' memories."""
     tables = open_tables(catalog, TABLES)
     for name, memory in robots.items():
         found: dict[tuple[str, date], dict[str, list[Row]]] = {}
@@ -47,13 +51,45 @@ def lake_robots(
     engine: LakeEngine,
     names: Sequence[str],
     limits: QuerySettings | None = None,
+    stores: Path | None = None,
 ) -> dict[str, LakeRobot]:
-    """The robots of a lake, asked at `NOW`."""
-    lake, clock = Lake(catalog, engine), FixedClock(NOW)
+    """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
+    lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
     return {
-        name: LakeRobot(lake, name, clock, limits or QuerySettings(), extractor(), refresh_s=0)
+        name: LakeRobot(
+            lake,
+            name,
+            clock,
+            limits or QuerySettings(),
+            extractor=extractor(),
+            decoder=decoder,
+            store=None
+            if stores is None
+            else ColumnStore([stores / name / FILE], decoder.definition),
+            refresh_s=0,
+        )
         for name in names
     }
+
+
+def store_columns(robot: LakeRobot) -> Filling:
+    """Fills the store of a lake's robot, as a server does; returns what filled it."""
+    memory = robot.memory
+    filling = Filling(
+        memory.columns,
+        memory.reader,
+        memory.index.bag_dir,
+        memory.clock,
+        StoreLimits(max_share=1.0),
+        are_files=False,
+    )
+    timeline = memory.index.snapshot().timeline
+    for bag in filling.waiting(timeline):
+        assert filling.fill(bag, timeline)
+    make_fragments(memory, filling.merge(timeline))
+    filling.thin()
+    assert filling.progress(timeline).stored == len(timeline.bags)
+    return filling
 
 
 def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False) -> Fleet:

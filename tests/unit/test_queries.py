@@ -167,7 +167,12 @@ def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
 
     memory = memory_of(tmp_path)
     counted = type(memory)(
-        memory.index, memory.reader, memory.extractor, Counting(T0 + 9 * S), memory.limits
+        memory.index,
+        memory.reader,
+        memory.extractor,
+        Counting(T0 + 9 * S),
+        memory.limits,
+        memory.columns,
     )
     answer = queries.find_last_match(counted, Call(), "/odom", "near_position", {"x": 0, "y": 0})
     assert answer.found is not None

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, Vector3
 
 Scalar: TypeAlias = bool | int | float | str
-_WORD: Final = re.compile(r"\w+")
 
 POSITION_KEYS: Final = ("position", "point", "translation")
 """Keys under which a value holds a place; x and y under other keys may be a velocity or an axis."""
@@ -236,21 +235,6 @@ class Condition:
         if isinstance(self.test, Contains) and self.test.has_element(target):
             return True
         return self.test.matches(target)
-
-    def may_match(self, words: str) -> bool:
-        """Returns whether some value may match whose texts have these words alone.
-
-        They are casefolded, each on a line of its own: longest runs of letters and digits.
-        """
-        test = self.test
-        if isinstance(test, Beyond | NearPosition):
-            return True
-        equal = test.equal if isinstance(test, Contains) else test
-        is_on_elements = isinstance(test, Equals) or self.field is not None
-        if test.folded is None or (is_on_elements and equal.numbers):
-            return True
-        # A longest run in the needle is part of a longest run in any text that contains it.
-        return all(word in words for word in words_of(test.folded))
 
     @property
     def can_be_refused(self) -> bool:
@@ -620,8 +604,3 @@ def _dot_paths(value: JsonValue, prefix: str) -> Iterator[str]:
     elif isinstance(value, list):
         for element in value[:1]:
             yield from _dot_paths(element, prefix)
-
-
-def words_of(folded: str) -> list[str]:
-    """Returns the words of a casefolded string."""
-    return _WORD.findall(folded)

@@ -97,13 +97,6 @@ class IntervalTable(NamedTuple):
         """How many intervals there are."""
         return len(self.rows) // ROW.itemsize
 
-    @property
-    def is_sound(self) -> bool:
-        """Whether every row has one of the labels; a damaged file may contain others."""
-        if len(self.rows) % ROW.itemsize:
-            return False
-        return not self.rows or int(_rows(self.rows)["label"].max()) < len(self.labels)
-
     def intervals(self) -> tuple[VisibleInterval, ...]:
         """Returns each of them."""
         rows = _rows(self.rows).tolist()
@@ -171,20 +164,6 @@ class IntervalTable(NamedTuple):
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
         rows = _rows(self.rows)
         return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).intervals()
-
-
-def moved_rows(rows: bytes, by: Ns) -> bytes:
-    """Returns the rows of an `IntervalTable` so many nanoseconds later.
-
-    Raises:
-        ValueError: the bytes are no rows.
-    """
-    if not rows or not by:
-        return rows
-    moved = np.frombuffer(rows, ROW).copy()
-    moved["first"] += by
-    moved["last"] += by
-    return moved.tobytes()
 
 
 class IntervalPart(NamedTuple):

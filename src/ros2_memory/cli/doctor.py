@@ -383,7 +383,7 @@ def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
 
 def check_columns(memory: Memory) -> Iterator[Finding]:
     """Checks that columns can be stored, and names topics that are beyond their share."""
-    store = None if memory.columns is None else memory.columns.store
+    store = memory.columns.store
     if store is None:
         return
     dropped = store.dropped()

@@ -83,6 +83,7 @@ class Filling:
         bag_dir: the bag directory.
         clock: says now.
         limits: how much the store may take.
+        are_files: whether bags are files, which change; those of a lake do not.
     """
 
     def __init__(
@@ -92,6 +93,8 @@ class Filling:
         bag_dir: Path,
         clock: Clock,
         limits: StoreLimits,
+        *,
+        are_files: bool = True,
     ) -> None:
         if scanner.store is None:
             raise ValueError("a scanner without a store has nothing to fill")
@@ -101,6 +104,7 @@ class Filling:
         self._bag_dir = bag_dir
         self._clock = clock
         self._limits = limits
+        self._are_files = are_files
         self._refused: dict[BagKey, Ns] = {}
         self._trimmed: dict[BagKey, Ns] = {}
         self._shared: tuple[Timeline, frozenset[str]] | None = None
@@ -204,7 +208,9 @@ class Filling:
         if not present:
             return
         absent = (path for path in self.store.paths() if path not in present)
-        gone = [path for path in absent if not (self._bag_dir / path).exists()]
+        gone = [
+            path for path in absent if not (self._are_files and (self._bag_dir / path).exists())
+        ]
         if gone:
             self.store.delete(gone)
         self.store.give_back()
@@ -234,7 +240,9 @@ class Filling:
         Each rotation writes that of a recording with many bags again, and it concerns one or two of
         these. All messages of the bag count now; if it was stored with as many, all did then.
         """
-        if not bag.sidecar_ns or sure_handover(bag.recording).handover.rule(bag.path.name):
+        if not self._are_files or not bag.sidecar_ns:
+            return False
+        if sure_handover(bag.recording).handover.rule(bag.path.name):
             return False
         return self.store.renew(self._key(bag), bag)
 
@@ -267,7 +275,7 @@ class Filling:
         return [with_all_messages(self._reader, bag.path, table, everything) for table in tables]
 
     def _is_settled(self, bag: BagFile) -> bool:
-        return is_settled(bag, self._bag_dir, self._clock.now())
+        return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())
 
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""

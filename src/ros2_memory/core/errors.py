@@ -12,7 +12,7 @@
     |   `-- BagUnreachableError   bag_unreadable     the disk or the machine fails, not the file
     |-- UndecodableError          undecodable        a message that cannot be decoded
     |-- RefusedError              refused            a request that is refused, and why
-    |   `-- NotShippedError       refused            messages that a lake does not hold
+    |   `-- NotInLakeError        not_in_lake        messages that a lake does not hold
     |-- LakeError                 lake               a lake cannot be opened or written
     `-- RecorderError             recorder           recording cannot start or go on
 
@@ -143,8 +143,10 @@ class RefusedError(EpisodicError):
     code = "refused"
 
 
-class NotShippedError(RefusedError):
+class NotInLakeError(RefusedError):
     """The answer needs messages that the lake does not hold; the robot's own memory may."""
+
+    code = "not_in_lake"
 
 
 class LakeError(EpisodicError):

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
 
@@ -24,13 +23,11 @@ class Tested(NamedTuple):
         time: log time.
         topic: its topic.
         met: whether it meets the condition; None where it cannot be decoded.
-        message: itself; None where its columns told.
     """
 
     time: Ns
     topic: str
     met: bool | None
-    message: StoredMessage | None = None
 
 
 def tested(
@@ -41,10 +38,6 @@ def tested(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    if view.memory.columns is None:
-        for each in view.stream.messages(topics, window, newest_first=True):
-            yield Tested(each.time, each.record.channel.topic, search.matches(each), each)
-        return
     matching = Matching(view, search)
     sources = (_of_topic(matching, topic, window) for topic in topics)
     yield from heapq.merge(*sources, key=lambda each: -each.time)

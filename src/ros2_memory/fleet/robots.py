@@ -6,7 +6,7 @@ import threading
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotShippedError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotInLakeError
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS, Clock
 
@@ -122,7 +122,7 @@ class Robot:
         `begin_of` returns from when an answer is, by it and the newest log time.
 
         Raises:
-            NotShippedError: it needs those, and no other memory is mounted.
+            NotInLakeError: it needs those, and no other memory is mounted.
         """
         source = self._lake_source
         if source is not None and (lake or not self.is_mounted):
@@ -141,7 +141,7 @@ class Robot:
                 if source.latest is not None or not self.is_mounted:
                     detail = "; ".join((error.detail, *notes))
                     raise NoDataError(error.reason, detail, error.notes) from error
-            except NotShippedError:
+            except NotInLakeError:
                 if not self.is_mounted:
                     raise
         return ask(self.memory()), None

@@ -15,6 +15,7 @@ from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
     NoDataError,
+    NotInLakeError,
     QueryTimeoutError,
     RefusedError,
 )
@@ -289,6 +290,8 @@ def _shared_error(errors: Mapping[str, EpisodicError]) -> EpisodicError:
         reasons = {error.reason for error in errors.values() if isinstance(error, NoDataError)}
         if len(reasons) == 1:
             return NoDataError(first.reason, text)
+    if kinds == {NotInLakeError}:
+        return NotInLakeError(text)
     if kinds == {InvalidArgumentsError}:
         return InvalidArgumentsError(str(first) if len(by_reason) == 1 else text)
     if any(issubclass(kind, QueryTimeoutError) for kind in kinds):

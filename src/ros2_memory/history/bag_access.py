@@ -80,8 +80,7 @@ class BagAccess:
         Others are read for every question, which takes long where there are many. Empty where that
         is less than 1 % of them: then it is not the cause.
         """
-        columns = self.memory.columns
-        coverage = None if columns is None else columns.coverage(self.snapshot.timeline)
+        coverage = self.memory.columns.coverage(self.snapshot.timeline)
         if coverage is None:
             return ""
         bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)

@@ -164,13 +164,13 @@ def _step_in(view: View, pause: Pause) -> ClockStep | None:
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
     key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
-    known = None if scanner is None else scanner.clock_steps.get(key)
+    known = scanner.clock_steps.get(key)
     if known is None:
         with view.notes.isolated():
             step = _read_step(view, topic, (pause.start, pause.end))
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         known = () if step is None else (step,)
-        if scanner is not None and is_final:
+        if is_final:
             scanner.clock_steps.put(key, known, _STEPS_BYTES)
     return next(iter(known), None)
 
@@ -189,8 +189,6 @@ def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep 
 
 def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
     """Returns the step that a hole is by the header stamps of topics on both sides of it."""
-    if view.memory.columns is None:
-        return None
     around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
     for bag in view.snapshot.timeline.overlapping(around):

@@ -6,7 +6,7 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
@@ -15,12 +15,10 @@ from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
 from ros2_memory.index.listed_splits import absent_splits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.topic_events import State, TopicEvents
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.retention.policy import RetentionLimits
-    from ros2_memory.storage.base import BagReader, Record
+    from ros2_memory.storage.base import BagReader
 
 ClockOfTransforms = Literal["auto", "stamp", "log"]
 NowOfMemory = Literal["wall", "latest"]
@@ -104,31 +102,12 @@ class SnapshotSource(Protocol):
         """Returns the bags that the directory's recorder did not make; None if not known."""
 
 
-T = TypeVar("T", bound="Sized")
-
-
-class Shipped(Protocol):
-    """What a lake has of whole bags."""
-
-    def fragment(self, bag: BagFile, kind: Kind[T]) -> T | None:
-        """Returns what follows from a bag; None if the lake has it not."""
-
-    def events(self, bag: BagFile, topic: str) -> TopicEvents | None:
-        """Returns the events on a topic in a bag, `NO_EVENTS` for none; None if not known."""
-
-    def words(self, bag: BagFile, topic: str) -> str | None:
-        """Returns the words in texts of a topic in a bag; None if not known."""
-
-
 @dataclass(frozen=True, slots=True)
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
     `columns` scans topics, from its store where that has the bags; every answer is the same without
-    the store. A lake has no `columns`. `stated` is set for a lake, which stores what messages state
-    instead of the messages: it returns that, or None for a message that can be decoded. The poses
-    of a lake are thinned, and its rows have no transforms that place what was seen; `shipped` has
-    what followed from all of a bag before.
+    the store.
     """
 
     index: SnapshotSource
@@ -136,9 +115,7 @@ class Memory:
     extractor: SchemaExtractor
     clock: Clock
     limits: QuerySettings
-    columns: Scanner | None = None
-    stated: Callable[[Record], State | None] | None = None
-    shipped: Shipped | None = None
+    columns: Scanner
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.

@@ -15,7 +15,6 @@ from ros2_memory.analysis.motion.trajectory import (
     joined_slices,
     path_slice,
 )
-from ros2_memory.analysis.poses import NO_POSES
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -35,7 +34,7 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, poses_of_bag, slices_back
+from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, slices_back
 from ros2_memory.history.robots import beside_path
 from ros2_memory.history.transforms import (
     clock_of,
@@ -150,7 +149,8 @@ def _slices_in(
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        for start, made in _path_back(view, topic, window, failures, reached):
+        blocks = blocks_back(view, topic, window, failures, reached)
+        for start, made in slices_of_path(view, blocks):
             since = start
             if made.poses or made.invalid:
                 found.append(made)
@@ -161,29 +161,6 @@ def _slices_in(
     return found[::-1], None
 
 
-def _path_back(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    failures: list[UndecodableError],
-    reached: Callable[[Ns], None],
-) -> Iterator[tuple[Ns, PathSlice]]:
-    """Yields the path in a window, piece by piece, the newest first; see `slices_of_path`."""
-    shipped = view.memory.shipped
-    if shipped is None:
-        blocks = blocks_back(view, topic, window, failures, reached)
-        yield from slices_of_path(view, blocks)
-        return
-    for first, last, bag in reversed(view.stream.overlapping_bags([topic], window)):
-        reached(last)
-        is_whole = window.contains(first) and window.contains(last)
-        made = shipped.fragment(bag, PATHS) if is_whole else None
-        if made is None:
-            poses = (poses_of_bag(view, bag, topic) or NO_POSES).between(window.start, window.stop)
-            made = path_slice(poses, view.memory.limits.max_plausible_speed_mps)
-        yield first, made
-
-
 def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path of some poses in slices, the newest first, with the time where each begins.
 
@@ -191,7 +168,7 @@ def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns,
         InvalidArgumentsError: a message carries no position.
     """
     fastest = view.memory.limits.max_plausible_speed_mps
-    known = None if view.memory.columns is None else view.memory.columns.fragments(PATHS)
+    known = view.memory.columns.fragments(PATHS)
 
     def make(some: PoseSlice) -> PathSlice:
         return path_slice(some.poses, fastest)
@@ -303,11 +280,9 @@ class Body(NamedTuple):
 def robot_body(view: View) -> Body | None:
     """Returns the robot's body by its transforms; None where none of them moves.
 
-    None for a lake, too, which has no transforms of any moment. By its name (`base_footprint`,
-    `base_link`), else what moves in the root itself; in the map, or in the root of its frames.
+    By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
+    in the root of its frames.
     """
-    if view.memory.stated is not None:
-        return None
     known = edges(view)
     parents = {each.child: each.parent for each in known}
     moving = [each.child for each in known if not each.static]
@@ -336,7 +311,7 @@ def _rank(frame: str) -> int:
 
 def body_by_transforms(view: View) -> Body | None:
     """Returns the robot's body where transforms alone show it; None where a topic has its poses."""
-    return None if view.memory.stated is not None or view.has_poses else robot_body(view)
+    return None if view.has_poses else robot_body(view)
 
 
 def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = False) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
+from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import (
@@ -78,11 +78,11 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
 
     With `degrees` that of the only satellite receiver, if there is none with poses. None where
     there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
-    count. None for a lake, which has the track of the configured topic alone.
+    count.
     """
     configured = view.memory.limits.pose_topic
     is_recorded = configured in view.snapshot.timeline.topics()
-    if configured != _DEFAULT_POSES or is_recorded or view.memory.stated is not None:
+    if configured != _DEFAULT_POSES or is_recorded:
         return None
     found = topics_of_robot(view, what)
     if not found and degrees:
@@ -198,11 +198,12 @@ def topics_that_show_poses(view: View) -> list[str]:
     ]
     shown = []
     for topic in unmapped[:MOST_TRIED]:
-        newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
-        if newest is None:
-            continue
-        type_name = newest.record.channel.type
-        with suppress(NoDataError):
+        # What a lake does not hold, as images, shows nothing.
+        with suppress(NoDataError, NotInLakeError):
+            newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
+            if newest is None:
+                continue
+            type_name = newest.record.channel.type
             pose = extractor.pose(decode(view, newest), type_name)
             if pose is not None and pose.orientation is not None:
                 shown.append(f"{topic} ({type_name})")

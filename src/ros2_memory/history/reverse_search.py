@@ -1,17 +1,16 @@
 """Search backwards in time for the last message that meets a condition.
 
-Zones and words of columns rule out bags and parts, and so do a lake's words of bags. The times of
-the others are searched, with every message there that decides which ones count.
+Zones and words of columns rule out parts. The times of the others are searched, with every message
+there that decides which ones count.
 """
 
 from __future__ import annotations
 
-import heapq
 import re
 from collections import OrderedDict
 from itertools import chain, islice
 from threading import Lock
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.conditions import (
@@ -29,7 +28,6 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.candidates import CandidateRows, CandidateTables
@@ -41,16 +39,14 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, unknown_name_hint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-    from pathlib import Path
+    from collections.abc import Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.index.segment import Segment
     from ros2_memory.storage.base import Record, Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
@@ -283,44 +279,20 @@ class ReverseSearch:
         self._templates = Templates(view.memory.reader, view.memory.extractor)
         self._to_learn = _MOST_TEMPLATES
 
-    def candidates(self, until: Ns) -> CandidateTables | CandidateBags:
-        """Returns the tables, in a lake the bags, that can contain a match before a moment."""
-        if self._view.memory.columns is not None:
-            return CandidateTables(self._view, self.topics, self.condition, until)
-        return CandidateBags(self._view, self.topics, self.condition, until)
+    def candidates(self, until: Ns) -> CandidateTables:
+        """Returns the tables that can contain a match before a moment."""
+        return CandidateTables(self._view, self.topics, self.condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
         """Returns the newest match before a moment; notes report what could not be tested.
+
+        Reads the messages whose columns may match, until one does.
 
         Raises:
             InvalidArgumentsError: no value of the topics can meet the condition.
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
-        if self._view.memory.columns is not None:
-            return self._newest_by_columns(until)
-        candidates = CandidateBags(self._view, self.topics, self.condition, until)
-        noted_before = self._view.notes.keys()
-        searched_to: Ns | None = None
-        try:
-            for part in candidates.windows():
-                for found in self._messages(part):
-                    if self.matches(found):
-                        self._view.notes.retract_before(found.time, noted_before)
-                        self._view.stream.find_first_copy(found)
-                        self.note_undecodable()
-                        return found
-                    searched_to = found.time
-                searched_to = part.window.start
-        except QueryTimeoutError as error:
-            if searched_to is None:
-                raise
-            raise out_of_time(self._view, searched_to) from error
-        self.close(candidates, TimeWindow(MIN_NS, until), found=False)
-        return None
-
-    def _newest_by_columns(self, until: Ns) -> StoredMessage | None:
-        """Does as `newest`: reads the messages whose columns may match, until one does."""
         candidates = CandidateRows(self._view, self.topics, self.condition, until)
         noted_before = self._view.notes.keys()
         try:
@@ -398,21 +370,6 @@ class ReverseSearch:
         type_name = found.record.channel.schema.name
         return None if message is None else self._view.memory.extractor.exact(message, type_name)
 
-    def _messages(self, part: SearchWindow) -> Iterator[StoredMessage]:
-        """Returns the messages of a part, newest first.
-
-        Bags that are ruled out are read where they may hold the original of a duplicate. Topics
-        that are ruled out are not: there may be thousands.
-        """
-        window = part.window
-        wider = TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
-        among = [
-            held
-            for held in self._view.stream.overlapping_bags(part.topics, wider)
-            if held.bag.file in part.bags or part.recordings != {held.bag.recording}
-        ]
-        return self._view.stream.messages(part.topics, window, newest_first=True, among=among)
-
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
         channel = found.record.channel
@@ -462,102 +419,3 @@ class ReverseSearch:
                 self._view.notes.complete = False
                 kind = Reason(f"could not be decoded: {error.reason}", "topic", of="messages of ")
                 self._view.notes.add(Note(kind, f"{topic} ({type_name})"))
-
-
-class SearchWindow(NamedTuple):
-    """A part of the history to search, and what in it is not ruled out: topics and bag files."""
-
-    window: TimeWindow
-    topics: tuple[str, ...]
-    bags: frozenset[str]
-    recordings: frozenset[Path]
-
-
-class _Candidate(NamedTuple):
-    """A bag that can contain a match on a topic between two log times (inclusive)."""
-
-    first: Ns
-    last: Ns
-    topic: str
-    bag: BagFile
-
-
-class CandidateBags:
-    """Finds the bags that can contain a match on any of the topics, before a moment.
-
-    Attributes:
-        ruled_out: whether a bag was left out; each of its messages could be decoded.
-    """
-
-    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
-        self._view = view
-        self._topics = topics
-        self.condition = condition
-        self._until = until
-        self._known: dict[str, bool] = {}
-        self.ruled_out = False
-
-    def windows(self) -> Iterator[SearchWindow]:
-        """Yields the windows in which a match can lie, newest first; they do not overlap."""
-        group: list[_Candidate] = []
-        start = until = self._until
-        for each in self._newest_first():
-            if group and each.last < start:
-                yield _search_window(group, start, until)
-                group, until = [], start
-            group.append(each)
-            start = min(start, each.first)
-        if group:
-            yield _search_window(group, start, until)
-
-    def _newest_first(self) -> Iterator[_Candidate]:
-        """Yields the candidates by the time of their last message of the topic, newest first.
-
-        A heap of segments feeds a heap of bags, so that only segments which are reached are opened.
-        """
-        segments = [
-            (-segment.spans[topic][1], -rank, order, topic, segment)
-            for rank, segment in enumerate(self._view.snapshot.timeline.segments)
-            for order, topic in enumerate(self._topics)
-            if topic in segment.spans and segment.spans[topic][0] < self._until
-        ]
-        heapq.heapify(segments)
-        waiting: list[tuple[Ns, int, _Candidate]] = []
-        count = 0
-        while segments or waiting:
-            if segments and (not waiting or segments[0][0] <= waiting[0][0]):
-                *_, topic, segment = heapq.heappop(segments)
-                self._view.bags.check_deadline()
-                for each in self._in_segment(segment, topic):
-                    count += 1
-                    heapq.heappush(waiting, (-each.last, count, each))
-            else:
-                yield heapq.heappop(waiting)[2]
-
-    def _in_segment(self, segment: Segment, topic: str) -> Iterator[_Candidate]:
-        shipped = self._view.memory.shipped
-        for bag, first, last in segment.extents(topic):
-            if first >= self._until:
-                continue
-            words = None if shipped is None else shipped.words(bag, topic)
-            if words is None or self._may_match(words):
-                yield _Candidate(first, last, topic, bag)
-            else:
-                self.ruled_out = True
-
-    def _may_match(self, words: str) -> bool:
-        """Whether texts of these words may match; most bags have the same few words."""
-        known = self._known.get(words)
-        if known is None:
-            known = self._known[words] = self.condition.may_match(words)
-        return known
-
-
-def _search_window(group: Sequence[_Candidate], start: Ns, until: Ns) -> SearchWindow:
-    stop = min(until, max(each.last for each in group) + 1)
-    return SearchWindow(
-        TimeWindow(start, stop),
-        tuple(sorted({each.topic for each in group})),
-        frozenset(each.bag.file for each in group),
-        frozenset(each.bag.recording for each in group),
-    )

@@ -290,7 +290,7 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     found = recordings_beside(view, topic, window)
     names = _names([each for each in found if not each.by_clock])
     # Transforms are of all recordings at once, so a path by them is not that of one there.
-    if topic in view.memory.limits.tf_topics or view.memory.shipped is not None:
+    if topic in view.memory.limits.tf_topics:
         names = _names(found)
     if names:
         raise NoDataError(

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.columns.scan import Asked, Scan
-from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.model import TimeWindow
 
@@ -52,7 +51,6 @@ def scan(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
         if stored:
@@ -77,7 +75,7 @@ def scan(
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )
-    return Scan(scanner, asked).rows(newest_first=newest_first)
+    return Scan(view.memory.columns, asked).rows(newest_first=newest_first)
 
 
 def copies(view: View, topic: str) -> Iterator[Rows]:
@@ -86,7 +84,6 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    scanner = view.memory.columns or Scanner(None, view.memory.index.bag_dir)
     window = TimeWindow.everything()
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
@@ -101,7 +98,7 @@ def copies(view: View, topic: str) -> Iterator[Rows]:
         relatches=view.stream.may_be_relatched([topic]),
         check=lambda _: view.bags.check_deadline(),
     )
-    return Scan(scanner, asked).copies()
+    return Scan(view.memory.columns, asked).copies()
 
 
 def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:

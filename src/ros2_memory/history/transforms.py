@@ -233,7 +233,7 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     if known is not None:
         return known
     key = (among, topics)
-    kept = None if scanner is None else scanner.statics.get(key)
+    kept = scanner.statics.get(key)
     if kept is not None and kept[0] is timeline:
         sessions.statics[among] = kept[1]
         return kept[1]
@@ -243,7 +243,7 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     static = _changes(found)
     sessions.statics[among] = static
     # What was noted must be noted in each answer.
-    if scanner is not None and view.notes.added == before and not view.call.used_active:
+    if view.notes.added == before and not view.call.used_active:
         scanner.statics.put(key, (timeline, static), 1000 + 600 * len(static))
     return static
 
@@ -270,7 +270,7 @@ def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
 def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
     """Returns the static transforms in some rows that differ from those before, as received."""
     scanner, part = view.memory.columns, rows.part
-    if scanner is None or part is None:
+    if part is None:
         return [*_decoded(view, rows)]
     known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
     made = known.get(key)
@@ -375,9 +375,9 @@ def _pairs_in(
             yield _pairs_of(view, found)
         elif among is None or sessions_of(view).folder(rows.recording) in among:
             part = rows.part
-            known = None if scanner is None or part is None else scanner.pairs.get(part)
+            known = None if part is None else scanner.pairs.get(part)
             pairs = _pairs_of_rows(view, rows) if known is None else known
-            if scanner is not None and part is not None:
+            if part is not None:
                 scanner.pairs.put(part, pairs, 200 + 200 * len(pairs))
             yield pairs
 

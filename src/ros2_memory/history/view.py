@@ -106,11 +106,7 @@ class View:
         except where recordings overlap or latched messages may have been received again.
         """
         groups = groups_of(self.stream, topic, window)
-        merged = {
-            group: self._times_in(topic, group)
-            for group in groups
-            if group.has_duplicates and self.memory.columns is not None
-        }
+        merged = {group: self._times_in(topic, group) for group in groups if group.has_duplicates}
         sizes = [
             merged[group].size if group in merged else self.count_in(topic, group)
             for group in groups

@@ -27,7 +27,7 @@ from ros2_memory.analysis.state_changes import (
     has_levels,
 )
 from ros2_memory.analysis.topic_events import has_events, joined_events
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotShippedError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
@@ -405,12 +405,8 @@ def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
     for topic in timeline.topics():
         if BATTERY not in timeline.types_of(topic):
             continue
-        try:
-            found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
-            message = None if found is None else view.bags.decode(found)
-        except NotShippedError as error:
-            view.notes.add(f"how full the battery was is not known: {error}")
-            continue
+        found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
+        message = None if found is None else view.bags.decode(found)
         if message is not None:
             part = charge_of(view.memory.extractor.exact(message, BATTERY))
             if part is not None:

@@ -25,7 +25,6 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
-    MAX_NS,
     MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
@@ -40,7 +39,7 @@ from ros2_memory.history.driven_path import (
     slices_of_path,
 )
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.poses import pose_rows, poses_of_bag, slices_back
+from ros2_memory.history.poses import pose_rows, slices_back
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.silences import unrecorded_length
 
@@ -145,7 +144,8 @@ def _standstills_in(
         InvalidArgumentsError: a message of the topic carries no position.
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    stands = _stands_in(view, topic, window.widened(CONTEXT_NS))[::-1]
+    blocks = blocks_back(view, topic, window.widened(CONTEXT_NS), [])
+    stands = _stands(view, blocks)[::-1]
     found = standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
@@ -167,28 +167,11 @@ def _standstills_in(
     return standstills, drops
 
 
-def _stands_in(view: View, topic: str, window: TimeWindow) -> list[Stands]:
-    """Returns what shows where the robot stood in slices of a window, the newest first."""
-    shipped = view.memory.shipped
-    if shipped is None:
-        return _stands(view, blocks_back(view, topic, window, []))
-    found: list[Stands] = []
-    for _, _, bag in reversed(view.stream.overlapping_bags([topic], window)):
-        made = shipped.fragment(bag, STANDS)
-        poses = poses_of_bag(view, bag, topic) if made is None else None
-        if made is None and poses is not None:
-            made = stands_of(poses, MIN_NS, MAX_NS, goes_on=True)
-        found += [] if made is None else [made]
-    return found
-
-
 def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:
-    scanner = view.memory.columns
+    """Returns what shows where the robot stood in slices of some poses, the newest first."""
+    known = view.memory.columns.fragments(STANDS)
     return [
-        some.remembered(
-            None if scanner is None else scanner.fragments(STANDS),
-            lambda part: stands_of(part.poses, part.start, part.stop),
-        )
+        some.remembered(known, lambda part: stands_of(part.poses, part.start, part.stop))
         for some in slices_back(blocks, SLICE_NS, BESIDE_NS)
     ]
 

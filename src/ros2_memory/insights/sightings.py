@@ -60,7 +60,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.candidates import Candidate
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.reverse_search import SearchWindow
     from ros2_memory.history.view import View
     from ros2_memory.insights.goals import GoalRun
     from ros2_memory.insights.sighting_search import Found, Run
@@ -84,7 +83,6 @@ class _Matches:
     Attributes:
         topic: the topic.
         last: log time of the last match.
-        newest: the last match; None where it is not in memory any more.
         first: log time of the earliest match so far.
         reach: log time of the earliest message so far, also of one that cannot be decoded.
         begun: whether what came before the earliest match is known.
@@ -94,7 +92,6 @@ class _Matches:
 
     topic: str
     last: Ns
-    newest: StoredMessage | None
     first: Ns
     reach: Ns
     messages: int = 1
@@ -149,7 +146,7 @@ def find_matches(
     goals = goals_asked(view, matching_topics(view, topic), condition, scope)
     if goals is None:
         search = ReverseSearch(view, topic, condition)
-        if scope.is_bounded or memory.columns is None:
+        if scope.is_bounded:
             _collect(view, search, scope, collected)
         else:
             enough = None if oldest_first else limit
@@ -228,7 +225,7 @@ def read_sightings(
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
     is_log = view.snapshot.timeline.is_log
-    if view.memory.columns is not None and not scope.is_bounded:
+    if not scope.is_bounded:
         search = ReverseSearch(view, pattern, condition)
         runs = find_runs(view, search, scope.window, is_log, enough=None)
         if runs.is_over:
@@ -344,7 +341,7 @@ class _Sightings:
         matches = self._open.get(topic)
         if matches is None:
             until = self.newer.get(topic)
-            matches = _Matches(topic, time, found.message, time, time, until=until)
+            matches = _Matches(topic, time, time, time, until=until)
             self._open[topic] = matches
             self._kept.append(matches)
             self.count += 1
@@ -360,9 +357,7 @@ class _Sightings:
         self.cut = found.searched_to is not None
         self.count = len(found.runs)
         self._kept.extend(
-            _Matches(
-                run.topic, run.last, None, run.first, run.first, run.messages, run.begun, run.until
-            )
+            _Matches(run.topic, run.last, run.first, run.first, run.messages, run.begun, run.until)
             for run in found.runs
         )
         if found.is_over:
@@ -412,7 +407,7 @@ class _Sightings:
 
 
 def _parts(
-    windows: Iterator[SearchWindow | Candidate], window: TimeWindow
+    windows: Iterator[Candidate], window: TimeWindow
 ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
     """Yields the parts of a window in which topics can have matches, and these, newest first."""
     for each in windows:
@@ -436,9 +431,7 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
 
 
 def _newest(view: View, matches: _Matches) -> StoredMessage | None:
-    """Returns the last match, read again where need be; None where its bag was deleted since."""
-    if matches.newest is not None:
-        return matches.newest
+    """Returns the last match; None where its bag was deleted since."""
     at = TimeWindow(matches.last, matches.last + 1)
     return view.stream.first([matches.topic], at, newest_first=True)
 

@@ -342,7 +342,7 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
     timeline, columns = view.snapshot.timeline, view.memory.columns
     bag = timeline.first_with(topic, type_name)
-    channels = None if columns is None else columns.channels(timeline, bag)
+    channels = columns.channels(timeline, bag)
     reasons = [
         view.memory.reader.undecodable(channel)
         for channel in channels or view.bags.channels(bag)

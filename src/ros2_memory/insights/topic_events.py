@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.stated import events_of, joined_stated, stated_by
-from ros2_memory.analysis.topic_events import NO_EVENTS, TopicEvents, joined_events, state_of
+from ros2_memory.analysis.topic_events import TopicEvents, joined_events, state_of
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Note
 from ros2_memory.history.scan import messages_of, scan
 
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -67,9 +65,6 @@ def events_back(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    if view.memory.columns is None:
-        yield from _of_bags(view, topic, window)
-        return
     columns = StatedColumns(view.memory.extractor)
     together: list[Rows] = []
     for rows in scan(view, topic, window, newest_first=True, reached=reached):
@@ -112,8 +107,8 @@ def _events(
 ) -> Iterator[TopicEvents]:
     """Yields the events of tables that overlap in time; those of a whole part are kept."""
     part = together[0].part if len(together) == 1 else None
-    known = None if view.memory.columns is None else view.memory.columns.events
-    events = None if known is None or part is None else known.get(part)
+    known = view.memory.columns.events
+    events = None if part is None else known.get(part)
     if events is None and part is not None and may_match and not may_match(together[0].table):
         events = TopicEvents(*together[0].span)
     if events is not None:
@@ -124,7 +119,7 @@ def _events(
     events = events_of(joined_stated(stated))
     if events is None:
         return
-    if known is not None and part is not None and view.notes.added == noted:
+    if part is not None and view.notes.added == noted:
         known.put(part, events, _size(events))
     yield events
 
@@ -167,34 +162,11 @@ def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
 def _state(view: View, found: StoredMessage) -> State | None:
     """Returns what a message states; None where it cannot be decoded."""
     channel = found.record.channel
-    known = None if view.memory.stated is None else view.memory.stated(found.record)
-    if known is not None:
-        return known
     try:
         message = view.memory.reader.decode(found.record)
     except UndecodableError:
         return None
     return state_of(view.memory.extractor.exact(message, channel.type), channel.type)
-
-
-def _of_bags(view: View, topic: str, window: TimeWindow) -> Iterator[TopicEvents]:
-    """Yields the events of a lake's bags: as it holds them of whole ones, else by their rows."""
-    for group in reversed(groups_of(view.stream, topic, window)):
-        view.bags.check_deadline()
-        events = _held(view, topic, group)
-        if events is None:
-            events = events_of_messages(view, group.messages())
-        if events is not None:
-            yield events
-
-
-def _held(view: View, topic: str, group: Group) -> TopicEvents | None:
-    """Returns the events that a lake holds of a bag that lies in the window as a whole."""
-    shipped = view.memory.shipped
-    if shipped is None or not group.is_whole or len(group.bags) > 1:
-        return None
-    events = shipped.events(group.bags[0].bag, topic)
-    return TopicEvents(group.first, group.last) if events is NO_EVENTS else events
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

@@ -14,6 +14,7 @@ from pyiceberg.exceptions import NoSuchTableError
 from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions, locations
 from ros2_memory.lake.tables import NAMESPACE, TABLES
+from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
 
 _EVER: Final = (date.min, date.max)
+_MESSAGE_BYTES: Final = 64 << 20
 
 
 def _as_they_are(_: str) -> AbstractContextManager[None]:
@@ -40,6 +42,9 @@ class Lake:
         engine: what runs selects.
         namespace: of the tables in the catalogue.
         translated: turns the errors of catalogues and stores into those of this program.
+
+    Attributes:
+        messages: packed ones that were read last, of all robots.
     """
 
     def __init__(
@@ -49,6 +54,7 @@ class Lake:
         namespace: str = NAMESPACE,
         translated: Callable[[str], AbstractContextManager[None]] = _as_they_are,
     ) -> None:
+        self.messages: ByteLru[bytes] = ByteLru(_MESSAGE_BYTES)
         self._translated = translated
         self._catalog = catalog
         self._engine = engine
@@ -100,17 +106,19 @@ class Lake:
         *,
         robots: Collection[str] | None = None,
         days: tuple[date, date] | None = None,
+        bags: tuple[str, str] | None = None,
     ) -> pa.Table:
         """Returns the rows of a select (see `LakeEngine`) over tables by their names.
 
         Only files of these robots and days (inclusive) are read, and no row of others is in them:
-        every table is partitioned so.
+        every table is partitioned so. Files that can have no row of `bags`, from one id to another
+        (inclusive), are not read.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            files = {name: self._files(name, robots, days or _EVER) for name in tables}
+            files = {name: self._files(name, robots, days or _EVER, bags) for name in tables}
         return self._engine.select(sql, files, parameters or {})
 
     def _table(self, name: str) -> IcebergTable | None:
@@ -126,10 +134,16 @@ class Lake:
         return {} if table is None else self._partitions[name].look(table)
 
     def _files(
-        self, name: str, robots: Collection[str] | None, days: tuple[date, date]
+        self,
+        name: str,
+        robots: Collection[str] | None,
+        days: tuple[date, date],
+        bags: tuple[str, str] | None,
     ) -> DataFiles:
         of_robot, table = self._days(name), self._table(name)
         among = of_robot if robots is None else sorted(robots)
         files = [each for robot in among for each in of_robot.get(robot, NO_DAYS).files(*days)]
+        if bags is not None:
+            files = [each for each in files if each.first <= bags[1] and bags[0] <= each.last]
         store = {} if table is None else dict(table.io.properties)
         return DataFiles(TABLES[name].arrow_schema(), locations(files), store)

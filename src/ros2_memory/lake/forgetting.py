@@ -1,8 +1,7 @@
 """Forgets a time of a robot in a lake: rows, old versions and files.
 
 Each bag that reaches into the time goes as a whole, or, where topics are forgotten, that holds some
-of them, since what its digests hold cannot be taken apart; where its file is still there without
-the messages, it is shipped again.
+of them: where its file is still there without the messages, it is shipped again.
 """
 
 from __future__ import annotations
@@ -63,9 +62,9 @@ def forget_in_lake(
         found = _bags(tables["bags"], reaching)
         spared: set[str] = set()
         if tombstone.topics:
-            # What is in the lake of a bag shows in its digests.
+            # What is in the lake of a bag shows in its channels.
             holding = _reaching(tombstone, "first_ns", "last_ns")
-            of_these = _bags(tables["digests"], of_topics(holding, tombstone.topics))
+            of_these = _bags(tables["channels"], of_topics(holding, tombstone.topics))
             spared = {*found["bag_id"].to_pylist()} - {*of_these["bag_id"].to_pylist()}
         ids: dict[tuple[str, date], set[str]] = {}
         for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from datetime import date, timedelta
-from functools import cached_property
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -25,14 +24,20 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
 _EPOCH: Final = date(1970, 1, 1)
+_LAST: Final = "\U0010ffff"
+"""After all ids of bags."""
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file, how many rows it has, and how many bytes."""
+    """A Parquet file, and how many rows it has.
+
+    No id of a bag in it is before `first`, nor after `last`.
+    """
 
     location: str
     rows: int
-    size: int
+    first: str = ""
+    last: str = _LAST
 
 
 Partition: TypeAlias = tuple[str, date]
@@ -77,37 +82,6 @@ class Days:
                 break
             first = day
         return first, last
-
-    def part(self, day: date, size: int) -> tuple[date, date]:
-        """Returns the first and last of the days that are read together with one.
-
-        They are consecutive days with rows, all together of at most `size` bytes, or one alone.
-        New days at the end change no part but the last.
-        """
-        at = max(bisect_right(self._starts(size), day) - 1, 0)
-        starts = self._starts(size)
-        if not starts:
-            return day, day
-        end = starts[at + 1] if at + 1 < len(starts) else None
-        last = self._days[-1] if end is None else self._days[bisect_left(self._days, end) - 1]
-        return min(starts[at], day), max(last, day)
-
-    def _starts(self, size: int) -> list[date]:
-        known = self._parts.get(size)
-        if known is None:
-            known, total = [], 0
-            for day in self._days:
-                own = sum(each.size for each in self._files[day])
-                total += own
-                if not known or total > size:
-                    known.append(day)
-                    total = own
-            self._parts[size] = known
-        return known
-
-    @cached_property
-    def _parts(self) -> dict[int, list[date]]:
-        return {}
 
 
 NO_DAYS: Final = Days({})
@@ -157,10 +131,15 @@ class Partitions:
             )
         spec = table.specs()[manifest.partition_spec_id]
         robot, day = (self._position(table, spec, column) for column in ("robot", "day"))
+        bag_id = table.schema().find_field("bag_id").field_id
         found: dict[Partition, list[LakeFile]] = {}
         for each in (entry.data_file for entry in entries):
             when = _EPOCH + timedelta(days=each.partition[day])
-            file = LakeFile(each.file_path, each.record_count, each.file_size_in_bytes)
+            first, last = (
+                bytes(bounds.get(bag_id) or b"").decode()
+                for bounds in (each.lower_bounds or {}, each.upper_bounds or {})
+            )
+            file = LakeFile(each.file_path, each.record_count, first, last or _LAST)
             found.setdefault((str(each.partition[robot]), when), []).append(file)
         return found
 

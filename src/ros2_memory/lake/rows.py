@@ -19,15 +19,7 @@ from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.analysis.state_changes import has_levels
-from ros2_memory.analysis.topic_events import (
-    MAX_PER_BAG,
-    NO_EVENTS,
-    TopicEvents,
-    has_events,
-    state_of,
-)
-from ros2_memory.columns.motion import PATHS, STANDS
+from ros2_memory.analysis.topic_events import MAX_PER_BAG, has_events
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -37,14 +29,13 @@ from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
-from ros2_memory.lake.event_codec import encode_topic_events
-from ros2_memory.lake.state_runs import EMPTY_KIND, KIND, EmptyRuns, StateRuns, is_stated
+from ros2_memory.lake.channel_rows import ChannelRows
 from ros2_memory.lake.tables import ROWS_VERSION, TABLES, microseconds, topic_key
 from ros2_memory.lake.typed_values import MAPS, taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
-from ros2_memory.things.seen import SIGHTS, Watching, in_bytes, may_have_detections
+from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -52,6 +43,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.analysis.sights import Sights
+    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
@@ -157,7 +149,6 @@ class _BagRows:
         in_map = tracks[0] if tracks else None
         events = self._events()
         self._add_poses(tracks)
-        self._add_digests(events)
         self._add_things()
         stood_s = self._add_events(events)
         self._add_messages(events, messages, in_map)
@@ -179,20 +170,11 @@ class _BagRows:
         within = [(frame, cut(track, window)) for frame, track in tracks]
         return [(frame, track) for frame, track in within if len(track.times)]
 
-    def _events(self) -> dict[str, TopicEvents | None]:
-        """Returns the events on each topic that can have some; None: no message counts."""
-        topics = [
-            topic
-            for topic, types in self._types.items()
-            if any(has_events(each) or has_levels(each) for each in types)
-        ]
+    def _events(self) -> dict[str, TopicEvents]:
+        """Returns the events on each topic that can have some."""
+        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
         found = events_of_bag(View(self._memory, Call()), self._bag, topics)
-        return {
-            topic: NO_EVENTS
-            if events == TopicEvents(events.first, events.last)
-            else events.limited(MAX_PER_BAG, MAX_PER_BAG)
-            for topic, events in found.items()
-        }
+        return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
 
     def _add_bag(self, in_map: tuple[str, RobotTrack] | None, stood_s: float | None) -> None:
         bag, content = self._bag, self._content
@@ -221,6 +203,8 @@ class _BagRows:
                 None if driven is None else driven.totals.gap_m,
                 None if driven is None else driven.max_speed,
                 stood_s,
+                bag.summary.schema.to_json(),
+                bag.summary.packed,
             )
         )
 
@@ -246,50 +230,8 @@ class _BagRows:
                 )
             ]
 
-    def _add_digests(self, events: Mapping[str, TopicEvents | None]) -> None:
-        add = self._add_digest
-        for each in self._bag.summary.topics:
-            self._rows["digests"].append(
-                (
-                    each.topic,
-                    topic_key(each.topic),
-                    "topic",
-                    str(ROWS_VERSION),
-                    each.type,
-                    each.count,
-                    each.first,
-                    each.last,
-                    None,
-                )
-            )
-        for topic in self._types:
-            found = events.get(topic, NO_EVENTS)
-            if found is not NO_EVENTS:
-                add(topic, "events", encode_topic_events(found))
-        if self._poses is not None:
-            path = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps)
-            stands = stands_of(self._poses, MIN_NS, MAX_NS, goes_on=True)
-            add(self._pose_topic, PATHS.name, PATHS.store(path).to_bytes())
-            add(self._pose_topic, STANDS.name, STANDS.store(stands).to_bytes())
-
-    def _add_digest(self, topic: str, kind: str, packed: bytes | None) -> None:
-        if packed is None:
-            return
-        summaries = self._bag.summary.of(topic)
-        first = min((each.first for each in summaries), default=self._bag.start)
-        last = max((each.last for each in summaries), default=self._bag.end)
-        count = sum(each.count for each in summaries)
-        version = str(ROWS_VERSION)
-        self._rows["digests"].append(
-            (topic, topic_key(topic), kind, version, None, count, first, last, packed)
-        )
-
     def _add_things(self) -> None:
-        placed = Watching(View(self._memory, Call())).in_bag(self._bag)
-        if placed:
-            packed = SIGHTS.store(in_bytes([(0, one) for one in placed])).to_bytes()
-            self._add_digest(self._pose_topic, SIGHTS.name, packed)
-        for one in placed:
+        for one in Watching(View(self._memory, Call())).in_bag(self._bag):
             for sights in one.sights:
                 for spot in sights.spots.tolist():
                     self._add_thing(one.frame_id, sights, spot)
@@ -311,7 +253,7 @@ class _BagRows:
             )
         )
 
-    def _add_events(self, events: Mapping[str, TopicEvents | None]) -> float | None:
+    def _add_events(self, events: Mapping[str, TopicEvents]) -> float | None:
         """Adds the events of the bag alone, and returns how long the robot stood in it."""
 
         def add(
@@ -323,8 +265,6 @@ class _BagRows:
             )
 
         for topic, found in events.items():
-            if found is None:
-                continue
             for seen in found.visible.intervals():
                 add(topic, "thing", seen.first, seen.last, seen.label, value=seen.best)
             for flip in found.toggles:
@@ -346,52 +286,37 @@ class _BagRows:
 
     def _add_messages(
         self,
-        events: Mapping[str, TopicEvents | None],
+        events: Mapping[str, TopicEvents],
         messages: Sequence[str],
         in_map: tuple[str, RobotTrack] | None,
     ) -> None:
-        """Reads the detections of the bag, what messages state, and those of the chosen topics."""
+        """Reads the bag: its channels, its detections, and the messages of the chosen topics."""
         # What the events of a topic rule out is not decoded.
         seen = {
             topic
             for topic, found in events.items()
-            if (found is None or found.visible.size or found.left_out)
+            if (found.visible.size or found.left_out)
             and any(map(may_have_detections, self._types[topic]))
         }
         whole = {topic for topic in messages if topic in self._types}
-        states = {
-            topic: StateRuns()
-            for topic, found in events.items()
-            if topic not in whole and is_stated(found)
-        }
-        empty = {topic: EmptyRuns() for topic in seen}
-        topics = {*seen, *whole, *states}
+        channels = ChannelRows(whole)
         robot = _RobotAt(in_map)
         numbers: dict[str, int] = {}
         # Of all topics: a bag with damage anywhere is not shipped as if it were whole.
         every, window = tuple(self._types), TimeWindow.everything()
         for record in self._memory.reader.records(self._bag.path, every, window):
+            channels.add(record)
             topic = record.channel.topic
-            if topic not in topics:
-                continue
             nth = numbers[topic] = numbers.get(topic, -1) + 1
             if topic in whole:
                 self._rows["messages"].append(self._message(record, nth))
-            value = self._decoded(record) if topic in seen or topic in states else None
-            if topic in seen and value is None:
-                self._undecodable += 1
-            elif topic in seen and value is not None:
-                found = [*self._sightings(record, nth, value, robot)]
-                self._rows["sightings"] += found
-                if not found:
-                    empty[topic].add(nth, record.log_time)
-            if topic in states:
-                state = None if value is None else state_of(value.shown, record.channel.type)
-                states[topic].add(record.log_time, state)
-        for topic, runs in states.items():
-            self._add_digest(topic, KIND, runs.packed())
-        for topic, nothing in empty.items():
-            self._add_digest(topic, EMPTY_KIND, nothing.packed())
+            if topic in seen:
+                value = self._decoded(record)
+                if value is None:
+                    self._undecodable += 1
+                else:
+                    self._rows["sightings"] += self._sightings(record, nth, value, robot)
+        self._rows["channels"] += channels.rows()
 
     def _decoded(self, record: Record) -> _Decoded | None:
         try:

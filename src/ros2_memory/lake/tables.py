@@ -6,7 +6,7 @@ in folder names) and time. Times are there twice: `*_ns` are nanoseconds of log 
 epoch, exact; `time` is the same as a timestamp of microseconds, for people and for engines.
 
     bags        a row for each bag: which file, when, how much, metres and standstill of it alone
-    digests     what folds over many bags: packed, by topic and kind
+    channels    a row for each channel of a bag: its definition, and its messages, packed
     poses       the robot's track in the map and in its own frame, thinned to `error_m`
     sightings   a row for each detection of each message
     things      a row for each place where a detector saw a label in the bag
@@ -66,12 +66,10 @@ if TYPE_CHECKING:
     ]
 
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 26
+ROWS_VERSION: Final = 27
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _NS_PER_US: Final = 1_000
-_ROW_GROUP: Final = 1 << 17
-"""Rows of a row group, so that engines skip those of other topics and labels."""
 
 
 def _map(field_id: int, kind: IcebergType) -> MapType:
@@ -96,7 +94,6 @@ _KEYS: Final[Mapping[str, Kind]] = {"robot": "text", "bag_id": "text", "day": "d
 """Columns of all tables; a row has a value for each."""
 _PROPERTIES: Final = {
     "write.parquet.compression-codec": "zstd",
-    "write.parquet.row-group-limit": str(_ROW_GROUP),
     "commit.manifest-merge.enabled": "true",
 }
 
@@ -109,11 +106,13 @@ class LakeTable:
         name: its name in the namespace.
         columns: the kind of each column besides `robot`, `bag_id` and `day`, in the order of a row.
         order: the columns that rows are sorted by.
+        row_group: rows of a row group, so that engines skip those of other topics and labels.
     """
 
     name: str
     columns: Mapping[str, Kind]
     order: tuple[str, ...]
+    row_group: int = 1 << 17
 
     def schema(self) -> IcebergSchema:
         """Returns its columns for Iceberg."""
@@ -180,23 +179,31 @@ TABLES: Final[Mapping[str, LakeTable]] = {
                 "gap_m": "double",
                 "max_mps": "double",
                 "stood_s": "double",
+                "summary": "text",
+                "counts": "bytes",
             },
             ("start_ns",),
         ),
         LakeTable(
-            "digests",
+            "channels",
             {
                 "topic": "text",
                 "topic_key": "text",
-                "kind": "text",
-                "version": "text",
+                "channel": "long",
                 "type": "text",
+                "encoding": "text",
+                "latched": "bool",
+                "schema_encoding": "text",
+                "schema": "bytes",
+                "metadata": "text",
                 "messages": "long",
                 "first_ns": "long",
                 "last_ns": "long",
+                "has_payloads": "bool",
                 "packed": "bytes",
             },
-            ("topic_key", "kind", "first_ns"),
+            ("topic_key", "first_ns"),
+            row_group=1024,
         ),
         LakeTable(
             "poses",
@@ -294,6 +301,9 @@ TABLES: Final[Mapping[str, LakeTable]] = {
 }
 """The tables by name; `bags` is committed last, so that a bag with a row there is whole."""
 
+RETIRED: Final = ("digests",)
+"""Tables of earlier versions, from which nothing is read any more."""
+
 Row = tuple[object, ...]
 """The values of a table's own columns, in order."""
 
@@ -366,7 +376,10 @@ def open_tables(
                 table.schema(),
                 partition_spec=table.partition(),
                 sort_order=table.sort_order(),
-                properties=_PROPERTIES,
+                properties={
+                    **_PROPERTIES,
+                    "write.parquet.row-group-limit": str(table.row_group),
+                },
             )
         known = {each.name for each in opened.schema().fields}
         if not known.issuperset(table.columns):

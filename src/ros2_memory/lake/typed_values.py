@@ -1,8 +1,7 @@
 """A message's value in columns: scalars by their dot-paths in maps, and JSON for the rest.
 
 In the JSON every scalar that a map has is null, and all else is in its place. So it is one text
-for all messages of a type without lists, which Parquet stores once, and the value can be made again
-as it was, in the order of its fields.
+for all messages of a type without lists, which Parquet stores once.
 """
 
 from __future__ import annotations
@@ -42,12 +41,6 @@ def taken_apart(value: JsonValue) -> TypedValue:
     return TypedValue(text, **found)
 
 
-def put_together(rest: str, scalars: Mapping[str, JsonValue]) -> JsonValue:
-    """Returns the value of the JSON and of all scalars by their paths."""
-    value: JsonValue = json.loads(rest)
-    return _with_scalars(value, "", scalars) if scalars else value
-
-
 def _without_scalars(value: JsonValue, path: str, found: Found) -> JsonValue:
     if isinstance(value, dict):
         return {
@@ -61,17 +54,6 @@ def _without_scalars(value: JsonValue, path: str, found: Found) -> JsonValue:
         return value
     found[kind][path] = value  # type: ignore[assignment]  # `_KIND_OF` has scalars alone
     return None
-
-
-def _with_scalars(value: JsonValue, path: str, scalars: Mapping[str, JsonValue]) -> JsonValue:
-    if isinstance(value, dict):
-        return {
-            name: inner
-            if "." in name or not name
-            else _with_scalars(inner, f"{path}.{name}" if path else name, scalars)
-            for name, inner in value.items()
-        }
-    return scalars.get(path) if value is None else value
 
 
 def _fits(value: object) -> bool:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
+    from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
 WRITTEN_FILE: Final = "written.jsonl"
@@ -115,6 +116,24 @@ def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written
         if gone:
             _keep(state_dir, {file: at for file, at in recorded.items() if file not in gone})
     return len(gone)
+
+
+def drop_with_files(state_dir: Path, catalog: IcebergCatalog, identifier: str) -> None:
+    """Drops a table, with the files of it that were recorded; killed anywhere, it is done again.
+
+    Raises:
+        OSError: a file cannot be deleted.
+    """
+    table = catalog.load_table(identifier)
+    below = f"{table.location().rstrip('/')}/"
+    recorded = recorded_files(state_dir)
+    own = {file for file in recorded if file.startswith(below) and ".." not in file}
+    # Last, since the table is opened by it.
+    for file in sorted(own - {table.metadata_location}):
+        _delete(table, file)
+    catalog.drop_table(identifier)
+    _delete(table, table.metadata_location)
+    _keep(state_dir, {file: at for file, at in recorded.items() if file not in own})
 
 
 def _delete(table: IcebergTable, file: str) -> None:

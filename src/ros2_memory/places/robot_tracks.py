@@ -184,8 +184,8 @@ class RobotTracks:
     def _part(self, rows: Rows, groups: Sequence[_Group], reading: Deadline) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
         scanner = self._view.memory.columns
-        key = None if scanner is None else self._key(rows, groups)
-        known = None if scanner is None or key is None else scanner.fragments(TRACKS)
+        key = self._key(rows, groups)
+        known = None if key is None else scanner.fragments(TRACKS)
         part = None if known is None or key is None else known.get(key)
         if part is None:
             if reading.expired():

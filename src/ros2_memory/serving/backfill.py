@@ -43,6 +43,8 @@ log = get_logger(__name__)
 
 BACKLOG: Final = 8
 """A child process stores more bags than these, so that answers stay fast."""
+_BACKLOG_ALONE: Final = 256
+"""Bags of a lake that are stored in a round: no child process knows them."""
 PRUNE_INTERVAL_S: Final = 600.0
 """How often what is stored of deleted files is removed."""
 
@@ -107,8 +109,7 @@ class Backfill:
         self.filling.thin()
         self.filling.trim()
         if self._of_others is None:
-            scanner = self._memory.columns
-            self._of_others = [] if scanner is None else scanner.fragments_of_others()
+            self._of_others = self._memory.columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
         make_fragments(self._memory, [TimeWindow(start, start + PART_NS) for start in now])
         return bool(self._of_others)
@@ -149,8 +150,6 @@ class Backfill:
 
 def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
     """Makes what follows from the parts of some times; stores it, and what questions made of it."""
-    if memory.columns is None:
-        return
     for window in windows:
         try:
             view = View(memory, Call())
@@ -180,13 +179,15 @@ async def keep_backfilled(
         await anyio.sleep(every_s)
 
 
-async def keep_all_backfilled(fillers: Sequence[tuple[Memory, Filler]], every_s: float) -> None:
+async def keep_all_backfilled(
+    fillers: Callable[[], Sequence[tuple[Memory, Filler]]], every_s: float
+) -> None:
     """Fills several stores, one after the other, until it is cancelled.
 
     A memory whose bags were not scanned lately is passed over: its disk may hang.
     """
     while True:
-        for memory, filler in fillers:
+        for memory, filler in fillers():
             published = memory.index.published
             if published is None or published.problem is not None:
                 continue
@@ -198,12 +199,15 @@ async def keep_all_backfilled(fillers: Sequence[tuple[Memory, Filler]], every_s:
 
 
 class Filler:
-    """Fills one store, a round at a time; see `keep_backfilled`."""
+    """Fills one store, a round at a time; see `keep_backfilled`.
+
+    Without a `helper` it stores a backlog itself.
+    """
 
     def __init__(
         self,
         backfill: Backfill,
-        helper: Sequence[str],
+        helper: Sequence[str] = (),
         warm_up: Callable[[], bool] | None = None,
     ) -> None:
         self._backfill = backfill
@@ -227,13 +231,14 @@ class Filler:
         store = None if backfill.filling is None else backfill.filling.store
         # A store that is in memory cannot be filled by another process.
         has_file = store is not None and store.path is not None
-        if len(waiting) > BACKLOG and has_file and await _run_helper(self._helper):
+        is_helped = self._helper and len(waiting) > BACKLOG and has_file
+        if is_helped and await _run_helper(self._helper):
             # Bags that the helper could not store are tried here, and refused if they fail.
             waiting = await _in_thread(backfill.waiting)
         if not waiting:
             await _in_thread(backfill.write_again)
         done = 0
-        for bag in waiting[:BACKLOG]:
+        for bag in waiting[: BACKLOG if self._helper else _BACKLOG_ALONE]:
             done += await _in_thread(partial(backfill.store, bag))
             if store is not None and store.is_failing:
                 break

@@ -67,7 +67,7 @@ def known_things(
     timeline, scanner = view.snapshot.timeline, view.memory.columns
     described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
     key = ("things", min_score, described, view.memory.limits.map_frame, view.pose_topic)
-    kept = None if scanner is None else scanner.things.get(key)
+    kept = scanner.things.get(key)
     if kept is not None and kept[0] is timeline and isinstance(kept[1], KnownThings):
         known = kept[1]
     else:
@@ -75,7 +75,7 @@ def known_things(
         known = _Loader(view, key).load(min_score, Labels(spellings))
         is_read = known.since is None or known.crowded
         is_whole = is_read and not view.call.used_active and view.notes.added == before
-        if scanner is not None and is_whole:
+        if is_whole:
             scanner.things.put(key, (timeline, known), 1)
     if known.crowded and known.since is not None:
         view.notes.complete = False
@@ -129,14 +129,12 @@ class _Loader:
 
     @property
     def _most_spots(self) -> int:
-        scanner = self._view.memory.columns
-        kept = None if scanner is None else scanner.things.get(self._key)
+        kept = self._view.memory.columns.things.get(self._key)
         return kept[1] if kept is not None and isinstance(kept[1], int) else _MOST_SPOTS
 
     def _remember_most(self, most: int) -> None:
-        scanner = self._view.memory.columns
-        if scanner is not None:
-            scanner.things.put(self._key, (self._view.snapshot.timeline, most), 1)
+        kept = self._view.snapshot.timeline, most
+        self._view.memory.columns.things.put(self._key, kept, 1)
 
     def _newest(self, most: int) -> tuple[list[list[Stretch]], bool]:
         """Returns the newest stretches, in order, and whether they have so many spots already."""

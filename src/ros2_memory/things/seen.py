@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import BagFile, StampedTransform
-    from ros2_memory.history.context import Shipped
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
@@ -199,9 +198,6 @@ class Watching:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        if self._view.memory.shipped is not None:
-            yield from self._shipped(self._view.memory.shipped)
-            return
         for around in self._stretches_in(TimeWindow.everything()):
             sessions = [one.own for one in around.sessions]
             if found := self._unpacked(around.window.start, sessions, self._known(around)):
@@ -246,14 +242,6 @@ class Watching:
             placed = self._placer.placed(window, own, among, rows)
             found += [] if placed is None else [placed]
         return found
-
-    def _shipped(self, shipped: Shipped) -> Iterator[list[Stretch]]:
-        """Yields the sights of the bags of a lake, each as a stretch."""
-        for bag in reversed(self._view.snapshot.timeline.bags):
-            self._view.bags.check_deadline()
-            known = shipped.fragment(bag, SIGHTS)
-            if known is not None:
-                yield self._unpacked(bag.start, [self._session(bag)], known.data)
 
     def _unpacked(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
         """Returns what was seen from its bytes; see `in_bytes`."""
@@ -314,7 +302,7 @@ class Watching:
         """Returns what was seen in a stretch, in bytes; from memory where that is known."""
         scanner = self._view.memory.columns
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
-        if scanner is None or is_open or not self._lasts:
+        if is_open or not self._lasts:
             return self._read(around)
         before = self._view.notes.added
         followed = self._follows_from(around)
@@ -460,7 +448,7 @@ class _Parts(NamedTuple):
     ) -> _Parts | None:
         """Returns the parts of some topics, and which bags are in parts; None without a store."""
         scanner = view.memory.columns
-        if scanner is None or scanner.store is None:
+        if scanner.store is None:
             return None
         # Before the parts: what becomes a part meanwhile is in none of those that are known.
         splits = scanner.store.splits()

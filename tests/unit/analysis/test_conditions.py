@@ -439,22 +439,3 @@ def test_no_tolerance_means_the_very_place() -> None:
 def test_a_tolerance_that_is_no_distance_is_refused(tolerance_m: float) -> None:
     with pytest.raises(InvalidArgumentsError, match="tolerance"):
         parse_condition("near_position", {"x": 1, "y": 2}, tolerance_m)
-
-
-@pytest.mark.parametrize(
-    ("condition", "may"),
-    [
-        (Condition(Contains("red mug")), True),
-        (Condition(Contains("Mu")), True),
-        (Condition(Equals("blue mug")), False),
-        (Condition(Contains("cup"), "label"), False),
-        (Condition(Contains("7")), False),
-        # Numbers and places are no words.
-        (Condition(Contains("7"), "score"), True),
-        (Condition(Equals(7)), True),
-        (Condition(Beyond(0.5, above=True), "score"), True),
-        (Condition(NearPosition(1.0, 2.0, None, 0.5)), True),
-    ],
-)
-def test_words_rule_out_texts_alone(condition: Condition, may: bool) -> None:
-    assert condition.may_match("mug\nred") is may

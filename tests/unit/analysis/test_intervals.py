@@ -221,19 +221,6 @@ def test_times_at_either_end_of_the_range_are_far_apart() -> None:
     assert united([each.visible for each in ends]).size == 2
 
 
-@pytest.mark.parametrize(
-    "seen",
-    [
-        IntervalTable((), watched([(0, ("a",))]).visible.rows),
-        IntervalTable(("a",), watched([(0, ("a", "b"))]).visible.rows),
-        IntervalTable(("a",), b"rows"),
-    ],
-)
-def test_rows_without_a_label_are_recognised(seen: IntervalTable) -> None:
-    assert not seen.is_sound
-    assert watched([(0, ("a", "b"))]).visible.is_sound
-
-
 @given(
     messages=st.lists(
         st.tuples(st.integers(1, 6), st.sampled_from([None, -0.5, 0.2, 0.7, 0.71234, 88.0])),

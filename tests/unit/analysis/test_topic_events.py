@@ -19,7 +19,6 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.event_codec import decode_topic_events, encode_topic_events
 
 Messages = list[tuple[int, State]]
 
@@ -168,15 +167,3 @@ def test_labels_booleans_and_errors_are_found_in_values() -> None:
     found = state_of({"status": status}, "diagnostic_msgs/msg/DiagnosticArray")
     assert found.errors == ("motor: hot",)
     assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is EMPTY_STATE
-
-
-@given(histories(), st.integers(0, 700))
-def test_events_are_equal_after_encoding_and_decoding(
-    history: tuple[Messages, list[int]], booleans: int
-) -> None:
-    messages, _ = history
-    at = messages[-1][0]
-    many = State(flags=tuple((f"flag_{nth}", nth % 3 == 0) for nth in range(booleans)), beyond=3)
-    events = events_of([*messages, (at, many), (at + 1, EMPTY_STATE)])
-    assert events is not None
-    assert decode_topic_events(encode_topic_events(events)) == events

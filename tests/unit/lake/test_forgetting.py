@@ -18,6 +18,7 @@ from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.forgetting import Forgotten, forget_in_lake
+from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.shipper import Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.tombstones import (
@@ -28,6 +29,7 @@ from ros2_memory.lake.tombstones import (
 )
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.written_files import recorded_files
+from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.housekeepers import own_all
@@ -44,6 +46,7 @@ from tests.support.lakes import (
 MARKER = "zyxwv-9876"
 """Short enough for the bounds of a column, which are cut after 16 characters."""
 DAY_NS = 86_400 * NS_PER_S
+CHANNEL = Channel("/any", "cdr", Schema("any"))
 
 
 def secret_bag(bag_dir: Path, number: int = 7, *more: Msg) -> Path:
@@ -86,7 +89,10 @@ def files_with(lake: Path, secret: str) -> list[Path]:
 def _content(path: Path) -> str:
     plain = path.read_bytes().decode("latin-1")
     if path.suffix == ".parquet":
-        return plain + str(pq.read_table(path, partitioning=None).to_pylist())
+        rows = pq.read_table(path, partitioning=None).to_pylist()
+        packed = [row["packed"] for row in rows if "packed" in row]
+        payloads = b"".join(unpacked_messages(each, CHANNEL).buffer for each in packed)
+        return plain + str(rows) + payloads.decode("latin-1")
     if path.suffix == ".avro" and not path.name.startswith("snap-"):
         entries: AvroFile[Record]
         with AvroFile[Record](PyArrowFileIO().new_input(str(path))) as entries:

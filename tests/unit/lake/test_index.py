@@ -17,6 +17,7 @@ from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.tables import day_of
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
@@ -55,14 +56,14 @@ class Shipping:
         self._catalog = lake_in(folder)
         self._passes = 0
 
-    def ship(self, starts_s: Sequence[int], label: str = "cup") -> None:
+    def ship(self, starts_s: Sequence[int], label: str = "cup", name: str = "") -> None:
         """Ships bags that begin at these times, and in which the robot saw something."""
         self._passes += 1
         bags = self._folder / f"bags_{self._passes}"
         for start_s in starts_s:
             at = start_s * NS_PER_S
             messages = [detections(at, [label]), text(at, label)]
-            write_mcap(bags / "rec" / f"rec_{start_s}.mcap", messages)
+            write_mcap(bags / "rec" / f"{name or f'rec_{start_s}'}.mcap", messages)
         fill(self._catalog, {"hall": with_store(memory_of(bags), bags)}, ["/chatter"])
 
     def robot(self) -> LakeRobot:
@@ -124,7 +125,7 @@ def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shippin
     assert same is bag
     assert late.file != bag.file
     [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
-    assert "cup" in record.payload.decode()
+    assert b"cup" in record.payload
 
 
 def test_the_newest_days_move_on_and_older_ones_are_still_found(
@@ -137,7 +138,8 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=1,
         most_bags=1,
@@ -162,7 +164,8 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=1,
         most_bags=1,
@@ -206,7 +209,8 @@ def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
         "hall",
         FixedClock(NOW),
         first.limits,
-        first.extractor,
+        extractor=first.extractor,
+        decoder=McapReader(),
         refresh_s=0,
         days=2,
         most_bags=1,
@@ -231,3 +235,17 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
     pause = (START_S + 24) * NS_PER_S, (START_S + 30) * NS_PER_S
     assert [*on_robot.index.snapshot().gaps] == [pause]
     assert [*in_lake.index.refresh().gaps] == [pause]
+
+
+def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
+    """As of a robot that was set up again: its recordings may have names of before."""
+    robot = shipping.robot()
+    shipping.ship([START_S - 2 * DAY_S], name="rec_0")
+    shipping.ship([START_S], name="rec_0")
+    assert len({bag.file for bag in robot.memory.index.refresh().bags}) == 2
+    shipping.ship([START_S - DAY_S], name="rec_0")
+    bags = robot.memory.index.refresh().bags
+    assert len({bag.file for bag in bags}) == 3
+    for bag in bags:
+        [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
+        assert record.log_time == bag.start

@@ -18,6 +18,7 @@ from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.queries import find_last_match, value_when
 from ros2_memory.results import Match
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
@@ -51,7 +52,8 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> L
         "hall",
         FixedClock(NOW),
         QuerySettings(),
-        extractor(),
+        extractor=extractor(),
+        decoder=McapReader(),
         refresh_s=0,
         days=1,
         most_bags=1,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import date, timedelta
-from itertools import pairwise
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,11 +15,11 @@ SIZES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 50)), min_size=1, 
 
 
 def days_of(sizes: Sequence[tuple[int, int]]) -> Days:
-    """Days with gaps between them and files of so many rows, which are so many bytes."""
+    """Days with gaps between them and files of so many rows."""
     found, day = {}, FIRST
     for gap, size in sizes:
         day += timedelta(days=gap + 1)
-        found[day] = (LakeFile(f"file:///{day}", size, size),)
+        found[day] = (LakeFile(f"file:///{day}", size),)
     return Days(found)
 
 
@@ -46,24 +45,6 @@ def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
         assert older[-1] <= last - timedelta(days=fewest)
 
 
-@given(SIZES, st.integers(1, 120))
-def test_every_day_is_in_one_part_that_is_not_too_large_and_stays(
-    sizes: list[tuple[int, int]], most: int
-) -> None:
-    days = days_of(sizes)
-    parts = sorted({days.part(day, most) for day in days.known})
-    assert all(before < first for (_, before), (first, _) in pairwise(parts))
-    held = [day for first, last in parts for day in days.known if first <= day <= last]
-    assert held == list(days.known)
-    for first, last in parts:
-        assert first == last or rows(days, first, last) <= most
-    shorter = days_of(sizes[:-1])
-    assert {shorter.part(day, most) for day in shorter.known[:-1]} - {*parts} <= {
-        shorter.part(day, most) for day in shorter.known[-1:]
-    }
-
-
 def test_a_robot_without_rows_has_no_days() -> None:
     assert NO_DAYS.newest(date.max, 1, 1) is None
     assert NO_DAYS.files(date.min, date.max) == []
-    assert NO_DAYS.part(FIRST, 1) == (FIRST, FIRST)

@@ -5,20 +5,20 @@ from collections import Counter
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
+from random import Random
 
 import pytest
 
-from ros2_memory.analysis.topic_events import MAX_PER_BAG
-from ros2_memory.core.model import BagFile
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange, View
+from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
-from ros2_memory.insights.topic_events import events_of_bag
-from ros2_memory.lake.event_codec import decode_topic_events
+from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, to_arrow, topic_key
-from tests.support.bags import detections, write_mcap
+from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import LENGTH_S, NOW, SEEN, SeededRobot, seeded, write_robot
 from tests.support.memories import memory_of, with_store
@@ -85,22 +85,62 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(both: list[dict[st
         assert apart <= float(str(row["error_m"])) + 1e-9
 
 
-def test_digests_are_what_the_memory_answers(memory: Memory, both: list[dict[str, Table]]) -> None:
-    packed = {
-        (str(row["topic"]), str(row["kind"])): row["packed"]
-        for row in both[0]["digests"]
-        if row["kind"] != "topic"
-    }
-    events = packed[SEEN, "events"]
-    assert isinstance(events, bytes)
-    bag = memory.index.snapshot().bags[0]
-    found = events_of_bag(View(memory, Call()), bag, [SEEN])
-    assert decode_topic_events(events) == found[SEEN].limited(MAX_PER_BAG, MAX_PER_BAG)
+def test_channels_have_every_message_of_the_bag(
+    memory: Memory, both: list[dict[str, Table]]
+) -> None:
+    everything = TimeWindow.everything()
+    for bag, rows in zip(memory.index.snapshot().bags, both, strict=True):
+        topics = [each.topic for each in bag.summary.topics]
+        expected = [*memory.reader.records(bag.path, topics, everything)]
+        channels = {each.channel.topic: each.channel for each in expected}
+        found = []
+        for row in rows["channels"]:
+            packed = row["packed"]
+            assert isinstance(packed, bytes)
+            batch = unpacked_messages(packed, channels[str(row["topic"])])
+            found += [batch.record(nth) for nth in range(len(batch.log_times))]
+        assert sorted(found, key=repr) == sorted(expected, key=repr)
+        assert {row["has_payloads"] for row in rows["channels"]} == {True}
     counts = Counter[str]()
-    for row in joined(both, "digests"):
-        if row["kind"] == "topic":
-            counts[str(row["topic"])] += int(str(row["messages"]))
+    for row in joined(both, "channels"):
+        counts[str(row["topic"])] += int(str(row["messages"]))
     assert counts["/odom"] == LENGTH_S
+
+
+def test_the_summary_of_a_bag_is_the_one_of_the_index(
+    memory: Memory, both: list[dict[str, Table]]
+) -> None:
+    for bag, rows in zip(memory.index.snapshot().bags, both, strict=True):
+        [row] = rows["bags"]
+        packed = row["counts"]
+        assert isinstance(packed, bytes)
+        schema = SummarySchema.from_json(str(row["summary"]))
+        assert BagSummary.decoded(schema, packed) == bag.summary
+
+
+def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
+    tmp_path: Path,
+) -> None:
+    noise = Random(1).randbytes
+    image = [Msg("/camera", "sensor_msgs/msg/Image", nth, noise(9_000)) for nth in (1, 2, 3)]
+    scans = [Msg("/scan", "sensor_msgs/msg/LaserScan", nth, noise(2_000)) for nth in range(1, 30)]
+    large_once = Msg("/map", "nav_msgs/msg/OccupancyGrid", 1, noise(9_000))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*image, *scans, large_once])
+    memory = memory_of(tmp_path)
+    [bag] = memory.index.snapshot().bags
+    rows = {row["topic"]: row for row in lake_rows(memory, bag)["channels"]}
+    assert {topic: row["has_payloads"] for topic, row in rows.items()} == {
+        "/camera": False,
+        "/map": True,
+        "/scan": False,
+    }
+    assert {topic: row["messages"] for topic, row in rows.items()} == {
+        "/camera": 3,
+        "/map": 1,
+        "/scan": 29,
+    }
+    chosen = {row["topic"]: row for row in lake_rows(memory, bag, ("/camera",))["channels"]}
+    assert chosen["/camera"]["has_payloads"]
 
 
 def test_metres_of_a_bag_are_those_of_a_recap_of_it(
@@ -143,11 +183,11 @@ def test_what_rows_are_made_of_changes_with_what_counts(memory: Memory) -> None:
 
 def test_arrow_tables_are_sorted_and_carry_the_keys(memory: Memory) -> None:
     content = BagContent(memory.index.snapshot().bags[0], "id", "", "")
-    rows = rows_of(memory, content)["digests"]
-    table = to_arrow(TABLES["digests"], "kitchen", date(2026, 11, 20), {"a": rows, "b": rows[:1]})
+    rows = rows_of(memory, content)["channels"]
+    table = to_arrow(TABLES["channels"], "kitchen", date(2026, 11, 20), {"a": rows, "b": rows[:1]})
     assert table.num_rows == len(rows) + 1
     assert Counter(table["bag_id"].to_pylist()) == {"a": len(rows), "b": 1}
-    keys = list(zip(*(table[name].to_pylist() for name in TABLES["digests"].order), strict=True))
+    keys = list(zip(*(table[name].to_pylist() for name in TABLES["channels"].order), strict=True))
     assert keys == sorted(keys)
     assert to_arrow(TABLES["poses"], "kitchen", date(2026, 11, 20), {}).num_rows == 0
 

@@ -11,6 +11,7 @@ import zstandard
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
@@ -504,7 +505,8 @@ def stale_memory(bag_dir: Path) -> Memory:
     clock, reader = later(), McapReader()
     index = IndexManager(bag_dir, reader, clock, refresh_s=10**6, split_duration_s=10.0)
     index.refresh()
-    return Memory(index, reader, extractor(), clock, QuerySettings(now="latest"))
+    limits = QuerySettings(now="latest")
+    return Memory(index, reader, extractor(), clock, limits, Scanner(None, bag_dir))
 
 
 class TestRemoval:

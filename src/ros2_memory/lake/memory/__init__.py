@@ -1,1 +1,1 @@
-"""A robot's memory made of its rows in a lake, so that every question is folded as on the robot."""
+"""A robot's memory over the bags that a lake has of it."""

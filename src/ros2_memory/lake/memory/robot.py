@@ -5,45 +5,28 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ros2_memory.extract import SchemaExtractor
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.core.text import counted
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.memory.digests import LakeDigests
 from ros2_memory.lake.memory.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
-from ros2_memory.lake.memory.rows_as_messages import stated_in
 from ros2_memory.lake.tables import day_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.lake.files import Lake
-
-
-class LakeExtractor(SchemaExtractor):
-    """Takes values as they are, since those of rows were extracted when they were shipped.
-
-    Args:
-        shipped: what a type holds, as on the robot.
-    """
-
-    def __init__(self, shipped: SchemaExtractor) -> None:
-        super().__init__({}, shipped.limit)
-        self._shipped = shipped
-
-    def is_mapped(self, type_name: str) -> bool:
-        """Returns True: no message is read to see what its type holds."""
-        del type_name
-        return True
-
-    def kinds_of(self, type_name: str) -> frozenset[str]:
-        """Returns what messages of a mapped type have."""
-        return self._shipped.kinds_of(type_name)
+    from ros2_memory.storage.base import BagReader
 
 
 class LakeRobot:
-    """A robot's memory over its rows.
+    """A robot's memory over the bags that a lake has of it.
+
+    It is that of a bag directory, but for the index and what reads bags.
 
     Args:
         lake: the lake.
@@ -51,6 +34,9 @@ class LakeRobot:
         clock: the wall clock.
         limits: the settings of queries.
         extractor: knows the types of messages.
+        decoder: decodes messages.
+        store: of the columns of its bags, which are made again from the lake; None for none.
+        settings: what follows from bags depends on, as a text.
         refresh_s: how old (s) the index may be.
         days: how many days are looked at together, at least; see `LakeIndex`.
         most_bags: likewise, and of how many bags.
@@ -65,39 +51,26 @@ class LakeRobot:
         name: str,
         clock: Clock,
         limits: QuerySettings,
-        extractor: SchemaExtractor,
         *,
+        extractor: SchemaExtractor,
+        decoder: BagReader,
+        store: ColumnStore | None = None,
+        settings: str = "",
         refresh_s: float = 60.0,
         days: int = 31,
         most_bags: int = MOST_BAGS,
     ) -> None:
         self._index = LakeIndex(
-            lake,
-            name,
-            clock,
-            pose_topic=limits.pose_topic,
-            refresh_s=refresh_s,
-            days=days,
-            most_bags=most_bags,
+            lake, name, clock, refresh_s=refresh_s, days=days, most_bags=most_bags
         )
-        self._reader = LakeReader(
-            lake,
-            name,
-            self._index,
-            map_frame=limits.map_frame,
-            tf_topics=limits.tf_topics,
-            static_topics=limits.tf_static_topics,
-        )
-        # Nothing is recorded here, and nothing deleted.
-        own = replace(limits, kept=None, recording="", screened=False)
         self.memory = Memory(
             self._index,
-            self._reader,
-            LakeExtractor(extractor),
+            LakeReader(lake, name, self._index, decoder),
+            extractor,
             clock,
-            own,
-            stated=stated_in,
-            shipped=LakeDigests(lake, name, self._index),
+            # Nothing is recorded here, and nothing deleted.
+            replace(limits, kept=None, recording="", screened=False),
+            Scanner(store, self._index.bag_dir, settings),
         )
 
     @property
@@ -117,4 +90,8 @@ class LakeRobot:
                 f"the lake has days before {since}, which were not looked at: an end (or before, "
                 "or a time) there has them looked at"
             )
-        yield from self._reader.take_notes()
+        if unread := self._index.take_unread():
+            yield (
+                f"not in the answer: {counted(unread, 'bag')} that an earlier version shipped, "
+                "without messages"
+            )

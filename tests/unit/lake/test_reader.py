@@ -1,0 +1,156 @@
+"""What a lake has of a robot's bags is read as its bags are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from random import Random
+
+import pyarrow as pa
+import pytest
+from pyiceberg.catalog.sql import SqlCatalog
+
+from ros2_memory.core.errors import BagVanishedError, NotInLakeError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Memory
+from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
+from ros2_memory.lake.rows import bag_id_of
+from ros2_memory.lake.tables import TABLES, open_tables
+from ros2_memory.lake.warehouse import quiet_deletes
+from ros2_memory.storage.base import Channel, Schema
+from tests.support.bags import Msg, detections, text, write_mcap
+from tests.support.fleets import SEEN, START_S
+from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots, store_columns
+from tests.support.lakes import location
+from tests.support.memories import memory_of, with_store
+from tests.unit.lake.test_questions import reply
+
+AT = START_S * NS_PER_S
+EVERYTHING = TimeWindow.everything()
+CHANNEL = Channel("/any", "cdr", Schema("any"))
+
+
+@pytest.fixture
+def bags(tmp_path: Path) -> Memory:
+    """Two recordings whose messages are of equal and of unlike sizes, and images."""
+    draw = Random(3)
+    for recording in range(2):
+        messages: list[Msg] = []
+        for nth in range(20):
+            at = AT + recording * 60 * NS_PER_S + nth * NS_PER_S + draw.randrange(NS_PER_S)
+            messages.append(text(at, "x" * draw.randrange(4)))
+            messages.append(text(at + 1, f"{nth:04}", topic="/even"))
+            messages.append(detections(at + 2, ["cup"]))
+            image = draw.randbytes(5_000)
+            messages.append(Msg("/camera", "sensor_msgs/msg/Image", at + 3, image, at - 5))
+        write_mcap(tmp_path / "bags" / f"r{recording}" / "one_0.mcap", messages)
+    return with_store(memory_of(tmp_path / "bags"), tmp_path / "bags")
+
+
+@pytest.fixture
+def robot(bags: Memory, engine: LakeEngine, tmp_path: Path) -> LakeRobot:
+    catalog = lake_in(tmp_path)
+    fill(catalog, {"hall": bags})
+    return lake_robots(catalog, engine, ["hall"], stores=tmp_path / "cache")["hall"]
+
+
+def test_bags_and_their_messages_are_those_of_the_robot(bags: Memory, robot: LakeRobot) -> None:
+    theirs, own = bags.index.snapshot().bags, robot.memory.index.snapshot().bags
+    folder = str(bags.index.bag_dir)
+    assert [bag.file for bag in own] == [bag.file.replace(folder, "/hall") for bag in theirs]
+    for bag, other in zip(theirs, own, strict=True):
+        assert other[1:7] == bag[1:7]
+        topics = ["/chatter", "/even", "/nothing"]
+        for window in (EVERYTHING, TimeWindow(bag.start + 2 * NS_PER_S, bag.end)):
+            for newest_first in (False, True):
+                found = robot.memory.reader.records(
+                    other.path, topics, window, newest_first=newest_first
+                )
+                expected = bags.reader.records(bag.path, topics, window, newest_first=newest_first)
+                assert [*found] == [*expected]
+            for topic in (*topics, "/camera"):
+                times = robot.memory.reader.log_times(other.path, topic, window)
+                assert [*times] == [*bags.reader.log_times(bag.path, topic, window)]
+        assert {*robot.memory.reader.channels(other.path)} == {*bags.reader.channels(bag.path)}
+
+
+def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
+    bags: Memory, robot: LakeRobot
+) -> None:
+    over_lake, over_bags = fleet_of({"hall": robot.memory}), fleet_of({"hall": bags})
+    at: dict[str, object] = {"topic": "/camera", "timestamp": START_S + 5, "tolerance_s": 9}
+    refused = reply(over_lake, "get_topic_at_time", at)
+    assert refused["error"] == NotInLakeError.code == "not_in_lake"
+    assert "only the times of /camera" in refused["detail"]
+    assert "lake.messages" in refused["detail"]
+    span: dict[str, object] = {"start": START_S, "end": START_S + 99}
+    for tool, given in (
+        ("list_recorded_topics", {}),
+        ("get_topic_in_range", {"topic": "/camera", **span, "by": "hour"}),
+        ("recap", span),
+    ):
+        expected = reply(over_bags, tool, given)
+        assert "error" not in expected
+        assert reply(over_lake, tool, given) == expected
+
+
+def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
+    bags: Memory, robot: LakeRobot, tmp_path: Path
+) -> None:
+    filling = store_columns(robot)
+    assert filling.store.paths() == ["r0/one_0.mcap", "r1/one_0.mcap"]
+    given: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
+    over_lake, over_bags = fleet_of({"hall": robot.memory}), fleet_of({"hall": bags})
+    assert reply(over_lake, "find_matches", given) == reply(over_bags, "find_matches", given)
+    first, second = robot.memory.index.snapshot().bags
+    for table in open_tables(lake_in(tmp_path), TABLES).values():
+        with quiet_deletes():
+            table.delete(f"bag_id = '{bag_id_of('hall', first, first.start)}'")
+    assert robot.memory.index.refresh().bags == (second,)
+    with pytest.raises(BagVanishedError):
+        [*robot.memory.reader.records(first.path, ["/even"], EVERYTHING)]
+    filling.prune(robot.memory.index.refresh().timeline)
+    assert filling.store.paths() == ["r1/one_0.mcap"]
+
+
+def test_bags_of_before_messages_were_shipped_are_named(
+    bags: Memory, engine: LakeEngine, tmp_path: Path
+) -> None:
+    catalog = lake_in(tmp_path)
+    fill(catalog, {"hall": bags})
+    rows = catalog.load_table("ros2_memory.bags")
+    old = rows.scan().to_arrow()
+    summaries = [None, old["summary"][1].as_py()]
+    nth = old.schema.get_field_index("summary")
+    rows.overwrite(
+        old.set_column(nth, old.schema.field(nth), pa.array(summaries, pa.large_string()))
+    )
+    robot = lake_robots(catalog, engine, ["hall"])["hall"]
+    assert len(robot.memory.index.snapshot().bags) == 1
+    [note] = robot.notes()
+    assert note.startswith("not in the answer: 1 bag ")
+
+
+def test_damaged_and_later_bytes_are_refused() -> None:
+    data = packed_messages([1, 2], [1, 2], [b"ab", b"cd"])
+    batch = unpacked_messages(data, CHANNEL)
+    assert [batch.payload(nth) for nth in range(2)] == [b"ab", b"cd"]
+    assert not unpacked_messages(packed_messages([], [], []), CHANNEL).log_times.size
+    for other in (data[:-3], b"", data[::-1]):
+        with pytest.raises(ValueError, match="packed"):
+            unpacked_messages(other, CHANNEL)
+
+
+def test_a_table_of_an_earlier_version_goes_with_its_files(tmp_path: Path) -> None:
+    where = location(tmp_path / "lake")
+    with where.opened() as catalog:
+        assert isinstance(catalog, SqlCatalog)
+        catalog.create_namespace("ros2_memory")
+        old = catalog.create_table("ros2_memory.digests", TABLES["things"].schema())
+        old.append(TABLES["things"].arrow_schema().empty_table())
+        assert [*(tmp_path / "lake").rglob("digests/**/*.avro")]
+        where.tables(catalog, TABLES)
+        assert not catalog.table_exists("ros2_memory.digests")
+    assert not [each for each in (tmp_path / "lake").rglob("digests/**/*") if each.is_file()]
