@@ -54,7 +54,6 @@ from ros2_memory.messages.fields import (
     names_of,
     parse_path,
 )
-from ros2_memory.messages.json_template import HoledJson, UnmarkedError
 from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, ReplyJson
 
 if TYPE_CHECKING:
@@ -62,7 +61,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import Quaternion, Vector3
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.json_template import JsonTemplate, Marks
 
 MAX_SHOWN_CHARS: Final = 20_000
 """A longer value would fill a reply alone, and is thinned harder."""
@@ -234,18 +232,6 @@ class SchemaExtractor:
             if len(text) <= self._max_chars or (limit == 1 and squeeze >= MAX_SQUEEZE):
                 return Extracted(value, rendering.notes, text)
             limit, squeeze = max(limit // 2, 1), squeeze * 2
-
-    def json_template(self, message: object, type_name: str, marks: Marks) -> JsonTemplate | None:
-        """Returns the JSON of `shown` for all messages that differ by their numbers alone.
-
-        None where a number is computed of others, or a value may have to be thinned harder.
-        """
-        rendering = HoledJson(self.limit, marks)
-        try:
-            value = self._whole(rendering, message, type_name)
-        except UnmarkedError:
-            return None
-        return rendering.template(value, self._max_chars)
 
     def pose(self, message: object, type_name: str) -> Pose | None:
         """Returns the pose of a message, in its header's frame; None where it has none.

@@ -247,11 +247,6 @@ class Condition:
             or (isinstance(test, Equals) and _plain_text(test) is not None)
         )
 
-    @property
-    def place(self) -> NearPosition | None:
-        """The test, if it is `near_position` without a field, where boxes alone decide."""
-        return self.test if self.field is None and isinstance(self.test, NearPosition) else None
-
 
 def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     """Returns the texts in a value that meet a condition on texts, each once, in their order."""

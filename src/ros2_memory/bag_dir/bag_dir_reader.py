@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.handover_file import Exclusion, FileRule
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Batch, CdrLayout, Channel, Closing, Definition, Record
+    from ros2_memory.storage.base import Batch, Channel, Closing, Definition, Record
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)
@@ -195,10 +195,6 @@ class BagDirReader(BagReader):
     def definition(self, channel: Channel) -> Definition | None:
         """Returns what the adapter returns."""
         return self._reader.definition(channel)
-
-    def layout(self, record: Record) -> CdrLayout | None:
-        """Returns what the adapter returns."""
-        return self._reader.layout(record)
 
     def _confined(self, path: Path) -> Path:
         """Returns the path, which must lie in the bag directory and behind no link inside it.

@@ -10,6 +10,7 @@ a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded.
 
 from __future__ import annotations
 
+import json
 from collections import OrderedDict
 from contextlib import ExitStack
 from datetime import UTC, datetime
@@ -20,16 +21,14 @@ from urllib.parse import quote
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ros2_memory.analysis.bulk_decode import JsonRows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Iterable
     from pathlib import Path
 
-    from ros2_memory.analysis.bulk_decode import JsonRow
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
@@ -50,8 +49,7 @@ SCHEMA: Final = pa.schema(
 )
 _GROUP_ROWS: Final = 20_000
 """Rows of a row group: some megabytes."""
-_WAITING_BYTES: Final = 16 << 20
-"""Of messages that are decoded at once, at most, but for a single one."""
+_AS_JSON: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 _DAY_NS: Final = 86_400 * NS_PER_S
 _NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
@@ -65,38 +63,26 @@ Row = tuple[object, ...]
 class _PartFile:
     """One file being written, under a temporary name until the dataset is complete."""
 
-    def __init__(self, path: Path, rows_of: Callable[[Sequence[Record]], list[Row]]) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.temporary = path.with_name(f".{path.name}.tmp")
-        self._rows_of = rows_of
         self._rows: list[Row] = []
-        self._waiting: list[Record] = []
-        self._waiting_bytes = 0
         self.temporary.unlink(missing_ok=True)  # or a link there would be written through
         self.writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
 
-    def add(self, record: Record) -> None:
-        """Takes the next message."""
-        self._waiting.append(record)
-        self._waiting_bytes += len(record.payload)
-        if len(self._rows) + len(self._waiting) >= _GROUP_ROWS:
+    def add(self, row: Row) -> None:
+        """Takes the row of the next message."""
+        self._rows.append(row)
+        if len(self._rows) >= _GROUP_ROWS:
             self._flush()
-        elif self._waiting_bytes >= _WAITING_BYTES:
-            self._decode()
 
     def close(self) -> None:
         """Writes what is buffered, and ends the file."""
         self._flush()
         self.writer.close()
 
-    def _decode(self) -> None:
-        """Makes rows of the waiting messages."""
-        self._rows += self._rows_of(self._waiting)
-        self._waiting, self._waiting_bytes = [], 0
-
     def _flush(self) -> None:
         """Writes what is buffered as a row group."""
-        self._decode()
         if self._rows:
             columns = dict(zip(_COLUMNS, zip(*self._rows, strict=True), strict=True))
             self.writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
@@ -117,7 +103,8 @@ class Dataset:
         self, root: Path, reader: BagReader, extractor: SchemaExtractor, robot: str | None = None
     ) -> None:
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
-        self._json = JsonRows(reader, extractor)
+        self._reader = reader
+        self._extractor = extractor
         self._open: OrderedDict[Path, _PartFile] = OrderedDict()
         self._parts: dict[Path, list[_PartFile]] = {}
         self._newest: tuple[BagFile, Ns, _PartFile] | None = None
@@ -141,7 +128,7 @@ class Dataset:
                 self.files += 1
 
     def _add(self, stored: StoredMessage) -> None:
-        self._part_for(stored).add(stored.record)
+        self._part_for(stored).add(self._row(stored.record))
         self.rows += 1
 
     def _part_for(self, stored: StoredMessage) -> _PartFile:
@@ -172,24 +159,25 @@ class Dataset:
                 ", name another folder, or delete this one"
             )
         parts = self._parts.setdefault(folder, [])
-        part = _PartFile(folder / f"part-{len(parts)}.parquet", self._rows_of)
+        part = _PartFile(folder / f"part-{len(parts)}.parquet")
         self._cleanup.callback(part.temporary.unlink, missing_ok=True)
         self._cleanup.enter_context(part.writer)
         parts.append(part)
         return part
 
-    def _rows_of(self, records: Sequence[Record]) -> list[Row]:
-        """Returns the rows of messages."""
-        return [*map(_row, records, self._json.of(records))]
-
-
-def _row(record: Record, found: JsonRow | UndecodableError) -> Row:
-    channel = record.channel
-    row = (channel.topic, channel.type, record.log_time, record.publish_time)
-    if isinstance(found, UndecodableError):
-        return (*row, None, found.reason, None, *_NO_POSE)
-    pose, text = found.pose, encodable(found.text)
-    if pose is None:
-        return (*row, text, None, None, *_NO_POSE)
-    frame = encodable(pose.frame_id) or None
-    return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
+    def _row(self, record: Record) -> Row:
+        """Returns the row of a message."""
+        channel = record.channel
+        row = (channel.topic, channel.type, record.log_time, record.publish_time)
+        try:
+            message = self._reader.decode(record)
+        except UndecodableError as error:
+            return (*row, None, error.reason, None, *_NO_POSE)
+        shown = self._extractor.shown(message, channel.type)
+        # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.
+        text = encodable(_AS_JSON(shown.value) if "\\" in shown.text else shown.text)
+        pose = self._extractor.pose(message, channel.type)
+        if pose is None:
+            return (*row, text, None, None, *_NO_POSE)
+        frame = encodable(pose.frame_id) or None
+        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))

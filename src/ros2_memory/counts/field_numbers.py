@@ -5,22 +5,14 @@ from __future__ import annotations
 import math
 import sys
 from functools import partial
-from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-import numpy as np
-
-from ros2_memory.analysis.bulk_decode import BulkDecoder
 from ros2_memory.analysis.conditions import leaves
-from ros2_memory.analysis.payload_templates import template_for
 from ros2_memory.core.errors import UndecodableError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
-    from ros2_memory.analysis.payload_templates import Bytes, PayloadTemplate
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_groups import Span
@@ -28,11 +20,9 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Record
 
-Floats: TypeAlias = "NDArray[np.float64]"
 _Sample: TypeAlias = tuple[list[float], ...]
 """The numbers of each field in one message."""
 
-_MOST_AT_ONCE: Final = 1024
 _LARGEST: Final = sys.float_info.max
 _SUMMARY: Final = frozenset({"bytes", "numbers"})
 """The keys of a summary in place of numbers that are too many to show."""
@@ -77,21 +67,19 @@ class FieldReader:
         self._view = view
         self._fields = tuple(fields)
         self.failures: list[UndecodableError] = []
-        self._decoder = BulkDecoder(self._decode, self._template, self._apply)
 
     def numbers(self, messages: Iterable[StoredMessage]) -> tuple[Numbers | None, Span | None]:
         """Returns the numbers of messages in order, and the first and the last of their times."""
         times: list[Ns] = []
         samples: list[_Sample] = []
-        rest = iter(messages)
-        while some := list(islice(rest, _MOST_AT_ONCE)):
-            decoded = self._decoder.decode([each.record for each in some])
-            for found, sample in zip(some, decoded, strict=True):
-                if isinstance(sample, UndecodableError):
-                    self.failures.append(sample)
-                else:
-                    times.append(found.time)
-                    samples.append(sample)
+        for found in messages:
+            try:
+                samples.append(self._decode(found.record))
+            except UndecodableError as error:
+                # A new one, since the one that was raised keeps the message by its traceback.
+                self.failures.append(UndecodableError(error.topic, error.type_name, error.reason))
+            else:
+                times.append(found.time)
         if not times:
             return None, None
         fields = range(len(self._fields))
@@ -102,26 +90,6 @@ class FieldReader:
         message = self._view.memory.reader.decode(record)
         at = partial(self._view.memory.extractor.exact_at, message, record.channel.type)
         return tuple([*numbers_in(at(field))] for field in self._fields)
-
-    def _template(self, record: Record, _: _Sample) -> PayloadTemplate | None:
-        """Returns the template of a message, where it has all fields."""
-        template = template_for(self._view.memory.reader, self._view.memory.extractor, record)
-        if template is None or not {*self._fields} <= {path for path, _ in template.fields}:
-            return None
-        return template
-
-    def _apply(
-        self, template: PayloadTemplate, _: _Sample, _records: Sequence[Record], rows: Bytes
-    ) -> Iterator[_Sample]:
-        offsets = dict(template.fields)
-        blocks = [template.block(rows, offsets[field]) for field in self._fields]
-        if all(np.isfinite(each).all() for each in blocks):
-            return zip(*(each.tolist() for each in blocks), strict=True)
-        found = (
-            [[each for each in row if math.isfinite(each)] for row in block.tolist()]
-            for block in blocks
-        )
-        return zip(*found, strict=True)
 
 
 def numbers_in(value: JsonValue) -> Iterator[float]:

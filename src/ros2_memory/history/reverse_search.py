@@ -20,7 +20,6 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
     refusal_for,
 )
-from ros2_memory.analysis.payload_templates import Templates
 from ros2_memory.core.errors import (
     BagError,
     InvalidArgumentsError,
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import Record, Schema
+    from ros2_memory.storage.base import Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
 _CONSTANT: Final = re.compile(
@@ -56,8 +55,6 @@ _CONSTANT: Final = re.compile(
 """A constant in the text of a message definition, as ROS 2 writes it."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
-_MOST_TEMPLATES: Final = 16
-"""Messages of a search that a template is made of: it takes as long as decoding some ten."""
 _MOST_QUESTIONS: Final = 4
 _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
@@ -256,8 +253,6 @@ class Searched(Protocol):
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
-    Of messages that differ in their numbers alone one is decoded to test positions.
-
     Attributes:
         topics: the recorded topics that match.
         condition: what is searched for.
@@ -275,9 +270,6 @@ class ReverseSearch:
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
         self._truths = _TRUTHS.of(view.memory.extractor, condition)
-        self._place = None if condition.min_score else condition.place
-        self._templates = Templates(view.memory.reader, view.memory.extractor)
-        self._to_learn = _MOST_TEMPLATES
 
     def candidates(self, until: Ns) -> CandidateTables:
         """Returns the tables that can contain a match before a moment."""
@@ -378,21 +370,10 @@ class ReverseSearch:
         if known is not None:
             self._has_decoded = True
             return known
-        met = self._is_near(found.record)
-        if met is None:
-            met = self._decoded(found)
+        met = self._decoded(found)
         if met is not None and len(self._truths) < _MOST_TRUTHS:
             self._truths[key] = met
         return met
-
-    def _is_near(self, record: Record) -> bool | None:
-        """Whether a message has a position that is near, by its bytes; None where not known so."""
-        template = None if self._place is None else self._templates.known(record)
-        if template is None or self._place is None:
-            return None
-        self._has_decoded = True
-        near = self._place.is_near
-        return any(near(*each) for each in template.points_in(record.payload))
 
     def _decoded(self, found: StoredMessage) -> bool | None:
         channel, memory = found.record.channel, self._view.memory
@@ -407,9 +388,6 @@ class ReverseSearch:
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
                 self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
                 return None
-        if self._place is not None and self._to_learn:
-            self._to_learn -= 1
-            self._templates.of(found.record)
         return met
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:

@@ -67,17 +67,6 @@ def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
     return _without(value, min_score, MAX_DEPTH)
 
 
-def depends_on_numbers(value: JsonValue) -> bool:
-    """Returns whether other scores in the same message could change the detections' names."""
-    if isinstance(value, list):
-        return any(map(depends_on_numbers, value))
-    if not isinstance(value, dict):
-        return False
-    results = value.get("results")
-    several = isinstance(results, list) and len(results) > 1
-    return several or any(map(depends_on_numbers, value.values()))
-
-
 def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detection]:
     if depth == 0:
         return

@@ -104,25 +104,6 @@ class Record(NamedTuple):
         return self.channel.latched and self.log_time - self.publish_time > RELATCHED_NS
 
 
-@dataclass(frozen=True, slots=True)
-class CdrLayout:
-    """The offsets of the numbers of a message in its little-endian payload.
-
-    It holds for every payload of `size` bytes that has the same bytes outside of these numbers.
-
-    Attributes:
-        size: bytes of the payload.
-        doubles: offset of each float64.
-        singles: offset of each float32.
-        times: offset of each time or duration: int32 seconds, then uint32 nanoseconds.
-    """
-
-    size: int
-    doubles: tuple[int, ...]
-    singles: tuple[int, ...]
-    times: tuple[int, ...]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
     """Undecoded messages of one channel that lie in one buffer.
@@ -384,11 +365,6 @@ class BagReader(ABC):
         It is the same object for the same channel while the reader remembers it.
         """
         del channel
-        return None
-
-    def layout(self, record: Record) -> CdrLayout | None:
-        """Returns the offsets of this message's numbers; None if it must be decoded."""
-        del record
         return None
 
 

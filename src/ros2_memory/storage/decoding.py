@@ -7,8 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.storage.cdr_layout import MAX_OBJECTS, holds_too_many, layout_of
 from ros2_memory.storage.errors import UnreadableError
+from ros2_memory.storage.object_count import MAX_OBJECTS, holds_too_many
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 from ros2_memory.typestore import Typestores
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import CdrLayout, Channel, Definition, Record
+    from ros2_memory.storage.base import Channel, Definition, Record
     from ros2_memory.typestore import MessageType
 
 _MAX_KNOWN = 10_000
@@ -64,17 +64,6 @@ class Decoding:
         except Exception as error:
             reason = _reason(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
-
-    def layout(self, record: Record) -> CdrLayout | None:
-        """Returns where the numbers of a message lie; None if it must be decoded."""
-        channel = record.channel
-        if channel.encoding != "cdr":
-            return None
-        schema = channel.schema
-        found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
-        if isinstance(found, str):
-            return None
-        return layout_of(found.definitions, found.name, record.payload)
 
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages; None if they are not CDR of a known type."""

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Batch, CdrLayout, Channel, Definition, Record
+    from ros2_memory.storage.base import Batch, Channel, Definition, Record
     from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.sqlite_bag import SqliteBags
 
@@ -133,7 +133,3 @@ class FileReader(BagReader):
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of the channel's messages, or None."""
         return self._decoding.definition(channel)
-
-    def layout(self, record: Record) -> CdrLayout | None:
-        """Returns where the numbers of a record lie, or None."""
-        return self._decoding.layout(record)

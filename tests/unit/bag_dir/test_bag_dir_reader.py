@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
-from ros2_memory.storage.base import CdrLayout, Closing, Record
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.support.fakes import FakeReader
@@ -182,15 +182,10 @@ EVER = TimeWindow.everything()
 
 
 class Adapter(FakeReader):
-    """Knows the layout of every message."""
-
     def __init__(self) -> None:
         super().__init__({"nav_msgs/msg/Odometry": "it is not wanted"})
         self.add(OPEN, [text(10, "open")], closing=Closing.OPEN)
         self.add(FULL, [text(1, "first"), text(2, "last"), odom(3, 0, 0)])
-
-    def layout(self, record: Record) -> CdrLayout:
-        return CdrLayout(len(record.payload), (), (), ())
 
 
 def test_without_a_sidecar_it_answers_as_the_adapter() -> None:
@@ -216,7 +211,6 @@ def test_messages_are_decoded_as_the_adapter_decodes_them() -> None:
     assert reader.undecodable(chatter.channel) is None
     assert reader.undecodable(pose.channel) == "it is not wanted"
     assert getattr(reader.decode(chatter), "data", None) == "first"
-    assert reader.layout(chatter) == adapter.layout(chatter)
 
 
 def test_nothing_is_opened_before_the_first_message_is_asked_for() -> None:

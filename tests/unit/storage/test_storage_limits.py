@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 import zstandard
 
-from ros2_memory.analysis.bulk_decode import BulkDecoder
-from ros2_memory.analysis.payload_templates import PayloadTemplate
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -216,18 +214,6 @@ class TestMessages:
         assert len(getattr(few, "data", ())) == 1000
         with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
             Decoding().decode(record(300_000))
-
-    def test_messages_that_cannot_be_decoded_are_not_kept_with_their_errors(self) -> None:
-        known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
-        reader = McapReader()
-        record = Record(known, 1, 1, b"\0\1\0\0" + bytes([255] * 20))
-        decoder = BulkDecoder[object, PayloadTemplate](
-            reader.decode, lambda *_: None, lambda *_: ()
-        )
-        [error] = decoder.decode([record])
-        assert isinstance(error, UndecodableError)
-        assert error.__traceback__ is None
-        assert error.__cause__ is None
 
     def test_a_large_array_of_numbers_is_decoded(self) -> None:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))

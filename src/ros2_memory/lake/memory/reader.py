@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.index import LakeBag, LakeIndex
-    from ros2_memory.storage.base import Batch, CdrLayout, Definition, Record
+    from ros2_memory.storage.base import Batch, Definition, Record
 
 _MOST_ALONE: Final = 2
 """Bags that are read alone; who goes on reads those beside them, too."""
@@ -146,10 +146,6 @@ class LakeReader(BagReader):
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages, as of that of a file."""
         return self._decoder.definition(channel)
-
-    def layout(self, record: Record) -> CdrLayout | None:
-        """Returns the offsets of a message's numbers, as of that of a file."""
-        return self._decoder.layout(record)
 
     def _batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str] = ()
