@@ -29,7 +29,8 @@ from ros2_memory.columns.shown import (
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
 from ros2_memory.columns.zones import PartZones
-from ros2_memory.messages.detections import LISTS, MAX_DEPTH, POSITIONS, detections_of
+from ros2_memory.core.text import LISTS_OF_LABELS
+from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, detections_of
 from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
@@ -265,7 +266,7 @@ def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) ->
 def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
     for name, node in fields.items():
         element = node.element if isinstance(node, Listing) else None
-        if name in LISTS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
+        if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
             yield Words(element)
         yield from sources_in(node, depth - 1, frames)
 

@@ -28,7 +28,8 @@ from ros2_memory.columns.shown import (
     unknown,
 )
 from ros2_memory.columns.values import Kind, Leaf, Level
-from ros2_memory.messages.detections import MAX_DEPTH, NAMES, NOT_LABELLED, SCORES
+from ros2_memory.core.text import LABELS
+from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -230,7 +231,7 @@ def scored(fields: Mapping[str, Node]) -> Scored | None:
     """Returns how an object is named and scored; None if none like it is a detection."""
     if fields.keys() & NOT_LABELLED:
         return None
-    labels = _leaves(fields, NAMES, lambda leaf: leaf.kind is Kind.TEXT)
+    labels = _leaves(fields, LABELS, lambda leaf: leaf.kind is Kind.TEXT)
     numeric = {Kind.INTEGER, Kind.REAL}
     scores = _leaves(fields, SCORES, lambda leaf: leaf.kind in numeric)
     return Scored(labels[0].level, labels, scores) if labels else None

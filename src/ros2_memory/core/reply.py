@@ -33,7 +33,7 @@ from typing import (
 )
 
 from ros2_memory.core.geometry import normalised, yaw
-from ros2_memory.core.text import shortened
+from ros2_memory.core.text import named, quote, shortened
 from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
@@ -436,7 +436,15 @@ def _plain(value: JsonValue | tuple[JsonValue, ...]) -> JsonValue:
 
 
 def _name(name: str) -> str | None:
-    return name or None
+    return named(name) or None
+
+
+def _names(names: Iterable[str]) -> JsonValue:
+    return [*map(named, names)]
+
+
+def _counts(counts: Iterable[tuple[str, JsonValue]]) -> JsonValue:
+    return {named(name): count for name, count in counts}
 
 
 def _inside(places: Sequence[str]) -> JsonValue:
@@ -465,7 +473,12 @@ def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
 
 
 PLAIN: Final = unit(_plain)
+MESSAGE: Final = unit(quote)
+"""A value of a message, or a part of it: its texts are quoted (`core/text.py`)."""
 NAME: Final = unit(_name)
+"""Of a frame, or a label: quoted if it is more than two words; likewise in the next two."""
+NAMES: Final = unit(_names)
+COUNTS_BY_NAME: Final = unit(_counts)
 PAIRS: Final = unit(dict)
 TIME: Final = unit(unix_rounded_up)
 ISO_LOCAL: Final = unit(iso_local, "_local")

@@ -1,4 +1,12 @@
-"""Text for people: counts and names in sentences, values in few characters, globs over names."""
+"""Text for people: counts and names in sentences, values in few characters, globs over names.
+
+And texts that messages say, which a planner must not obey. What people say to a robot, what nodes
+log and what a network names reaches a language model with the reply. Such a text is `Quoted`, and
+so is a sentence that repeats one; `quoted_keys` finds where they stand in a reply, which lists
+these places first. Frames, labels of detections, nodes, joints and the like are names: they are
+quoted as soon as they are more than two words, since a bag, or a network that names what it sees in
+its own words, can hold a sentence there.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +20,8 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
+    from ros2_memory.core.model import JsonValue
+
 MAX_NAMED: Final = 3
 """How many names a sentence lists before it counts the rest."""
 _MAX_NAME_CHARS: Final = 160
@@ -20,6 +30,18 @@ _MAX_ITEMS: Final = 8
 _MAX_TEXT_CHARS: Final = 80
 _MAX_INTEGER_BITS: Final = 128
 _ELLIPSIS: Final = "…"
+LABELS: Final = ("label", "class_id", "class_name", "class", "object")
+"""Fields with the label of a detection, the first that is there."""
+LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
+_FRAMES: Final = ("frame_id", "child_frame_id", "parent", "child")
+_OTHER_NAMES: Final = ("name", "names", "id", "hardware_id", "type", "encoding", "format", "skill")
+_NAMES: Final = LISTS_OF_LABELS.union(LABELS, _FRAMES, _OTHER_NAMES)
+"""Fields of messages that hold names."""
+_NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
+"""One word, or two: `map`, `traffic light`."""
+_MOST_KEYS: Final = 12
+_MOST_KEYS_CHARS: Final = 300
+"""Of more places, or longer ones, a reply lists its own keys above them."""
 
 
 def counted(count: int, singular: str, plural: str | None = None) -> str:
@@ -35,8 +57,8 @@ def listed(names: Sequence[str], count: int | None = None, at_most: int = MAX_NA
 
 
 def shortened(text: str, max_chars: int = _MAX_NAME_CHARS) -> str:
-    """Returns the text, cut to `max_chars` with an ellipsis."""
-    return text if len(text) <= max_chars else text[: max_chars - 1] + _ELLIPSIS
+    """Returns the text, cut to `max_chars` with an ellipsis; a quoted one stays so."""
+    return text if len(text) <= max_chars else type(text)(text[: max_chars - 1] + _ELLIPSIS)
 
 
 def encodable(text: str) -> str:
@@ -116,3 +138,70 @@ def _pruned(value: object, levels: int) -> object:
 
 def _type_name(value: object) -> str:
     return f"a {type(value).__name__}"
+
+
+class Quoted(str):
+    """A text that a message says, or one that repeats it."""
+
+    __slots__ = ()
+
+
+def named(name: str) -> str:
+    """Returns the name of a frame or a label; quoted if it is more than two words."""
+    return name if not name or _NAME.fullmatch(name) else Quoted(name)
+
+
+def repeating(sentence: str, names: Iterable[str]) -> str:
+    """Returns a sentence with names of frames or labels in it; quoted if one of them is."""
+    return Quoted(sentence) if any(isinstance(named(name), Quoted) for name in names) else sentence
+
+
+def still_quoted(text: str, *parts: str) -> str:
+    """Returns a text that was made with parts of it; quoted if one of these is."""
+    return Quoted(text) if any(isinstance(part, Quoted) for part in parts) else text
+
+
+def quote(value: JsonValue, field: str = "") -> JsonValue:
+    """Returns a value of a message with its texts quoted; `field` is the path that it is of."""
+    if isinstance(value, str):
+        is_name = not value or field.rpartition(".")[2] in _NAMES
+        return named(value) if is_name else Quoted(value)
+    if isinstance(value, dict):
+        return {named(name): quote(part, name) for name, part in value.items()}
+    if isinstance(value, list) and any(isinstance(part, str | dict | list) for part in value):
+        return [quote(part, field) for part in value]
+    return value
+
+
+def quoted_keys(reply: JsonValue) -> list[str]:
+    """Returns the dot-paths of the keys of a reply at which quoted texts stand, without indices.
+
+    A cell of a table (`fields`, `rows`) is at `rows` and the name of its column.
+    """
+    found: dict[str, None] = {}
+    columns = reply.get("fields") if isinstance(reply, dict) else None
+    rows = reply.get("rows") if isinstance(reply, dict) else None
+    if isinstance(reply, dict) and isinstance(columns, list) and isinstance(rows, list):
+        for row in rows:
+            for name, cell in zip(columns, row if isinstance(row, list) else (), strict=True):
+                _find(cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", found)
+        reply = {key: each for key, each in reply.items() if key != "rows"}
+    _find(reply, "", found)
+    if len(found) > _MOST_KEYS or sum(map(len, found)) > _MOST_KEYS_CHARS:
+        found = dict.fromkeys(path.partition(".")[0] for path in found)
+    return [*found]
+
+
+def _find(value: JsonValue, path: str, found: dict[str, None]) -> None:
+    if isinstance(value, Quoted):
+        found[path] = None
+    elif isinstance(value, list):
+        for part in value:
+            _find(part, path, found)
+    elif isinstance(value, dict):
+        for name, part in value.items():
+            if isinstance(name, Quoted):
+                found[path] = None
+                _find(part, path, found)
+            else:
+                _find(part, f"{path}.{name}" if path else name, found)

@@ -16,7 +16,7 @@ from heapq import merge
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.results import (
     AnswerWithNotes,
@@ -338,8 +338,13 @@ def _notes_of(replies: Sequence[RobotReply]) -> list[str]:
     for each in replies:
         notes = each.value.get("notes") if isinstance(each.value, dict) else None
         for note in notes if isinstance(notes, list) else ():
-            by_note.setdefault(str(note), []).append(each.name)
-    return [f"{listed(names, at_most=_MOST_NAMED)}: {note}" for note, names in by_note.items()]
+            if isinstance(note, str):
+                by_note.setdefault(note, []).append(each.name)
+    return [_of_robots(names, note) for note, names in by_note.items()]
+
+
+def _of_robots(names: Sequence[str], note: str) -> str:
+    return still_quoted(f"{listed(names, at_most=_MOST_NAMED)}: {note}", note)
 
 
 def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, str]) -> list[str]:
@@ -348,14 +353,14 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, str]) -> lis
     for name, reason in failures.items():
         by_reason.setdefault(reason, []).append(name)
     notes = [
-        f"no answer of {listed(names, at_most=_MOST_NAMED)}: {reason}"
+        still_quoted(f"no answer of {_of_robots(names, reason)}", reason)
         for reason, names in by_reason.items()
     ]
     by_reason = {}
     for each in replies:
         for note in () if each.lake is None else each.lake.notes:
             by_reason.setdefault(note, []).append(each.name)
-    notes += [f"{listed(names, at_most=_MOST_NAMED)}: {note}" for note, names in by_reason.items()]
+    notes += [_of_robots(names, note) for note, names in by_reason.items()]
     notes += shipped_to({each.name: each.lake.latest for each in replies if each.lake is not None})
     if ahead := [each.name for each in replies if each.is_ahead]:
         notes.append(

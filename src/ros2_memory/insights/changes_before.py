@@ -29,6 +29,7 @@ from ros2_memory.analysis.state_changes import (
 from ros2_memory.analysis.topic_events import has_events, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -267,14 +268,15 @@ def _changed(topic: str, change: Change, charge: int) -> str:
 def _status(name: str, level: int, text: str) -> str:
     word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
     more = f": {text}" if text else ""
-    return f"status of {name.removeprefix(STATUS)} became {word}{more}"[:_MAX_LOG_CHARS]
+    text = f"status of {name.removeprefix(STATUS)} became {word}{more}"
+    return Quoted(text[:_MAX_LOG_CHARS])
 
 
 def _reported(report: Report) -> str:
     if report.reports == 1:
-        return report.text
+        return Quoted(report.text)
     span = unix_from_ns(report.last - report.first)
-    return f"{report.text} ({report.reports} times in {span:.0f} s)"
+    return Quoted(f"{report.text} ({report.reports} times in {span:.0f} s)")
 
 
 class _ActiveGoals:
@@ -330,7 +332,7 @@ def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]
         for level in events.changes.known:
             if level.name.startswith(STATUS) and level.last:
                 word = _LEVELS[level.last] if 0 < level.last < len(_LEVELS) else str(level.last)
-                yield f"status of {level.name.removeprefix(STATUS)}", word
+                yield Quoted(f"status of {level.name.removeprefix(STATUS)}"), word
 
 
 def before(

@@ -17,7 +17,7 @@ from ros2_memory.analysis.motion.standstills import SHORTEST_NS
 from ros2_memory.analysis.topic_events import has_events, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import Quoted, counted, listed, repeating
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
@@ -367,7 +367,7 @@ def _topic_events(
             "thing",
             each.first,
             each.last,
-            f"{each.label} in view",
+            repeating(f"{each.label} in view", [each.label]),
             goes_on=each.last == last_seen.get(each.label),
             score=each.best,
         )
@@ -393,7 +393,7 @@ def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None)
             x, y = point or (x, y)
             frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.
-        text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
+        text = repeating(f"stood at x {x:z.2f}, y {y:z.2f}{frame}", [frame.removeprefix(" in ")])
         yield Event("stop", start, end, text, goes_on, point=point)
 
 
@@ -464,7 +464,7 @@ def _silences(view: View, window: TimeWindow) -> Iterator[Event]:
 def _error(error: ReportedError) -> Event:
     again = f" ({error.reports} times)" if error.reports > 1 else ""
     end = error.last if error.reports > 1 else None
-    return Event("error", error.first, end, f"error: {error.text}{again}")
+    return Event("error", error.first, end, Quoted(f"error: {error.text}{again}"))
 
 
 def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:

@@ -24,6 +24,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import transform_point
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import Quoted, named, quote, repeating
 from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
@@ -467,7 +468,8 @@ def _sighting(
     """
     message = view.memory.reader.decode(newest.record)
     value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
-    thing = _matching(detections_of(value, view.memory.extractor.frame(message)), condition)
+    seen = detections_of(value, view.memory.extractor.frame(message))
+    thing, labels = _matching(seen, condition), {each.label for each in seen}
     robot_at_first = thing is None and matches.begun
     at = matches.first if robot_at_first else newest.time
     robot = _robot(view, at, _recording_at(view, newest, at), frame_id)
@@ -482,7 +484,10 @@ def _sighting(
         thing=_spot_of(
             view, condition, newest, matches.first, robot, thing=thing, frame_id=frame_id
         ),
-        matched=matched_texts(condition, value),
+        matched=tuple(
+            named(text) if text in labels else Quoted(text)
+            for text in matched_texts(condition, value)
+        ),
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
     )
@@ -528,7 +533,7 @@ def _with_fields(
             continue
         for sentence in shown.notes:
             view.notes.add(sentence)
-        extended.append(replace(sighting, matched=(), value=shown.value))
+        extended.append(replace(sighting, matched=(), value=quote(shown.value)))
     if refused and len(refused) == len(extended):
         raise refused[0]
     return tuple(extended)
@@ -597,8 +602,11 @@ def _spot_of(
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
-        f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
-        f"no transform leads to {' or '.join(targets)} at that time"
+        repeating(
+            f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
+            f"no transform leads to {' or '.join(targets)} at that time",
+            [spot.frame_id, *targets],
+        )
     )
     return spot
 

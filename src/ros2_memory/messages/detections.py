@@ -1,7 +1,8 @@
 """Reads detections from messages: what a detector saw, by name, and where if the message has that.
 
-A detection is an object with a name under one of `NAMES`: an entry of a list, or the whole message.
-A string that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The
+A detection is an object with a name under one of `LABELS`: an entry of a list, or the whole
+message; a list of strings under one of `LISTS_OF_LABELS` is a list of detections. A string that is
+JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The
 position is a point in metres: `point` or `position`, vision_msgs' pose or the centre of a 3D box.
 Boxes in an image are in pixels, and give no position. The score is a number under one of `SCORES`.
 """
@@ -13,6 +14,7 @@ import math
 from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
 from ros2_memory.messages.conversions import triple, xyz
 
 if TYPE_CHECKING:
@@ -20,12 +22,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue, Vector3
 
-NAMES: Final = ("label", "class_id", "class_name", "class", "object")
 SCORES: Final = ("score", "confidence", "probability")
 NOT_LABELLED: Final = frozenset({"stride"})
 """An object with such a field is a std_msgs/MultiArrayDimension, whose label names an axis."""
-LISTS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
-"""A list of strings under one of these names is a list of detections."""
 
 POSITIONS: Final = (
     ("point",),
@@ -87,7 +86,7 @@ def _detections(value: JsonValue, frame_id: str, depth: int) -> Iterator[Detecti
 
 def _in_fields(value: dict[str, JsonValue], frame: str, depth: int) -> Iterator[Detection]:
     for name, inner in value.items():
-        if name in LISTS and isinstance(inner, list):
+        if name in LISTS_OF_LABELS and isinstance(inner, list):
             yield from (Detection(each) for each in inner if isinstance(each, str) and each)
         if _may_hold_detections(inner):
             yield from _detections(inner, frame, depth - 1)
@@ -161,7 +160,7 @@ def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
 def _label(value: dict[str, JsonValue]) -> str | None:
     if not NOT_LABELLED.isdisjoint(value):
         return None
-    for name in NAMES:
+    for name in LABELS:
         label = value.get(name)
         if isinstance(label, str) and label.strip():
             return label

@@ -10,6 +10,7 @@ from ros2_memory.core.reply import (
     LOCAL,
     MINUTES,
     NAME,
+    NAMES,
     OBJECTS,
     PLAIN,
     POSE,
@@ -121,7 +122,10 @@ class TransformAt(AnswerWithNotes):
         return yaw(self.rotation)
 
 
-@result("frames", objects(keys("parent", "child", "static"))("transforms", "sorted_edges"))
+@result(
+    NAMES("frames"),
+    objects(keys(NAME("parent"), NAME("child"), "static"))("transforms", "sorted_edges"),
+)
 class Frames(AnswerWithNotes):
     """The frame graph as it was recorded."""
 

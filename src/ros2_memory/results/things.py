@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.reply import (
     AGO,
+    COUNTS_BY_NAME,
     INSIDE,
     NAME,
+    NAMES,
     OBJECT,
     OBJECTS,
     PAIRS,
@@ -30,7 +32,7 @@ from ros2_memory.core.reply import (
     unit,
     vector,
 )
-from ros2_memory.core.text import shortened
+from ros2_memory.core.text import named, shortened
 from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
@@ -41,7 +43,7 @@ _XY: Final = vector("xy", 2)
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 _MISSED: Final = "not_seen_where_expected"
-_LABEL: Final = unit(lambda label: shortened(label, 40))
+_LABEL: Final = unit(lambda label: shortened(named(label), 40))
 
 
 @result(
@@ -83,16 +85,16 @@ class StillThere:
 
 def _other_frame(frame_id: str, scope: Scope) -> JsonValue | Absent:
     """Returns a frame that is not that of the whole reply."""
-    return Absent.ABSENT if frame_id == getattr(scope.answer, "frame_id", None) else frame_id
+    return Absent.ABSENT if frame_id == getattr(scope.answer, "frame_id", None) else named(frame_id)
 
 
 def thing(most_stays: int) -> Keys:
     """Returns the keys of a thing with so many of its newest places."""
     return keys(
-        PLAIN("label").in_short,
-        PAIRS("labels").if_any,
-        PLAIN("also_seen_as").if_any,
-        PLAIN("misread_as").if_any,
+        NAME("label").in_short,
+        COUNTS_BY_NAME("labels").if_any,
+        NAMES("also_seen_as").if_any,
+        NAMES("misread_as").if_any,
         PLAIN("moves").if_any.in_short,
         PLAIN("at_once").if_known.in_short,
         vector("xyz", 2)("place").in_short,
@@ -178,7 +180,7 @@ def listed_things(form: Keys) -> Keys:
         NAME("frame_id").merged("inherited"),
         objects(form)("things").along("last_seen"),
         TOTAL("total", "total", "all_counted").merged("added"),
-        PAIRS("labels").merged("counted"),
+        COUNTS_BY_NAME("labels").merged("counted"),
     )
 
 
@@ -390,13 +392,13 @@ class Comparison(AnswerWithNotes):
     @property
     def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
         """The farthest points, with the window that they are of."""
-        named = zip(("this", "with"), self.farthest, strict=True)
-        return [(name, point) for name, point in named if point is not None]
+        found = zip(("this", "with"), self.farthest, strict=True)
+        return [(name, point) for name, point in found if point is not None]
 
     @property
     def frames(self) -> dict[str, JsonValue]:
         """The frames that places are in, where there are any; that of the path if it is another."""
-        frames: list[JsonValue] = [self.frame_id or None] * self.things.is_any
+        frames: list[str | None] = [self.frame_id or None] * self.things.is_any
         frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)
-        named = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
-        return dict(named)
+        found = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
+        return {key: frame and named(frame) for key, frame in found}

@@ -9,6 +9,7 @@ from ros2_memory.core.reply import (
     AGO,
     LASTED,
     LOCAL,
+    MESSAGE,
     NAME,
     OBJECT,
     OBJECTS,
@@ -31,6 +32,7 @@ from ros2_memory.core.reply import (
     texts,
     unit,
 )
+from ros2_memory.core.text import named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
 
@@ -62,7 +64,7 @@ class TopicRow:
     "topic",
     "type",
     TIME("timestamp", "sample.time"),
-    PLAIN("value", "sample.value"),
+    MESSAGE("value", "sample.value"),
     PLAIN("latched").if_any,
     SECONDS("age_s").if_known,
 )
@@ -111,7 +113,7 @@ def _last_time(answer: TopicRange) -> Ns | None:
     "topic",
     "type",
     "total",
-    objects(keys(TIME("timestamp", "time"), "value"))("samples"),
+    objects(keys(TIME("timestamp", "time"), MESSAGE("value")))("samples"),
     where=(
         "fields",
         keys(
@@ -142,14 +144,15 @@ class TopicRange(AnswerWithNotes):
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of the table: a field that holds an object has one for each of its parts."""
-        return ("timestamp", *dict.fromkeys(name for row in self._cells() for name in row))
+        names = dict.fromkeys(name for row in self._cells() for name in row)
+        return ("timestamp", *map(named, names))
 
     @property
     def rows(self) -> list[JsonValue]:
         """A row for each sample: its time and cells; null where a sample has no such part."""
         _, *names = self.columns
         return [
-            [moment(sample.time), *(cells.get(name) for name in names)]
+            [moment(sample.time), *(quote(cells.get(name), name) for name in names)]
             for sample, cells in zip(self.samples, self._cells(), strict=True)
         ]
 
@@ -186,10 +189,10 @@ class TypeFields(AnswerWithNotes):
 @result(
     TIME("timestamp", "found.sample.time"),
     LOCAL("local", "found.sample.time", "found.sample.time"),
-    PLAIN("value", "found.sample.value"),
+    MESSAGE("value", "found.sample.value"),
     PLAIN("topic", "found.topic").if_known,
     PLAIN("type", "found.type").if_known,
-    PLAIN("frame_id", "found.frame_id").if_any,
+    NAME("frame_id", "found.frame_id").if_any,
     SECONDS("age_s", "found.age").if_known,
     span=("found.sample.time", "seen_at"),
 )
@@ -209,13 +212,13 @@ class Match(AnswerWithNotes):
 
 @result(
     TIME("timestamp", "matched.sample.time"),
-    PLAIN("matched", "matched.sample.value"),
-    PLAIN("value", "value.sample.value"),
+    MESSAGE("matched", "matched.sample.value"),
+    MESSAGE("value", "value.sample.value"),
     TIME("value_timestamp", "value.sample.time"),
     PLAIN("condition_topic", "matched.topic"),
     PLAIN("value_topic", "value.topic"),
-    PLAIN("matched_frame_id", "matched.frame_id").if_any,
-    PLAIN("frame_id", "value.frame_id").if_any,
+    NAME("matched_frame_id", "matched.frame_id").if_any,
+    NAME("frame_id", "value.frame_id").if_any,
     PLAIN("value_latched", "value.latched").if_any,
     SECONDS("value_age_s").when("value.latched"),
     SECONDS("age_s", "matched.age").if_known,

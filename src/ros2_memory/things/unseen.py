@@ -12,7 +12,7 @@ import numpy as np
 
 from ros2_memory.analysis.sights import Look, Spot, Unplaced
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import abbreviate, counted, listed
+from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.insights.silences import describe_silences
@@ -83,7 +83,7 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     for key, label in asked.labels.items():
         about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
         for note in _of_label(known, key, asked):
-            yield about + note
+            yield still_quoted(about + note, note)
 
 
 def vague_notes(
@@ -104,9 +104,10 @@ def vague_notes(
                 mine = during[spots[during, Spot.LABEL] == label]
                 labels |= {estimate.names[key]} if estimate.is_vague(mine) else set()
     if labels:
-        yield (
+        yield repeating(
             "localisation was poor when these were detected last, which moves nothing, so that "
-            f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}"
+            f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
+            labels,
         )
 
 
@@ -163,10 +164,13 @@ def _left_out(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
         for each in detected
         if each.low and not each.counted
     ]
+    names = [each.name for each in detected]
     if unplaced:
-        yield f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}"
+        text = f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}"
+        yield repeating(text, names)
     if low:
-        yield f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
+        text = f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
+        yield repeating(text, names)
 
 
 def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
@@ -179,7 +183,8 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
         meant = f"; did you mean {close[0]}?" if close else ""
         label = abbreviate(asked.labels[key])
         if names:
-            yield f"no detector reported {label}; there are: {listed(shown)}{meant}"
+            text = f"no detector reported {label}; there are: {listed(shown)}{meant}"
+            yield repeating(text, shown)
         return
     _, count, low, unplaced, *_ = _detected(known, key, asked.window)
     if unplaced:

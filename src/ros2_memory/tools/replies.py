@@ -16,9 +16,10 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.reply import Scope, file_name, shown, with_notes
+from ros2_memory.core.text import quoted_keys
 from ros2_memory.core.timebase import unix_rounded_up
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
-from ros2_memory.tools.reply_size import fit_reply, to_json_text
+from ros2_memory.tools.reply_size import QUOTED, fit_reply, to_json_text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -85,7 +86,13 @@ class Replies:
             value = {**value, "from_active": True}
         if now is not None:
             value = {"now": unix_rounded_up(now), **value}
-        return Reply(fit_reply(value, self.max_chars))
+        return self._fitted(value)
+
+    def _fitted(self, value: JsonObject, *, is_error: bool = False) -> Reply:
+        """Returns a reply that says first, and in full, where it repeats texts of messages."""
+        quoted = quoted_keys(value)
+        marked: JsonObject = {QUOTED: [*quoted], **value} if quoted else value
+        return Reply(fit_reply(marked, self.max_chars), is_error)
 
     def _topics(self, rows: tuple[results.TopicRow, ...], name: JsonObject) -> str:
         """Returns the list of topics, each row with the name of the robot, if there is one.
@@ -141,8 +148,8 @@ class Replies:
 
     def _no_data(self, reason: NoDataReason, detail: str, notes: tuple[str, ...] = ()) -> Reply:
         reply: JsonObject = {"error": NoDataError.code, "reason": reason.value, "detail": detail}
-        return Reply(fit_reply(with_notes(reply, notes), self.max_chars))
+        return self._fitted(with_notes(reply, notes))
 
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
         reply: JsonObject = {"error": code, **more, "detail": detail}
-        return Reply(fit_reply(reply, self.max_chars), is_error=True)
+        return self._fitted(reply, is_error=True)

@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
 
+QUOTED: Final = "quoted"
+"""The key that lists where a reply repeats texts of messages; it is short, and stays whole."""
 EVENLY_THINNED: Final = frozenset({"samples", "rows", "waypoints", "value"})
 """Rows along time: some of every part say more than all of one part. Others lose their end."""
 
-_NEVER_THINNED: Final = frozenset({"notes", "fields"})
+_NEVER_THINNED: Final = frozenset({"notes", "fields", QUOTED})
 _FEWEST_ROWS: Final = 2
 _SHORTEST_TEXT: Final = 200
 _ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
@@ -108,7 +110,7 @@ def _with_few_notes(reply: JsonObject) -> JsonObject:
 
 def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
     """Returns the short values of the reply's first level, where shortening was not enough."""
-    outline: JsonObject = {}
+    outline: JsonObject = {key: reply[key] for key in (QUOTED,) if key in reply}
     for key, item in reply.items():
         is_short = not isinstance(item, list | dict) and len(to_json_text(item)) < _LONGEST_OUTLINED
         extended = {**outline, key: item}
@@ -226,7 +228,11 @@ class _Shortener:
         if isinstance(columns, list) and isinstance(rows, list):
             table = {"fields": columns, "rows": [self._cells(row, columns) for row in rows]}
         return {
-            key: table[key] if key in table else item if key == "notes" else self._rows(key, item)
+            key: table[key]
+            if key in table
+            else item
+            if key in {"notes", QUOTED}
+            else self._rows(key, item)
             for key, item in reply.items()
         }
 
