@@ -58,7 +58,13 @@ CLASSES: Final[dict[str, MutationClass]] = {
         (indexes.flip_message_index, indexes.wrong_message_index), mcaps
     ),
     "chunk_indexes": MutationClass(
-        (indexes.wrong_chunk_index, indexes.wrong_chunk_head, indexes.one_lie), mcaps
+        (
+            indexes.wrong_chunk_index,
+            indexes.wrong_chunk_head,
+            indexes.one_lie,
+            indexes.lies_together,
+        ),
+        mcaps,
     ),
     "statistics": MutationClass((indexes.wrong_statistics,), mcaps),
     "sqlite_indexes": MutationClass((indexes.wrong_order, indexes.flip_index_page), sqlites),

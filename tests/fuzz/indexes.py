@@ -6,6 +6,7 @@ import sqlite3
 import struct
 from contextlib import closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
@@ -140,11 +141,45 @@ def wrong_chunk_head(rng: Random, good: Good) -> Mutant:
 
 def one_lie(rng: Random, good: Good) -> Mutant:
     """All that points to one chunk agrees on other times than its messages have."""
-    chunks = sum(each.opcode == Opcode.CHUNK for each in pieces(good.plain))
+    chunks = len(_indexed_spans(good.plain))
     if not chunks:
         return mutant_of(good, good.plain)
     moved = rng.choice((-1, 1)) * rng.choice((1, 1_000_000, 50_000_000, 600_000_000))
     return mutant_of(good, agreed(good.plain, rng.randrange(chunks), lambda time: time + moved))
+
+
+def _indexed_spans(plain: bytes) -> list[tuple[int, int]]:
+    """The first and last log time that each chunk states; none unless all have a chunk index."""
+    records = pieces(plain)
+    chunks = [each for each in records if each.opcode == Opcode.CHUNK]
+    if len(chunks) != sum(each.opcode == Opcode.CHUNK_INDEX for each in records):
+        return []
+    return [struct.unpack_from("<QQ", each.body) for each in chunks]
+
+
+def lies_together(rng: Random, good: Good) -> Mutant:
+    """Two or three neighbouring chunks, of which all indexes agree on each other's times, or later.
+
+    So the times of the file may be covered without a hole.
+    """
+    spans = _indexed_spans(good.plain)
+    if len(spans) < 2:
+        return mutant_of(good, good.plain)
+    first = rng.randrange(len(spans) - 1)
+    together = range(first, min(first + rng.choice((2, 2, 3)), len(spans)))
+    longest = max(end - start for start, end in spans)
+    if rng.random() < 0.5:
+        moved = rng.choice((-1, 1)) * rng.choice((50_000_000, longest // 2 + 1, longest + 1))
+        shifts = dict.fromkeys(together, moved)
+    else:  # in descending order
+        shifts = {
+            nth: spans[other][0] - spans[nth][0]
+            for nth, other in zip(together, reversed(together), strict=True)
+        }
+    plain = good.plain
+    for nth, moved in shifts.items():
+        plain = agreed(plain, nth, partial(int.__add__, moved))
+    return mutant_of(good, plain)
 
 
 def agreed(plain: bytes, nth: int, told: Callable[[int], int]) -> bytes:
@@ -158,7 +193,7 @@ def agreed(plain: bytes, nth: int, told: Callable[[int], int]) -> bytes:
     after = at + 1
     while records[after].opcode == Opcode.MESSAGE_INDEX:
         body = bytearray(records[after].body)
-        for pair in range(6, len(body), _PAIR):
+        for pair in range(6, len(body) - _PAIR + 1, _PAIR):
             _retell(body, pair, told)
         records[after] = replace(records[after], body=bytes(body))
         after += 1

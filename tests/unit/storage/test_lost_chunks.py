@@ -314,6 +314,62 @@ class TestAChunkOfWhichAllIndexesTellOneLie:
             assert found == list(range(window.start, window.stop, S // 100))
 
 
+class TestNeighbouringChunksOfWhichAllIndexesLieTogether:
+    """One has the times of the other, so no hole is there; neither is said to have the topic."""
+
+    FIRST = 4
+    PERIOD = 11 * S // 10
+
+    def driven(self, bag_dir: Path, lie: str) -> list[int]:
+        """A drive with a word every 1.1 s, and a lie; the times of words in those chunks."""
+        words = [T0 + n * self.PERIOD + S // 300 for n in range(9)]
+        messages = [odom(T0 + n * S // 100, n / 100, 0.0) for n in range(1000)]
+        messages += [text(at, f"word {n}", "/words") for n, at in enumerate(words)]
+        messages.sort(key=lambda each: each.log_time)
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=40_000))
+        pair = chunks_of(path)[self.FIRST : self.FIRST + 2]
+        one, other = (each.message_start_time for each in pair)
+        shift = {"swapped": (other - one, one - other)}.get(lie)
+        shift = shift or (int(float(lie) * (other - one)),) * 2
+        plain = path.read_bytes()
+        for nth, moved in enumerate(shift, self.FIRST):
+            plain = agreed(plain, nth, partial(int.__add__, moved))
+        path.write_bytes(plain)
+        inside = [at for at in words if one <= at <= pair[1].message_end_time]
+        assert inside
+        return inside
+
+    @pytest.mark.parametrize("tolerance_s", [0.1, 10.0])
+    @pytest.mark.parametrize("lie", ["swapped", "1", "-1", "0.4", "-0.4", "3", "-3"])
+    def test_a_first_answer_is_what_the_messages_say(
+        self, tmp_path: Path, lie: str, tolerance_s: float
+    ) -> None:
+        for at in self.driven(tmp_path, lie):
+            reply = asked_tool(
+                memory_of(tmp_path),
+                tmp_path,
+                "get_topic_at_time",
+                topic="/words",
+                timestamp=at / S + 0.02,
+                tolerance_s=tolerance_s,
+            )
+            assert reply["value"] == {"value": f"word {(at - T0) // self.PERIOD}"}
+            assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
+
+    def test_a_bag_that_pauses_and_one_whose_chunks_overlap_are_read_by_their_indexes(
+        self, tmp_path: Path
+    ) -> None:
+        pauses = [odom(T0 + n * S // 100 + n // 100 * 2 * S, 0.0, 0.0) for n in range(500)]
+        late = [odom(T0 + (n - n % 7 // 5 * 9) * S // 100, 0.0, 0.0) for n in range(20, 500)]
+        for name, messages in (("pauses", pauses), ("late", late)):
+            path = tmp_path / f"{name}.mcap"
+            write_mcap(path, messages, McapLayout(chunk_size=10_000))
+            reader = McapReader()
+            for n in range(0, 500, 20):
+                reader.newest(path, "/odom", TimeWindow(T0, T0 + n * S // 50))
+            assert reader.summarize(path).notes == ()
+
+
 class TestASummarySectionThatDeclaresOtherThanItsChunks:
     """What a chunk declares is protected by its checksum; the summary section repeats it."""
 

@@ -578,7 +578,7 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes of one of them do not agree with its records.
         """
-        for chunk in _beside(index.chunks, window):
+        for chunk in _beside(index, window):
             if chunk.index_places is None or self._indexes.get((file.key, chunk.offset, _COMPARED)):
                 continue
             data = self._readable_data(file, chunk)
@@ -697,16 +697,20 @@ def _overlaps(chunk: Chunk, window: TimeWindow) -> bool:
     return chunk.start < window.stop and chunk.end >= window.start
 
 
-def _beside(chunks: Sequence[Chunk], window: TimeWindow) -> list[Chunk]:
+def _beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
     """Returns the chunks that may hold messages of a window of which their indexes know nothing.
 
     In the order of the file the times of chunks ascend, mostly, and one follows the other. Where
     all indexes of a chunk agree on wrong times, no chunk has the times of its messages: such a
-    hole is looked for at both ends of the window, and between two chunks that overlap it.
+    hole is looked for at both ends of the window, and between two chunks that overlap it. Where
+    neighbours agree on it, no hole need be there, but the times of the file do not go on.
     """
-    start, last = window.start, window.stop - 1
+    chunks, start, last = index.chunks, window.start, window.stop - 1
     inside = [n for n, chunk in enumerate(chunks) if chunk.start <= last and chunk.end >= start]
     found = {one + 1 for one, other in pairwise(inside) if other - one == _NEXT_BUT_ONE}
+    for seam in index.seams:
+        if seam.first <= last and seam.last >= start:
+            found.update((seam.nth, seam.nth + 1))
     for at in (start, last):
         if not any(chunks[n].start <= at <= chunks[n].end for n in inside):
             before = [(chunk.end, n) for n, chunk in enumerate(chunks) if chunk.end < at]

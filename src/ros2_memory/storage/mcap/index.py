@@ -9,6 +9,7 @@ the messages themselves.
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 from operator import attrgetter, itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -66,9 +67,27 @@ _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
 _HEAD_BYTES: Final = RECORD.size
+_SEAM_SHARE: Final = 16
+_SEAM_TIMES: Final = 4
+_SEAM_CHUNKS: Final = 3
+_MOST_SEAMS: Final = 8
 _stating: Final = _STATED.pack
 _NEVER: Final = 1 << 64
 """Later than any time that a file can state."""
+
+
+class Seam(NamedTuple):
+    """A chunk after which the stated times do not go on as elsewhere in its file.
+
+    Attributes:
+        nth: its number; the next chunk is the other side.
+        first: the earliest time that a chunk near it states, on either side.
+        last: the latest.
+    """
+
+    nth: int
+    first: Ns
+    last: Ns
 
 
 class McapIndex(NamedTuple):
@@ -85,6 +104,7 @@ class McapIndex(NamedTuple):
         set_back: by how much the log times of a channel go back from one chunk, or one loose
             message, to a later one, at most; 0 up to `OUT_OF_ORDER_NS`.
         pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
+        seams: where the times of chunks do not go on from one to the next; empty after a scan.
         contradiction: how the indexes of the file contradict its messages, if that was found after
             they had been used; else empty.
         declared: what the summary section declares; None if the index comes from a scan.
@@ -99,6 +119,7 @@ class McapIndex(NamedTuple):
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
     pauses: Pauses = ()
+    seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
 
@@ -185,6 +206,27 @@ def _pauses(file: OpenFile, chunks: Sequence[Chunk]) -> Pauses:
     )
 
 
+def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
+    """Returns `McapIndex.seams`.
+
+    A writer fills one chunk after the other, so their times follow each other. Where all indexes of
+    neighbouring chunks agree on wrong times there is a hole, or an overlap, of more than a
+    `_SEAM_SHARE` of the two chunks, and of several times what is usual in the file. A file with
+    many of them was written in another order, and they say nothing.
+    """
+    # Plain lists: for some thirty chunks arrays take twice as long.
+    apart = [abs(other[2] - one[3]) for one, other in pairwise(chunks)]
+    usual = _SEAM_TIMES * sorted(apart)[len(apart) // 2] if apart else 0
+    seams: list[Seam] = []
+    for nth in [nth for nth, gap in enumerate(apart) if gap > usual]:
+        one, other = chunks[nth], chunks[nth + 1]
+        if apart[nth] * _SEAM_SHARE > one.end - one.start + other.end - other.start:
+            near = chunks[max(nth + 1 - _SEAM_CHUNKS, 0) : nth + 1 + _SEAM_CHUNKS]
+            first, last = min([each.start for each in near]), max([each.end for each in near])
+            seams.append(Seam(nth, first, last))
+    return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
+
+
 def beyond_disorder(back: Ns) -> Ns:
     """Returns `back`; 0 if messages are merely out of order."""
     return back if back > OUT_OF_ORDER_NS else 0
@@ -255,6 +297,7 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         notes=notes,
         set_back=back,
         pauses=_pauses(file, filled),
+        seams=_seams(filled),
         declared=declared,
     )
 
