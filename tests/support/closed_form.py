@@ -2,23 +2,52 @@
 
 A circle of radius 2 m at 0.5 m/s, t seconds after the session's T0: from (0, 0) facing +x, turning
 left about (0, 2). Header stamps are T0 + t exactly; log times lie some milliseconds later.
+`written_session` writes such a session, so that its truth is held to without the recorded ones.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
+import yaml
+from mcap.writer import CompressionType
+
+from tests.support.bags import (
+    TRANSIENT_LOCAL,
+    VOLATILE,
+    McapLayout,
+    Msg,
+    battery,
+    boolean,
+    command,
+    detections,
+    odom,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.memories import ROOT
 from tests.support.shared_bags import RECORDED
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 TURN_RATE: Final = 0.25  # rad/s
 RADIUS: Final = 2.0  # m
 SPEED: Final = 0.5  # m/s
 LASER: Final = (0.10, 0.0, 0.20)  # in base_link, m
 CAMERA: Final = (0.15, 0.0, 0.30)
+SEEN: Final = {
+    "table": ((0.0, math.inf),),
+    "cup": ((5.0, 30.0),),
+    "scissors": ((12.0, 18.0), (40.0, 46.0)),
+}
+"""When its detector saw what (seconds after T0)."""
 
 
 @dataclass(frozen=True)
@@ -73,3 +102,91 @@ def mounted(t: float, mount: tuple[float, float, float]) -> tuple[float, float, 
         y + mount[0] * math.sin(angle) + mount[1] * math.cos(angle),
         mount[2],
     )
+
+
+_TICKS: Final = 1300
+_TICK_NS: Final = 50_000_000
+_SPLIT_TICKS: Final = 200
+_LAYOUT: Final = McapLayout(chunk_size=16_384, compression=CompressionType.ZSTD)
+
+
+def written_session(folder: Path) -> Session:
+    """Writes 65 s of the simulated robot as `ros2 bag record` lays them out: splits of 10 s."""
+    session = Session(folder, 1795144003095000000)
+    splits = [
+        [*_messages(session.t0, first, min(first + _SPLIT_TICKS, _TICKS))]
+        for first in range(0, _TICKS, _SPLIT_TICKS)
+    ]
+    names = [f"{folder.name}_{nth}.mcap" for nth in range(len(splits))]
+    for name, messages in zip(names, splits, strict=True):
+        write_mcap(folder / name, messages, _LAYOUT)
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(_metadata(names, splits)))
+    return session
+
+
+def _messages(t0: int, first: int, stop: int) -> Iterator[Msg]:
+    """The messages of some ticks, each logged some tenths of a millisecond after the other."""
+    for tick in range(first, stop):
+        at, t = t0 + tick * _TICK_NS, tick / 20
+        x, y = position(t)
+        turned = math.radians(yaw_deg(t))
+        found = [
+            odom(at, x, y, turned, vx=SPEED, wz=TURN_RATE),
+            tf(at, transform(at, "odom", "base_link", (x, y, 0.0), turned)),
+        ]
+        if not tick:
+            mounts = {"laser": LASER, "camera": CAMERA}
+            fixed = [transform(at, "base_link", name, mount) for name, mount in mounts.items()]
+            found.append(tf(at, *fixed, topic="/tf_static"))
+        if tick % 2 == 0:
+            found.append(command(at, SPEED, TURN_RATE))
+        if tick % 10 == 0:
+            found.append(boolean(at, 25.0 <= t < 26.0))
+        if tick % 20 == 0:
+            found.append(battery(at, 0.80 - 0.001 * t))
+            found.append(detections(at, [name for name in SEEN if _is_seen(name, t)]))
+        for nth, each in enumerate(found, 1):
+            yield replace(each, log_time=at + nth * 300_000, publish_time=at + nth * 200_000)
+
+
+def _is_seen(name: str, t: float) -> bool:
+    return any(begin <= t < end for begin, end in SEEN[name])
+
+
+def _metadata(names: list[str], splits: list[list[Msg]]) -> object:
+    def span(messages: list[Msg]) -> dict[str, object]:
+        first, last = messages[0].log_time, messages[-1].log_time
+        return {
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "duration": {"nanoseconds": last - first},
+            "message_count": len(messages),
+        }
+
+    every = [*chain(*splits)]
+    topics = [
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": type_name,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": TRANSIENT_LOCAL if topic in _LAYOUT.latched else VOLATILE,
+                "type_description_hash": "",
+            },
+            "message_count": count,
+        }
+        for (topic, type_name), count in Counter((each.topic, each.type) for each in every).items()
+    ]
+    files = [{"path": name, **span(part)} for name, part in zip(names, splits, strict=True)]
+    about = {
+        "version": 9,
+        "storage_identifier": "mcap",
+        **span(every),
+        "topics_with_message_count": topics,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": names,
+        "files": files,
+        "custom_data": None,
+        "ros_distro": "jazzy",
+    }
+    return {"rosbag2_bagfile_information": about}

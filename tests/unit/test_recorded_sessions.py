@@ -1,4 +1,7 @@
-"""Answers against the closed form, over bags that the real `ros2 bag record` wrote."""
+"""Answers against the closed form, over bags that the real `ros2 bag record` wrote, and one more.
+
+That one the tests write: without the shared bags there is no other of its length.
+"""
 
 from __future__ import annotations
 
@@ -25,6 +28,7 @@ from tests.support.closed_form import (
     degrees_apart,
     mounted,
     position,
+    written_session,
     yaw_deg,
 )
 from tests.support.memories import memory_of
@@ -33,13 +37,32 @@ from tests.support.shared_bags import RECORDED, needs_recorded
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
 
-sessions = pytest.mark.parametrize(
-    "session",
-    [
+WRITTEN = "written"
+"""In place of a session: the one that the test writes."""
+LONG = [
+    pytest.param(WRITTEN, id=WRITTEN),
+    pytest.param(SESSIONS["session_mcap"], id="session_mcap", marks=needs_recorded),
+]
+long_ones = pytest.mark.parametrize("session", LONG, indirect=True)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Session:
+    return written_session(tmp_path_factory.mktemp("session") / "written")
+
+
+@pytest.fixture(
+    params=[
         pytest.param(SMALL, id="small"),
+        pytest.param(WRITTEN, id=WRITTEN),
         *(pytest.param(each, id=name, marks=needs_recorded) for name, each in SESSIONS.items()),
-    ],
+    ]
 )
+def session(request: pytest.FixtureRequest) -> Session:
+    found: Session = (
+        request.getfixturevalue("written") if request.param == WRITTEN else request.param
+    )
+    return found
 
 
 @pytest.fixture
@@ -65,7 +88,6 @@ def log_times(session: Session, topic: str) -> list[int]:
     return sorted(times)
 
 
-@sessions
 def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
     memory: Memory, session: Session
 ) -> None:
@@ -81,7 +103,6 @@ def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
         assert answer.time == max(each for each in known if each <= asked * 1e9 + 1000)
 
 
-@sessions
 def test_the_heading_is_the_closed_form(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     for step in range(20):
@@ -98,7 +119,6 @@ def test_the_heading_is_the_closed_form(memory: Memory, session: Session) -> Non
         assert degrees_apart(shown, yaw_deg(t)) < 0.1
 
 
-@sessions
 @pytest.mark.parametrize(("sensor", "mount"), [("laser", LASER), ("camera", CAMERA)])
 def test_a_transform_is_interpolated_to_the_asked_moment(
     memory: Memory, session: Session, sensor: str, mount: tuple[float, float, float]
@@ -115,7 +135,6 @@ def test_a_transform_is_interpolated_to_the_asked_moment(
         assert answer.clock == "stamp"
 
 
-@sessions
 def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     t = (begin + end) / 2
@@ -132,7 +151,6 @@ def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> 
     assert there.transform.rotation[2] == pytest.approx(-back.transform.rotation[2], abs=1e-9)
 
 
-@sessions
 def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     span = TimeRange(start_s=session.at(begin - 1), end_s=session.at(end + 1))
@@ -146,7 +164,6 @@ def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -
         assert math.dist(waypoint.position[:2], (x, y)) < 0.005
 
 
-@sessions
 def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Session) -> None:
     _, end = spanned(memory, session)
     answer = queries.find_last_match(
@@ -160,7 +177,6 @@ def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Sess
     )
 
 
-@sessions
 def test_a_thing_never_seen_is_a_complete_search_without_a_match(
     memory: Memory, session: Session
 ) -> None:
@@ -171,7 +187,6 @@ def test_a_thing_never_seen_is_a_complete_search_without_a_match(
     assert answer.notes == ()
 
 
-@sessions
 def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
@@ -182,7 +197,6 @@ def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Ses
         assert again.sample.time == sample.time
 
 
-@sessions
 def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> None:
     rows = {row.topic: row for row in queries.list_recorded_topics(memory, Call())}
     with Reader(session.folder) as reader:
@@ -195,7 +209,6 @@ def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> Non
         assert (row.first, row.last) == (times[0], times[-1])
 
 
-@sessions
 def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
@@ -218,10 +231,10 @@ def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: S
     assert compared == len(wanted) > 100
 
 
-@needs_recorded
-def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released() -> None:
-    session = SESSIONS["session_mcap"]
-    memory = memory_of(session.folder)
+@long_ones
+def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released(
+    memory: Memory, session: Session
+) -> None:
     answer = queries.find_last_match(memory, Call(), "/bumper", "equals", value=True)
     assert answer.found is not None
     assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(25.5, abs=0.05)
@@ -231,11 +244,10 @@ def test_the_bumper_was_last_pressed_half_a_second_before_it_was_released() -> N
         assert value.sample.value == {"value": pressed}
 
 
-@needs_recorded
-def test_the_battery_when_the_bumper_was_pressed() -> None:
-    session = SESSIONS["session_mcap"]
+@long_ones
+def test_the_battery_when_the_bumper_was_pressed(memory: Memory) -> None:
     answer = queries.value_when(
-        memory_of(session.folder),
+        memory,
         Call(),
         "/battery_state",
         "/bumper",
@@ -286,9 +298,8 @@ def test_static_frames_of_three_broadcasters_are_all_known() -> None:
     assert [note for note in found.notes if note.endswith("a frame has no name: 3")]
 
 
-@needs_recorded
-def test_now_can_be_the_newest_recorded_moment() -> None:
-    session = SESSIONS["session_mcap"]
+@long_ones
+def test_now_can_be_the_newest_recorded_moment(session: Session) -> None:
     memory = memory_of(session.folder, limits=QuerySettings(now="latest"))
     answer = queries.position(memory, Call(), AtTime(ago_s=10.0))
     newest = memory.index.snapshot().latest

@@ -32,7 +32,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
-from tests.support.closed_form import SESSIONS
+from tests.support.closed_form import SESSIONS, written_session
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.random_histories import write_history
@@ -78,12 +78,19 @@ def spans(memory: Memory, x: float, y: float = 0.0, **given: Any) -> list[tuple[
     ]
 
 
-@needs_recorded
 @each_way
-def test_visits_of_a_recorded_session_are_the_closed_form(tmp_path: Path, recalls: bool) -> None:
-    session = SESSIONS["session_mcap"]
-    for bag in session.folder.glob("*.mcap"):
-        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+@pytest.mark.parametrize(
+    "recorded", [False, pytest.param(True, marks=needs_recorded)], ids=["written", "recorded"]
+)
+def test_visits_of_a_session_are_the_closed_form(
+    tmp_path: Path, recorded: bool, recalls: bool
+) -> None:
+    if recorded:
+        session = SESSIONS["session_mcap"]
+        for bag in session.folder.glob("*.mcap"):
+            (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    else:
+        session = written_session(tmp_path / "written")
     memory = memory_of(tmp_path)
     if recalls:
         memory = with_store(replace(memory), tmp_path)
