@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import Pose, Sample, TimeWindow
-from ros2_memory.core.text import listed, repeating
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -514,8 +514,7 @@ def trajectory_summary(
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
     if len(path.frames) > 1:
-        text = f"poses in several frames were joined: {', '.join(path.frames)}"
-        view.notes.add(repeating(text, path.frames))
+        view.notes.add(f"poses in several frames were joined: {', '.join(path.frames)}")
     require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)

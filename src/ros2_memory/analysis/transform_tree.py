@@ -36,7 +36,7 @@ from ros2_memory.core.geometry import (
     normalised,
 )
 from ros2_memory.core.model import StampedTransform, Transform
-from ros2_memory.core.text import listed, repeating
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_S,
@@ -254,7 +254,7 @@ class FrameGraph:
         else:
             names = listed(known, at_most=_MAX_NAMES)
             detail = f"no transform names a frame '{name}'; there are: {names}"
-        return NoDataError(NoDataReason.FRAME_UNKNOWN, repeating(detail, known))
+        return NoDataError(NoDataReason.FRAME_UNKNOWN, detail)
 
     def _not_connected(self, target: str, source: str, time: Ns) -> NoDataError:
         roots = self._root_of(target), self._root_of(source)
@@ -272,7 +272,7 @@ class FrameGraph:
                 f" the tree changes or contains a loop; the newest known roots are"
                 f" '{roots[0]}' and '{roots[1]}'; ask about another time"
             )
-        return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, repeating(detail, self.names()))
+        return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
 
 def agreeing_clock(transforms: Iterable[StampedTransform]) -> TfClock:

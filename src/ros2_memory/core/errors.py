@@ -30,10 +30,6 @@ class EpisodicError(Exception):
 
     code: ClassVar[str] = "internal"
 
-    def __str__(self) -> str:
-        """Returns the sentence; still quoted, if it repeats what a message says."""
-        return self.args[0] if self.args and isinstance(self.args[0], str) else super().__str__()
-
 
 class ConfigError(EpisodicError):
     """The configuration is refused; the sentence names the key and what is allowed."""

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import repeating
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.time_bins import TimeBins
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
@@ -45,11 +44,10 @@ def place_bins(view: View, window: TimeWindow) -> TimeBins:
     places = places_in(view, view.memory.limits.places, placement, window)
     if not places:
         frames = " or ".join(placement.frames)
-        text = (
+        raise InvalidArgumentsError(
             f"by place needs named places in {frames}, and there is none in "
             f"{places_setting(view.memory.limits)}"
         )
-        raise InvalidArgumentsError(repeating(text, placement.frames))
     track = track_in(view, placement.frame_id, window)
     inside = [
         [(each.start, each.stop + 1) for each in robot_inside(own, place.region, window)]

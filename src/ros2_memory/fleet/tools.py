@@ -19,7 +19,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     RefusedError,
 )
-from ros2_memory.core.text import listed, still_quoted
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_rounded_up
 from ros2_memory.fleet.fan_out import AT_ONCE, FanOut
 from ros2_memory.fleet.merging import (
@@ -284,7 +284,6 @@ def _shared_error(errors: Mapping[str, EpisodicError]) -> EpisodicError:
     for name, error in errors.items():
         by_reason.setdefault(_reason(error), []).append(name)
     text = "; ".join(f"{listed(names)}: {reason}" for reason, names in by_reason.items())
-    text = still_quoted(text, *by_reason)
     kinds = {type(error) for error in errors.values()}
     first = next(iter(errors.values()))
     if isinstance(first, NoDataError) and len(kinds) == 1:

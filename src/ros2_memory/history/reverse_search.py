@@ -27,7 +27,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Reason, abbreviate, listed, repeating
+from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.candidates import CandidateRows, CandidateTables
 from ros2_memory.history.context import Note
@@ -142,8 +142,7 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     within = f"within {condition.test.tolerance_m:g} m"
     compared = f"near_position compared x and y ({within}) in the frame of each message: "
     compared += listed(named)
-    every = [frame for _, each in frames for frame in each]
-    return (repeating(f"{compared}; {_ELSEWHERE}", every),)
+    return (f"{compared}; {_ELSEWHERE}",)
 
 
 def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
@@ -172,11 +171,10 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     for topic in topics[:_MOST_FRAMES] if asked else ():
         frames = _frames_of(view, topic)
         if frames and asked not in frames:
-            text = (
+            raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
                 f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
             )
-            raise InvalidArgumentsError(repeating(text, frames))
 
 
 def _frames_of(view: View, topic: str) -> list[str]:

@@ -17,7 +17,7 @@ from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, united
-from ros2_memory.core.text import listed, repeating
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import copy_key
@@ -106,10 +106,9 @@ class Contradiction(NamedTuple):
     def __str__(self) -> str:
         """Returns a sentence, without a full stop."""
         one, other = self.names
-        return repeating(
+        return (
             f"the frame {self.frame} is in {self.parents[0]} in the recording {one}, and in "
-            f"{self.parents[1]} in {other}, as of two robots",
-            [self.frame, *self.parents],
+            f"{self.parents[1]} in {other}, as of two robots"
         )
 
 

@@ -36,7 +36,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import alike
 from ros2_memory.core.model import StampedTransform, TimeWindow
-from ros2_memory.core.text import Reason, still_quoted
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     MAX_NS,
     NS_PER_MS,
@@ -431,8 +431,7 @@ def _explained(
         if not unknown or not connected(view, frames, TimeWindow.around(at, _LONGER_NS), among):
             return then
         advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
-        detail = still_quoted(f"{then.detail}; {advice}", then.detail)
-        return NoDataError(between(view, near), detail)
+        return NoDataError(between(view, near), f"{then.detail}; {advice}")
     if failure.reason not in {NoDataReason.OUTSIDE_RANGE, NoDataReason.GAP}:
         return failure
     inside = (
@@ -512,11 +511,11 @@ def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDat
 
 def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
     """Returns a failure that sounds as if it were about all times with the time it is about."""
-    detail = (
+    return NoDataError(
+        failure.reason,
         f"within {seconds(TF_CACHE_NS)} of {unix_text(at)}: {failure.detail}; "
-        "list_frames names the frames of all times"
+        "list_frames names the frames of all times",
     )
-    return NoDataError(failure.reason, still_quoted(detail, failure.detail))
 
 
 def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransform]:

@@ -12,7 +12,7 @@ from ros2_memory.analysis.topic_events import has_errors
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
-from ros2_memory.core.text import Quoted, repeating
+from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, pose_frame, resolve_path_topic
@@ -186,11 +186,8 @@ def _paths_apart(
         return _WaysApart()
     if not placement.is_map and not _is_one_session(view, windows):
         view.notes.add(
-            repeating(
-                f"standstills and paths are not compared: the origin of {frame} changes with "
-                "every start, and no transforms lead to a map",
-                [frame],
-            )
+            f"standstills and paths are not compared: the origin of {frame} changes with every "
+            "start, and no transforms lead to a map"
         )
         return _WaysApart()
     region, places = None if where is None else where.region, view.memory.limits.places

@@ -23,7 +23,6 @@ from ros2_memory.analysis.motion.trajectory import SLICE_NS
 from ros2_memory.columns.motion import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import still_quoted
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MIN_NS,
@@ -119,7 +118,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         since = window.start if path is None or path.since is None else path.since
         standstills, drops = _standstills_in(view, topic, TimeWindow(since, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
-        view.notes.add(still_quoted(f"the path is unknown: {error}", str(error)))
+        view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed=elapsed)
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")

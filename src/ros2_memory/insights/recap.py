@@ -393,7 +393,7 @@ def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None)
             x, y = point or (x, y)
             frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.
-        text = repeating(f"stood at x {x:z.2f}, y {y:z.2f}{frame}", [frame.removeprefix(" in ")])
+        text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
         yield Event("stop", start, end, text, goes_on, point=point)
 
 

@@ -24,7 +24,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import transform_point
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import Quoted, named, quote, repeating
+from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
@@ -602,11 +602,8 @@ def _spot_of(
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
-        repeating(
-            f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
-            f"no transform leads to {' or '.join(targets)} at that time",
-            [spot.frame_id, *targets],
-        )
+        f"the place of the sighting at {unix_text(newest.time)} is in {spot.frame_id}: "
+        f"no transform leads to {' or '.join(targets)} at that time"
     )
     return spot
 

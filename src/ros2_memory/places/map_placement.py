@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.text import abbreviate, repeating
+from ros2_memory.core.text import abbreviate
 from ros2_memory.history.transforms import connected, connects, sessions_of
 
 if TYPE_CHECKING:
@@ -52,11 +52,10 @@ def map_placement(
     placement = own if frame_id == pose_frame else _map_or_own(view, topic, own, asked_for)
     if frame_id not in (None, placement.frame_id):
         known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
-        text = (
+        raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)}; places are in {known}; "
             "get_transform_at converts from other frames"
         )
-        raise InvalidArgumentsError(repeating(text, [pose_frame]))
     return placement
 
 

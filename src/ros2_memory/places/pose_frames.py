@@ -16,7 +16,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import places_at
-from ros2_memory.core.text import abbreviate, counted, repeating
+from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.history.driven_path import newest_of_body, robot_body
 from ros2_memory.history.transforms import connects, newest_in_session, transform_at
 
@@ -127,11 +127,10 @@ def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, bag: BagSpan) ->
 
 
 def _unreachable(frame_id: str, own_frame: str) -> str:
-    text = (
+    return (
         f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
         f"{own_frame or 'a pose without a frame'} at that time"
     )
-    return repeating(text, [own_frame])
 
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:

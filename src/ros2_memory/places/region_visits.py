@@ -19,7 +19,6 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.spans import without
-from ros2_memory.core.text import repeating
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
@@ -293,11 +292,10 @@ def places_in(
     for place in places:
         frame = place.frame_id
         if frame not in placement.frames:
-            text = (
+            view.notes.add(
                 f"{place.name} is left out: it is in {frame}, and where the robot was is known in "
                 f"{' and '.join(placement.frames)}"
             )
-            view.notes.add(repeating(text, placement.frames))
             continue
         if frame not in tracks:
             tracks[frame] = track_in(view, frame, window)

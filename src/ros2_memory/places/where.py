@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.regions import Circle, Rectangle
-from ros2_memory.core.text import abbreviate, repeating
+from ros2_memory.core.text import abbreviate
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import robot_inside
 
@@ -151,8 +151,7 @@ def note_other_frame(
         return
     with suppress(QueryTimeoutError):
         if times_inside(view, replace(where, frame_id=own), own, window):
-            text = (
+            view.notes.add(
                 f"x and y were taken in {placement.frame_id}; the robot was at those in {own}, "
                 f"the frame of get_position_*: {ask}"
             )
-            view.notes.add(repeating(text, [own]))
