@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
-from ros2_memory.recorder.base import Housekeeper
+from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception
@@ -292,8 +292,8 @@ class PlayedHousekeeper(Housekeeper):
     ) -> None:
         self.recorded.append((tuple(recordings), bytes_written, monotonic_s))
 
-    def age_held(self) -> str | None:
-        return self.held
+    def status(self) -> HouseStatus:
+        return HouseStatus(age_held=self.held)
 
     def faults(self) -> dict[str, str]:
         return self.failed
