@@ -117,7 +117,8 @@ class BagTable:
         patrol = self._next_patrol() if patrolling else ()
         scanned = self._tree.scan(context.now, [*self._watched, *patrol])
         self._reactivate_changed(scanned, context)
-        known = self._known_at_first()
+        is_first = not (self._files or self._unchanged)
+        known = self._known() if self._known is not None and is_first else {}
         restored = self._restore(scanned.stamps, known, context)
         changed = self._forget(scanned.gone) | self._examine(
             scanned.stamps, known, context, restored
@@ -177,11 +178,6 @@ class BagTable:
         following = self._patrol[-PATROL:]
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
-
-    def _known_at_first(self) -> Mapping[str, BagFile]:
-        """Returns the files that were read earlier, for the first scan."""
-        is_first = not (self._files or self._unchanged)
-        return self._known() if self._known is not None and is_first else {}
 
     def _restore(
         self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
