@@ -100,4 +100,4 @@ def test_without_rules_nothing_is_announced(tmp_path: Path) -> None:
     house = build_housekeeper(settings, tmp_path, build_reader(settings))
     house.announce("rec_20261120T080000Z")
     house.finish()
-    assert (house.screening(()), [*tmp_path.iterdir()]) == ((), [])
+    assert (house.screening(()), [*tmp_path.iterdir()]) == (None, [])

@@ -143,14 +143,18 @@ class Heartbeat:
         state, since = _state_of(self.pid)
         if state:
             return state in _ENDED or since != began
-        try:
-            # Processes of others may be hidden in /proc.
-            os.kill(self.pid, 0)
-        except ProcessLookupError:
-            return True
-        except (OSError, OverflowError):
-            return False
+        return not runs(self.pid)  # processes of others may be hidden in /proc
+
+
+def runs(pid: int) -> bool:
+    """Returns whether there is a process of this id, or may be one."""
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
         return False
+    except (OSError, OverflowError):
+        return True
+    return True
 
 
 def process_of(pid: int) -> str | None:

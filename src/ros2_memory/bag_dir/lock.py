@@ -15,6 +15,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import is_open_file
+from ros2_memory.bag_dir.heartbeat import runs
 from ros2_memory.bag_dir.json_files import is_integer
 from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.core.errors import RecorderError
@@ -102,7 +103,9 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             pid, host = _read_holder(descriptor)
-            alive = host != socket.gethostname() or pid is None or _is_alive(pid)
+            # A restarted container: the process before had the number that this one has.
+            is_before = pid == os.getpid()
+            alive = host != socket.gethostname() or pid is None or (not is_before and runs(pid))
             if alive or time.monotonic() >= give_up:
                 raise RecorderError(_refusal(path, pid, host, alive=alive)) from None
             time.sleep(_POLL_S)
@@ -143,15 +146,3 @@ def _read_holder(descriptor: int) -> tuple[int | None, str | None]:
     fields: dict[object, object] = value if isinstance(value, dict) else {}
     pid, host = fields.get("pid"), fields.get("host")
     return (pid, host) if is_integer(pid) and isinstance(host, str) else (None, None)
-
-
-def _is_alive(pid: int) -> bool:
-    if pid == os.getpid():
-        return False  # a restarted container: the process before had the same number
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except (PermissionError, OverflowError):
-        return True
-    return True

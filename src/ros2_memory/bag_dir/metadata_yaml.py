@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.json_files import integer
 from ros2_memory.bag_dir.layout import COMPRESSED, METADATA_FILE, bag_kind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
@@ -127,7 +127,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
         ValueError: a file is incomplete, or metadata.yaml is of an unknown form; it is unchanged.
     """
     path = recording / METADATA_FILE
-    files = [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
+    files = _plain_bags(recording)
     text = ""
     with suppress(FileNotFoundError):
         text = read_small_file(path)
@@ -146,18 +146,17 @@ def correct(recording: Path, reader: BagReader) -> bool:
 
 def is_named_by_rosbag2(recording: Path) -> bool:
     """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
-    files = [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
-    return all(_is_of_rosbag2(each) and each.suffix == ".mcap" for each in files)
+    prefix = f"{recording.name}_"
+    return all(
+        each.suffix == ".mcap"
+        and each.stem.startswith(prefix)
+        and each.stem.removeprefix(prefix).isdecimal()
+        for each in _plain_bags(recording)
+    )
 
 
-def _names_of(files: Iterable[str]) -> set[str]:
-    return {"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files}
-
-
-def _is_of_rosbag2(file: Path) -> bool:
-    """Returns whether rosbag2 names a file of this recording like this."""
-    number = file.stem.removeprefix(f"{file.parent.name}_")
-    return number != file.stem and number.isdecimal()
+def _plain_bags(recording: Path) -> list[Path]:
+    return [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
@@ -175,7 +174,8 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     info = _information(content)
     kind = _STORAGES.get(str(info.get("storage_identifier")))
     if info.get("compression_mode") == "FILE" or any(bag_kind(name) != kind for name in files):
-        raise ValueError(f"it is not of plain {' and '.join(sorted(_names_of(files)))} files")
+        found = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
+        raise ValueError(f"it is not of plain {' and '.join(found)} files")
     version = integer(info, "version")
     if version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which lists no messages of files")
@@ -203,10 +203,10 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
         }
         for name in order
     ]
-    topics = [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]
+    topics = _mappings(info, "topics_with_message_count")
     listed = set()
     for each in topics:
-        topic_metadata = _mapping(each.get("topic_metadata"), "topic_metadata")
+        topic_metadata = _described(each)
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
         each["message_count"] = counts[key]
@@ -221,7 +221,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
             new = _topic_metadata(channel, version)
             topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return _dumped(content)
 
 
 def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
@@ -307,7 +307,7 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     content = _parse(text)
     info = _information(content)
     names = {bare_name(name): counts for name, counts in gone.items()}
-    files = [_mapping(each, "files") for each in _list(info, "files")]
+    files = _mappings(info, "files")
     paths = _list(info, "relative_file_paths")
     deleted = [each for each in files if bare_name(each.get("path")) in names]
     left = [each for each in files if bare_name(each.get("path")) not in names]
@@ -322,9 +322,9 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
         counts = names[bare_name(each.get("path"))]
         is_equal &= sum(counts.values()) == integer(each, "message_count")
         lost.update(counts)
-    topics = [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]
+    topics = _mappings(info, "topics_with_message_count")
     for each in topics:
-        name = _mapping(each.get("topic_metadata"), "topic_metadata").get("name")
+        name = _described(each).get("name")
         each["message_count"] = integer(each, "message_count") - lost.pop(str(name), 0)
     total = sum(integer(each, "message_count") for each in left)
     if not is_equal or lost or total != sum(integer(each, "message_count") for each in topics):
@@ -333,7 +333,7 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     info["message_count"] = total
     info.update(_span(min(start for start, _ in spans), max(end for _, end in spans)))
     info["relative_file_paths"], info["files"] = left_paths, left
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return _dumped(content)
 
 
 def recounted(text: str, left: Mapping[str, Counts]) -> str:
@@ -350,8 +350,8 @@ def recounted(text: str, left: Mapping[str, Counts]) -> str:
         content = _parse(text)
         info = _mapping(content, "it")
         info = _mapping(info.get(_ROOT, info), _ROOT)
-        files = [_mapping(each, "files") for each in _list(info, "files")]
-        topics = [_mapping(each, "topics") for each in _list(info, "topics_with_message_count")]
+        files = _mappings(info, "files")
+        topics = _mappings(info, "topics_with_message_count")
         counts, others = Counter[str](), 0
         for each in files:
             count = integer(each, "message_count")
@@ -363,12 +363,12 @@ def recounted(text: str, left: Mapping[str, Counts]) -> str:
                 counts.update(known)
                 each["message_count"] = min(count, sum(known.values()))
         for each in topics:
-            name = str(_mapping(each.get("topic_metadata"), "topic_metadata").get("name"))
+            name = str(_described(each).get("name"))
             each["message_count"] = min(integer(each, "message_count"), counts[name] + others)
         info["message_count"] = sum(integer(each, "message_count") for each in files)
     except ValueError:
         return text
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+    return _dumped(content)
 
 
 def bare_name(path: object) -> str:
@@ -418,3 +418,16 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
     if not isinstance(value, list):
         raise ValueError(f"it has no list {key}")  # noqa: TRY004 - a value in a text
     return value
+
+
+def _mappings(fields: dict[object, object], key: str) -> list[dict[object, object]]:
+    """Returns the items of the list under a key, each of which must hold keys."""
+    return [_mapping(each, key.partition("_")[0]) for each in _list(fields, key)]
+
+
+def _described(topic: dict[object, object]) -> dict[object, object]:
+    return _mapping(topic.get("topic_metadata"), "topic_metadata")
+
+
+def _dumped(content: object) -> str:
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)

@@ -208,8 +208,11 @@ class OwnRecordings:
         """
         with self._lock:
             self._read()
-            folder = str(path.parent)
-            return self.judge(self.name_of(folder), known_identity(folder))(path.name)
+            return self.judge_of(str(path.parent))(path.name)
+
+    def judge_of(self, directory: str) -> Callable[[str], bool]:
+        """Returns `judge` of the directory that has this path now."""
+        return self.judge(self.name_of(directory), known_identity(directory))
 
     def judge(self, folder: str, identity: Identity | None) -> Callable[[str], bool]:
         """Returns what decides, by its name, whether a bag file in a directory is the recorder's.

@@ -11,28 +11,126 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
-from ros2_memory.index.file_state import FileNotes, FileState, classify
-from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Tree
+from ros2_memory.index.file_state import Classification, FileNotes, FileState, classify
+from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.index.unchanged_bags import KINDS, UnchangedBags
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import Classification, ScanContext
-    from ros2_memory.index.scan import Stamp
+    from ros2_memory.index.file_state import ScanContext
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
 
 _FILE: Final = attrgetter("size", "mtime_ns", "inode")
+
+
+KINDS: Final = (".mcap", ".db3")
+"""A compressed bag may lie beside the file it was made from, and is classified with that."""
+
+
+class UnchangedBags:
+    """Closed bags that do not change any more, or not since their columns were stored.
+
+    Those are most of a week. Of each only the bag and its inode are kept. Should its file change,
+    it is reactivated: the notes on it are made as if it had been read, and it is classified again.
+    Not for several threads at once.
+    """
+
+    def __init__(self) -> None:
+        self._bags: dict[str, BagFile] = {}
+        self._inodes: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        return len(self._bags)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._bags)
+
+    def __contains__(self, path: str) -> bool:
+        return path in self._bags
+
+    def take(
+        self,
+        stamps: dict[str, Stamp],
+        known: Mapping[str, BagFile],
+        reader: BagReader,
+        context: ScanContext,
+    ) -> list[BagFile]:
+        """Takes the files that are unchanged out of `stamps`.
+
+        Files that need a closer look stay: young ones, and empty or incomplete ones.
+
+        Returns:
+            Their bags in the order of their starts.
+        """
+        last = context.now - max(context.three_splits, YOUNG_NS)
+        kinds = tuple(kind for kind in KINDS if reader.reads(Path(f"bag{kind}")))
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
+        taken, inodes = self._bags, self._inodes
+        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
+            file = known.get(path)
+            if (
+                file is not None
+                and file.mtime_ns == mtime_ns < last
+                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
+                and path.endswith(kinds)
+                and (schema := file.summary.schema).complete
+                and schema.topics
+                and not (compressed and other_form(path) in compressed)
+            ):
+                taken[file.file], inodes[file.file] = file, inode
+        rest = {path: stamp for path, stamp in stamps.items() if path not in taken}
+        stamps.clear()
+        stamps.update(rest)
+        # Sorted here by numpy: sorting what is sorted takes no time later.
+        bags = [*taken.values()]
+        order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
+        return [bags[at] for at in order.tolist()]
+
+    def add(self, bag: BagFile, inode: int) -> None:
+        """Adds a bag that has proved to be closed, and old enough not to change."""
+        self._bags[bag.file], self._inodes[bag.file] = bag, inode
+
+    def rows(self) -> Iterator[tuple[BagFile, int]]:
+        """Yields each bag with its inode."""
+        return zip(self._bags.values(), map(self._inodes.__getitem__, self._bags), strict=True)
+
+    def is_unchanged(self, path: str, stamp: Stamp, now: Ns) -> bool:
+        """Returns whether a file is one of these, and looks as before."""
+        known = self.stamp(path)
+        return known is not None and settled(stamp.mtime_ns, now) and stamp.matches(known)
+
+    def stamp(self, path: str) -> Stamp | None:
+        """Returns the stamp of one of these files; None for any other.
+
+        Its ctime is 0: that counts only where a file could not be read.
+        """
+        bag = self._bags.get(path)
+        if bag is None:
+            return None
+        return Stamp(bag.size, bag.mtime_ns, 0, self._inodes[path], bag.sidecar_ns)
+
+    def reactivate(self, path: str, now: Ns) -> tuple[FileNotes, Classification] | None:
+        """Removes a file, and returns what would be known had it been read; None for any other."""
+        stamp = self.stamp(path)
+        if stamp is None:
+            return None
+        bag = self._bags.pop(path)
+        del self._inodes[path]
+        notes = FileNotes.first(path, stamp, now)
+        notes.restore(bag.summary)
+        return notes, Classification(FileState.CLOSED, bag)
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +215,8 @@ class BagTable:
         patrol = self._next_patrol() if patrolling else ()
         scanned = self._tree.scan(context.now, [*self._watched, *patrol])
         self._reactivate_changed(scanned, context)
-        known = self._known_at_first()
+        is_first = not (self._files or self._unchanged)
+        known = self._known() if self._known is not None and is_first else {}
         restored = self._restore(scanned.stamps, known, context)
         changed = self._forget(scanned.gone) | self._examine(
             scanned.stamps, known, context, restored
@@ -177,11 +276,6 @@ class BagTable:
         following = self._patrol[-PATROL:]
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
-
-    def _known_at_first(self) -> Mapping[str, BagFile]:
-        """Returns the files that were read earlier, for the first scan."""
-        is_first = not (self._files or self._unchanged)
-        return self._known() if self._known is not None and is_first else {}
 
     def _restore(
         self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext

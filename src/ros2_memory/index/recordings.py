@@ -23,6 +23,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.index.segment import folder_of
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
     loose = loose_bags(snapshot)
     found: dict[str, list[BagFile]] = {}
     for bag in snapshot.bags:
-        found.setdefault(loose.get(bag.file) or folder_of(bag.file), []).append(bag)
+        found.setdefault(loose.get(bag.file) or folder_of(bag), []).append(bag)
     return found
 
 
@@ -140,7 +141,7 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     folders: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
     for bag in snapshot.bags:
-        folder = folder_of(bag.file)
+        folder = folder_of(bag)
         if folder not in whole and not is_named_after_folder(bag.file):
             folders.setdefault(folder, []).append(bag)
     found: dict[str, str] = {}
@@ -158,11 +159,6 @@ def is_named_after_folder(file: str) -> bool:
     """Returns whether a bag is named as a split of the recording of its folder, or by a number."""
     folder, _, name = file.rpartition("/")
     return name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
-
-
-def folder_of(file: str) -> str:
-    """Returns the folder of a file."""
-    return file.rpartition("/")[0]
 
 
 def stem_of(file: str) -> str:
@@ -238,7 +234,7 @@ def _sweep(
     for bag in snapshot.bags:
         if bag.file in left_out:
             continue
-        own, start, end = loose.get(bag.file) or folder_of(bag.file), bag.start, bag.end
+        own, start, end = loose.get(bag.file) or folder_of(bag), bag.start, bag.end
         if _IN_MOMENTS in own:
             own = _recorded_folder(own)
         before = reach.get(own)

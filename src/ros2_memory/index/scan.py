@@ -170,7 +170,8 @@ class Tree:
             self._folders = before
             return ScanResult(problem=self._problem(fault))
         problem = self._unmounted() if fault is None else self._problem(fault)
-        if problem is None and not self._has_named():
+        folders = self._folders.values()
+        if problem is None and self._only and not any(each.files or each.odd for each in folders):
             problem = f"no bag is named {self._only} (data.recording)"
         if problem is not None:
             self._folders = {}
@@ -237,10 +238,6 @@ class Tree:
         if isinstance(error, NotADirectoryError):
             return f"the bag directory is a file, not a directory: correct {self._setting}"
         return f"the bag directory cannot be read: {error.strerror or error}"
-
-    def _has_named(self) -> bool:
-        folders = self._folders.values()
-        return self._only is None or any(each.files or each.odd for each in folders)
 
     def _leave_out_others(self, path: str, folder: _Folder, stamps: dict[str, Stamp]) -> None:
         """Leaves out of a folder what `only` does not name."""

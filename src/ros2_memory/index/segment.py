@@ -7,17 +7,17 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 from __future__ import annotations
 
 from functools import cached_property, lru_cache, reduce
-from itertools import chain
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.bag_summary import numbers_of
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import pauses_between, pauses_within
-from ros2_memory.index.presences import presences_of
 from ros2_memory.index.split_order import split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.holes import Pause
@@ -45,6 +44,16 @@ _CACHED_SEGMENTS: Final = 256
 
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
+
+
+_FEWEST: Final = 3
+"""A bag with fewer messages of a topic shows no period."""
+_PER_OCTAVE: Final = 2
+_OCTAVES: Final = 64 * _PER_OCTAVE
+
+_NOWHERE: Final = np.empty(0, np.intp)
+
+_Times: TypeAlias = "NDArray[np.int64]"
 
 
 class TopicExtent(NamedTuple):
@@ -298,7 +307,7 @@ class Segment:
     @cached_property
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
-        return presences_of(self.bags)
+        return _presences_of(self.bags)
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -398,3 +407,78 @@ class _Columns:
 def _columns(segment: Segment) -> _Columns:
     """Returns the columns of a segment: a copy of its summaries, so few of a week are kept."""
     return _Columns(segment.bags)
+
+
+# When bags hold each topic. A week has 60,000 with some ten topics or more, so this computes with
+# the numbers of all bags and topics of a segment at a time.
+
+
+def _presences_of(bags: Sequence[BagFile]) -> dict[str, Presence]:
+    """Returns by topic when the bags hold it, and how often; a topic's types count together."""
+    groups = _Columns(bags).groups
+    topics = sorted({topic for schema, _, _ in groups for topic in schema.positions})
+    at = {topic: column for column, topic in enumerate(topics)}
+    counts, firsts, lasts = _tables((len(bags), len(topics)), groups, at)
+    held = np.array([bag.end - bag.start for bag in bags], np.int64)
+    messages = counts.sum(axis=0).tolist()
+    lengths = np.where(counts > 0, held[:, None], 0).sum(axis=0).tolist()
+    rows = zip(
+        topics, _runs(firsts, lasts), _spacings(counts, lasts - firsts), messages, lengths,
+        strict=True,
+    )  # fmt: skip
+    return {topic: Presence(*each) for topic, *each in rows}
+
+
+def _tables(
+    shape: tuple[int, int], groups: Sequence[_SchemaGroup], column: dict[str, int]
+) -> tuple[_Times, _Times, _Times]:
+    """Returns counts, first and last times by bag and topic; where a bag has none, 0, MAX, MIN."""
+    counts = np.zeros(shape, np.int64)
+    firsts, lasts = np.full(shape, MAX_NS), np.full(shape, MIN_NS)
+    for schema, rows, numbers in groups:
+        columns = [column[header.topic] for header in schema.topics]
+        if len(schema.positions) == len(columns):
+            here = np.ix_(rows.tolist(), columns)
+            counts[here], firsts[here], lasts[here] = np.moveaxis(numbers, 2, 0)
+            continue
+        for position, at in enumerate(columns):  # a topic of two types has two
+            count, first, last = numbers[:, position].T
+            counts[rows, at] += count
+            firsts[rows, at] = np.minimum(firsts[rows, at], first)
+            lasts[rows, at] = np.maximum(lasts[rows, at], last)
+    return counts, firsts, lasts
+
+
+def _runs(firsts: _Times, lasts: _Times) -> Iterator[tuple[Span, ...]]:
+    """Yields for each topic its runs; see `Presence`."""
+    order = np.argsort(firsts, axis=0, kind="stable")
+    firsts = np.take_along_axis(firsts, order, 0)
+    reach = np.maximum.accumulate(np.take_along_axis(lasts, order, 0), axis=0)
+    # Bags without the topic are sorted to the end, and are no break.
+    before = firsts[1:] < MAX_NS
+    breaks = before & (np.where(before, firsts[1:], reach[:-1]) - reach[:-1] > SHORTEST_NS)
+    whole = [*zip(firsts[0].tolist(), reach[-1].tolist(), strict=True)]
+    broken = frozenset(np.flatnonzero(breaks.any(axis=0)).tolist())
+    for topic, (first, last) in enumerate(whole):
+        at = np.flatnonzero(breaks[:, topic]) if topic in broken else _NOWHERE
+        begins = [first, *firsts[1:][at, topic].tolist()]
+        ends = [*reach[at, topic].tolist(), last]
+        yield tuple(zip(begins, ends, strict=True))
+
+
+def _spacings(counts: _Times, spans: _Times) -> Iterator[dict[int, Spacing]]:
+    """Yields for each topic the spacings of its bags, by the part of an octave of the period."""
+    bag, topic = np.nonzero((counts >= _FEWEST) & (spans > 0))
+    span, intervals = spans[bag, topic], counts[bag, topic] - 1
+    octave = (np.log2(span / intervals) * _PER_OCTAVE).astype(np.int64).clip(0, _OCTAVES - 1)
+    key = topic * _OCTAVES + octave
+    order = np.argsort(key, kind="stable")
+    parts, at = np.unique(key[order], return_index=True)
+    found: list[dict[int, Spacing]] = [{} for _ in range(counts.shape[1])]
+    bounds = pairwise([*at.tolist(), len(order)])
+    for part, (begin, end) in zip(parts.tolist(), bounds, strict=True):
+        rows = order[begin:end]
+        found[part // _OCTAVES][part % _OCTAVES] = Spacing(
+            end - begin, int(span[rows].sum()), int(intervals[rows].sum())
+        )
+    return iter(found)

@@ -6,10 +6,11 @@ The docstrings of `Recorder` are the contract; one test suite checks every adapt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping
 
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
@@ -81,6 +82,28 @@ class NullRecorder(Recorder):
         return False
 
 
+@dataclass(frozen=True, slots=True)
+class HouseStatus:
+    """What the heartbeat shows of a housekeeper's work, under the same names.
+
+    Attributes:
+        age_held: describes the bags that are kept although their dates make them too old, or None.
+        unshipped: describes the bags that were deleted before they were shipped, as they had to be,
+            or None.
+        counted_bytes: the bytes that the budget counts; None before the first pass.
+        state_bytes: those of them that are no recording.
+        held_back: describes the splits that are not served for a fault, or None.
+        failing_rules: each rule of `recording.exclude_when` that cannot be evaluated.
+    """
+
+    age_held: str | None = None
+    unshipped: str | None = None
+    counted_bytes: int | None = None
+    state_bytes: int = 0
+    held_back: str | None = None
+    failing_rules: tuple[str, ...] = ()
+
+
 class Housekeeper:
     """Repairs what crashes left and deletes what exceeds the limits. This base class does nothing.
 
@@ -141,39 +164,21 @@ class Housekeeper:
         Called about every two seconds, from the thread that begins recordings; `live` are those
         that are being written.
         """
-        for step in self.screening(live):
+        step = self.screening(live)
+        if step is not None:
             step()
 
-    def screening(self, live: Collection[str]) -> Sequence[Callable[[], None]]:
+    def screening(self, live: Collection[str]) -> Callable[[], None] | None:
         """Returns what `screen` does, to be done at any time, also when `live` has changed."""
         del live
-        return ()
+        return None
 
     def finish(self) -> None:
         """Releases what can be, now that nothing is recorded any more. May take some seconds."""
 
-    def held_back(self) -> str | None:
-        """Describes the splits that are not served for a fault, or None."""
-        return None
-
-    def failing_rules(self) -> tuple[str, ...]:
-        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
-        return ()
-
-    def age_held(self) -> str | None:
-        """Describes the bags that are kept although their dates make them too old, or None."""
-        return None
-
-    def unshipped(self) -> str | None:
-        """Describes the bags that were deleted before they were shipped, as they had to be."""
-        return None
-
-    def usage(self) -> tuple[int, int] | None:
-        """Returns the bytes that the budget counts, and those of them that are no recording.
-
-        None before the first pass.
-        """
-        return None
+    def status(self) -> HouseStatus:
+        """Returns what the heartbeat shows. Cheap, and raises nothing."""
+        return HouseStatus()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task that failed in the background, such as `apply`, to the reason."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.timebase import Clock
+    from ros2_memory.recorder.base import HouseStatus
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
@@ -29,12 +30,7 @@ class HeartbeatWriter:
         interval_s: how often it is written, in seconds.
         clock: the wall clock.
         events: where a heartbeat that cannot be written is reported.
-        age_held: describes bags that are kept though their dates make them too old, or None.
-        held_back: describes splits that are not served for a fault, or None.
-        failing_rules: why each rule of `recording.exclude_when` that fails cannot be evaluated.
-        unshipped: describes bags that were deleted though they were in no lake and had to be, or
-            None.
-        usage: gives what the budget counts, see `Housekeeper`.
+        house: gives what the heartbeat shows of the housekeeper.
         topics: the list of topics to record.
         reception: knows what was lost.
         advice: says what to do where publishers are subscribed to and not heard.
@@ -52,25 +48,17 @@ class HeartbeatWriter:
         clock: Clock,
         events: EventLog,
         *,
-        age_held: Callable[[], str | None],
+        house: Callable[[], HouseStatus],
         topics: TopicsFile,
         reception: Reception,
-        held_back: Callable[[], str | None] = lambda: None,
-        failing_rules: Callable[[], tuple[str, ...]] = tuple,
-        unshipped: Callable[[], str | None] = lambda: None,
-        usage: Callable[[], tuple[int, int] | None] = lambda: None,
         advice: Callable[[], str] = str,
     ) -> None:
         self._advice = advice
-        self._held_back = held_back
-        self._failing_rules = failing_rules
-        self._unshipped = unshipped
-        self._usage = usage
         self._bag_dir = bag_dir
         self._interval_s = interval_s
         self._clock = clock
         self._events = events
-        self._age_held = age_held
+        self._house = house
         self._topics = topics
         self._reception = reception
         self.offered = set[str]()
@@ -105,7 +93,6 @@ class HeartbeatWriter:
         if announced is not None and announced not in names:
             names.append(announced)
         subscribed = frozenset[str]().union(*(each.subscribed for each in sessions.running))
-        usage = self._usage()
         silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
         return Heartbeat(
             pid=os.getpid(),
@@ -122,23 +109,15 @@ class HeartbeatWriter:
             interval_s=self._interval_s,
             restarts=sessions.restarts,
             missing=self.missing(sessions),
-            age_held=self._age_held(),
             lost=self._reception.lost_in_last_hour(now),
             waiting_for=sessions.waiting_for if state is RecorderState.WAITING else None,
             cut_short=tuple(sorted(self._reception.cut_short)),
-            held_back=self._held_back(),
-            failing_rules=self._failing_rules(),
-            unshipped=self._unshipped(),
             listed=self._topics.selection.listed,
             list_refused=self._topics.refused,
             process=process_of(os.getpid()),
-            counted_bytes=None if usage is None else usage[0],
-            state_bytes=0 if usage is None else usage[1],
-            unknown_types=self.shortfall.unknown_types,
-            unheard=self.shortfall.unheard,
-            fell_silent=self.shortfall.fell_silent,
-            required_missing=self.shortfall.required_missing,
             advice=self._advice() if self.shortfall.unheard else None,
+            **asdict(self._house()),
+            **asdict(self.shortfall),
         )
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ import os
 import threading
 import time
 from contextlib import suppress
+from dataclasses import replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -27,7 +28,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.recorder.base import Housekeeper
+from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector
@@ -39,7 +40,7 @@ from ros2_memory.retention.repair import Repairer, open_files
 from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
     from ros2_memory.bag_dir.state_files import Interruption
@@ -142,8 +143,8 @@ class Housekeeping(Housekeeper):
         self._over_budget = False
         self._out_of_reach = False
         self._collected = Collected()
-        self._usage: tuple[int, int] | None = None
-        self._unshipped: tuple[int, Sequence[str]] = (0, ())
+        self._status = HouseStatus()
+        self._unshipped = 0
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -237,22 +238,24 @@ class Housekeeping(Housekeeper):
         if self._screening is not None:
             self._screening.announce(recording)
 
-    def screening(self, live: Collection[str]) -> Sequence[Callable[[], None]]:
-        """Returns what screens closed splits; nothing where nothing is to be excluded."""
-        return () if self._screening is None else (self._screening.plan(live),)
+    def screening(self, live: Collection[str]) -> Callable[[], None] | None:
+        """Returns what screens closed splits; None where nothing is to be excluded."""
+        return None if self._screening is None else self._screening.plan(live)
 
     def finish(self) -> None:
         """Screens what is left, some splits of each recording."""
         for _ in range(_LAST_STEPS):
             self.screen(())
 
-    def held_back(self) -> str | None:
-        """Describes the splits that are not served for a fault, or None."""
-        return None if self._screening is None else self._screening.problem()
-
-    def failing_rules(self) -> tuple[str, ...]:
-        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
-        return () if self._screening is None else self._screening.failing_rules()
+    def status(self) -> HouseStatus:
+        """Returns what the last pass found, and what is held back at this moment."""
+        if self._screening is None:
+            return self._status
+        return replace(
+            self._status,
+            held_back=self._screening.problem(),
+            failing_rules=self._screening.failing_rules(),
+        )
 
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
@@ -260,11 +263,10 @@ class Housekeeping(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s)
 
-    def age_held(self) -> str | None:
-        """Describes the bags that are kept though their dates make them too old, or None."""
-        if not self._collected.held:
+    def _describe_held(self, held: int) -> str | None:
+        if not held:
             return None
-        bags = counted(self._collected.held, "bag is", "bags are")
+        bags = counted(held, "bag is", "bags are")
         limit = f"{self._max_age_h:g} h"
         return (
             f"{bags} older than {limit} (retention.max_age_h) by date, but not deleted: the clock "
@@ -272,27 +274,17 @@ class Housekeeping(Housekeeper):
             f"(timedatectl shows that), or when {limit} have been recorded after them"
         )
 
-    def unshipped(self) -> str | None:
-        """Describes the bags that were deleted before they were shipped, as they had to be."""
-        count, newest = self._unshipped
-        if not count:
-            return None
-        bags = counted(count, "bag was", "bags were")
-        return (
-            f"since the recorder started, {bags} deleted unshipped, to make room "
-            f"(retention.max_total_gb, min_free_gb): {listed(newest, count)}"
-        )
-
-    def usage(self) -> tuple[int, int] | None:
-        """Returns the bytes that the budget counts, and those of them that are no recording."""
-        return self._usage
-
     def _apply(self, free_bytes_wanted: int | None = None) -> None:
         begun = time.perf_counter_ns()
         self._update_moments()
         before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
         self._collected = collected
-        self._usage = collected.total_bytes, collected.state_bytes
+        self._status = replace(
+            self._status,
+            age_held=self._describe_held(collected.held),
+            counted_bytes=collected.total_bytes,
+            state_bytes=collected.state_bytes,
+        )
         wanted = {} if free_bytes_wanted is None else {"free_bytes_wanted": free_bytes_wanted}
         (_log.info if collected.bags else _log.debug)(
             "retention_applied",
@@ -309,13 +301,19 @@ class Housekeeping(Housekeeper):
         )
         self._report_changes(before, collected)
         if collected.unshipped:
-            lost = self._unshipped[0] + len(collected.unshipped)
-            self._unshipped = lost, collected.unshipped[: -MAX_NAMED - 1 : -1]
+            self._unshipped += len(collected.unshipped)
+            bags = counted(self._unshipped, "bag was", "bags were")
+            newest = collected.unshipped[: -MAX_NAMED - 1 : -1]
+            sentence = (
+                f"since the recorder started, {bags} deleted unshipped, to make room "
+                f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
+            )
+            self._status = replace(self._status, unshipped=sentence)
             _log.warning(
                 "unshipped_deleted",
                 bags=len(collected.unshipped),
                 names=[*collected.unshipped],
-                reason=self.unshipped(),
+                reason=sentence,
             )
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
@@ -323,7 +321,7 @@ class Housekeeping(Housekeeper):
     def _report_changes(self, before: Collected, after: Collected) -> None:
         """Reports what began or ended with this pass: age held back, and bags no limit counts."""
         if after.held and not before.held:
-            _log.warning("age_held", bags=after.held, reason=self.age_held())
+            _log.warning("age_held", bags=after.held, reason=self._status.age_held)
         elif before.held and not after.held:
             _log.info("age_no_longer_held")
         if after.foreign_bytes and not before.foreign_bytes:
@@ -519,11 +517,11 @@ class BackgroundHousekeeper(Housekeeper):
             return
         # What is live is known now, and not when the thread begins.
         try:
-            steps = self._housekeeper.screening(live)
+            step = self._housekeeper.screening(live)
         except (EpisodicError, OSError) as error:
             self._faults["screen"] = str(error)
             return
-        for step in steps:
+        if step is not None:
             self._begin("screen", step)
 
     def finish(self) -> None:
@@ -532,25 +530,9 @@ class BackgroundHousekeeper(Housekeeper):
             self._threads["screen"].join()
         self._run("screen", self._housekeeper.finish)
 
-    def held_back(self) -> str | None:
-        """Describes the splits that are not served for a fault, or None."""
-        return self._housekeeper.held_back()
-
-    def failing_rules(self) -> tuple[str, ...]:
-        """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
-        return self._housekeeper.failing_rules()
-
-    def age_held(self) -> str | None:
-        """Describes the bags that are kept though their dates make them too old, or None."""
-        return self._housekeeper.age_held()
-
-    def unshipped(self) -> str | None:
-        """Describes the bags that were deleted before they were shipped, as they had to be."""
-        return self._housekeeper.unshipped()
-
-    def usage(self) -> tuple[int, int] | None:
-        """Returns the bytes that the budget counts, and those of them that are no recording."""
-        return self._housekeeper.usage()
+    def status(self) -> HouseStatus:
+        """Returns what the heartbeat shows."""
+        return self._housekeeper.status()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""

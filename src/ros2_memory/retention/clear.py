@@ -30,7 +30,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable
+    from collections.abc import Iterable
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
@@ -146,26 +146,23 @@ def _clear_folder(
     with os.scandir(folder) as listing:
         entries = list(listing)
     in_moments = parts[:1] == (MOMENTS_FOLDER,) and len(parts) <= 2
-    has_bags = in_moments or any(_is_bag(entry) for entry in entries)
-    name = "/".join(parts)
-    holds = _any if own is None else own.judge(name, identity_at(folder))
     bags = [entry for entry in entries if _is_bag(entry)]
-    going = [entry for entry in bags if holds(_bag_name(entry.name))]
+    going = bags
+    if own is not None:
+        holds = own.judge("/".join(parts), identity_at(folder))
+        going = [entry for entry in bags if holds(_bag_name(entry.name))]
     names = RECORDING_FILES if bags and going == bags else frozenset()
     if not parts:
         names |= OWN_FILES
-    for entry in going + [each for each in entries if _is_file_of(each, names)]:
+    beside = [each for each in entries if each.name in names]
+    for entry in going + [each for each in beside if each.is_file(follow_symlinks=False)]:
         _delete(folder, path, entry, cleared)
     below = [
         entry.name
         for entry in entries
         if not entry.name.startswith(".") and entry.is_dir(follow_symlinks=False)
     ]
-    return has_bags, below
-
-
-def _is_file_of(entry: os.DirEntry[str], names: Collection[str]) -> bool:
-    return entry.name in names and entry.is_file(follow_symlinks=False)
+    return in_moments or bool(bags), below
 
 
 def _remove_emptied(root: Path, emptied: Iterable[Path], cleared: Cleared) -> None:
@@ -199,10 +196,6 @@ def _delete(folder: int, path: Path, entry: os.DirEntry[str], cleared: Cleared) 
     else:
         cleared.files += 1
         cleared.bytes += size
-
-
-def _any(_: str) -> bool:
-    return True
 
 
 def _bag_name(name: str) -> str:

@@ -51,7 +51,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.delete import repair_name
 from ros2_memory.retention.repair import open_files
-from ros2_memory.retention.rewriting import Identity, left_in, replace_file, rewritten
+from ros2_memory.retention.rewriting import Identity, beside, left_in, replace_file, rewritten
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -363,13 +363,9 @@ class Eraser:
         """Puts a new file in place of one name of the old one."""
         with directories.opened(self._bag_dir, path.parent) as folder:
             here = Path(f"/proc/self/fd/{folder}", path.name)
-            beside = here.with_name(repair_name(path.name))
-            beside.unlink(missing_ok=True)
-            os.link(new, beside, follow_symlinks=False)
-            try:
-                replace_file(beside, here, inode)
-            finally:
-                beside.unlink(missing_ok=True)
+            with beside(here) as name:
+                os.link(new, name, follow_symlinks=False)
+                replace_file(name, here, inode)
 
     def _clear_sidecar(self, path: Path, ids: Ids) -> None:
         """Takes messages of a file out of the sidecar in its folder.

@@ -27,7 +27,6 @@ from ros2_memory.bag_dir.layout import (
     other_form,
     split_number,
 )
-from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
@@ -202,10 +201,7 @@ class Inventory:
 
     def _judge(self, recording: str) -> Callable[[str], bool]:
         """Returns what decides by its name whether a bag in a directory may be deleted."""
-        own = self._own
-        if own is None:
-            return lambda _: True
-        return own.judge(own.name_of(recording), known_identity(recording))
+        return (lambda _: True) if self._own is None else self._own.judge_of(recording)
 
     def _is_new(self, bag: StoredBag, named: Collection[str]) -> bool:
         """Whether a bag that is not listed as own counts: it is listed moments after it appears."""

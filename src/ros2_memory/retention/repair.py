@@ -8,7 +8,6 @@ name of the original, which is left as it is in every other case.
 from __future__ import annotations
 
 import os
-import shutil
 import stat
 from contextlib import suppress
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention.delete import repair_name
+from ros2_memory.retention.rewriting import beside, give_attributes
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -109,17 +108,11 @@ class Repairer:
     def _rewrite(
         self, path: Path, before: os.stat_result, progress: Callable[[int], None] | None
     ) -> Repaired:
-        beside = path.with_name(repair_name(path.name))
-        beside.unlink(missing_ok=True)
-        try:
-            rewritten = self._writer.rewrite(path, beside, progress)
-            _copy_attributes(beside, before)
+        with beside(path) as new:
+            rewritten = self._writer.rewrite(path, new, progress)
+            give_attributes(new, before, before.st_mtime_ns)
             _require_same(path, before)
-            beside.replace(path)
-        except BaseException:
-            with suppress(OSError):
-                beside.unlink(missing_ok=True)
-            raise
+            new.replace(path)
         flush(path.parent)
         return Repaired(before.st_size, path.stat().st_size, rewritten)
 
@@ -154,11 +147,3 @@ def _require_same(path: Path, before: os.stat_result) -> None:
     for each in ("st_ino", "st_size", "st_mtime_ns"):
         if getattr(after, each) != getattr(before, each):
             raise BagError(str(path), "it was written to while it was being repaired")
-
-
-def _copy_attributes(path: Path, model: os.stat_result) -> None:
-    """Gives a file the mode, the owner and the times of another."""
-    path.chmod(stat.S_IMODE(model.st_mode))
-    with suppress(OSError):
-        shutil.chown(path, model.st_uid, model.st_gid)
-    os.utime(path, ns=(model.st_atime_ns, model.st_mtime_ns))

@@ -26,6 +26,30 @@ Identity = tuple[int, int]
 
 
 @contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Yields a name beside a bag for its new content; nothing has that name after the block.
+
+    Raises:
+        OSError: what an interrupted block left under that name cannot be deleted.
+    """
+    new = path.with_name(repair_name(path.name))
+    new.unlink(missing_ok=True)
+    try:
+        yield new
+    finally:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+
+
+def give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
+    """Gives a file the mode and, where that is allowed, the owner of another; and its times."""
+    new.chmod(stat.S_IMODE(before.st_mode))
+    with suppress(OSError):
+        os.chown(new, before.st_uid, before.st_gid)
+    os.utime(new, ns=(before.st_atime_ns, mtime_ns))
+
+
+@contextmanager
 def rewritten(
     bag_dir: Path,
     path: Path,
@@ -53,21 +77,14 @@ def rewritten(
     """
     with directories.opened(bag_dir, path.parent) as folder:
         here = Path(f"/proc/self/fd/{folder}", path.name)
-        beside = here.with_name(repair_name(path.name))
-        beside.unlink(missing_ok=True)
-        try:
-            taken = writer.cut(here, beside, takes, lambda text: recounted(text, left_of))
+        with beside(here) as new:
+            taken = writer.cut(here, new, takes, lambda text: recounted(text, left_of))
             if taken != expected:
                 raise BagError(str(path), "its contents changed meanwhile")
-            beside.chmod(stat.S_IMODE(before.st_mode))
-            with suppress(OSError):
-                os.chown(beside, before.st_uid, before.st_gid)
             # A nanosecond later: nobody may take the new file for the old one.
-            os.utime(beside, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-            yield beside
-            replace_file(beside, here, (before.st_dev, before.st_ino))
-        finally:
-            beside.unlink(missing_ok=True)
+            give_attributes(new, before, before.st_mtime_ns + 1)
+            yield new
+            replace_file(new, here, (before.st_dev, before.st_ino))
 
 
 def replace_file(new: Path, path: Path, inode: Identity) -> None:

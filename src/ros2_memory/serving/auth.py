@@ -133,15 +133,13 @@ class TokenGate:
         if is_right and robots is None:
             admit(scope)
             await self._app({**scope, AUTHENTICATED: True}, receive, send)
-        elif is_right and is_health:
+        elif is_health and (is_right or not shown):
             await self._app({**scope, AUTHENTICATED: False}, receive, send)
         elif is_right and not scope["path"].startswith(_QUESTIONS):
             await _FORBIDDEN(scope, receive, send)
         elif is_right:
             admit(scope)
             await self._app({**scope, AUTHENTICATED: False, _ROBOTS: robots}, receive, send)
-        elif not shown and is_health:
-            await self._app({**scope, AUTHENTICATED: False}, receive, send)
         else:
             self._log_refused(scope, is_wrong=bool(shown))
             refusal = _unauthorized(is_wrong=bool(shown), speaks_mcp=scope["path"] == MCP_PATH)

@@ -234,19 +234,17 @@ def _stored(backfill: Backfill) -> JsonObject:
 
 
 def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
-    error, held, waits = heartbeat.last_error, heartbeat.age_held, heartbeat.waiting_for
-    unshipped = heartbeat.unshipped
     shown: JsonObject = {
         "state": str(heartbeat.state),
         "live": heartbeat.is_live(now),
         "heartbeat_age_s": seconds(now - heartbeat.updated),
         "restarts": heartbeat.restarts,
-        "last_error": None if error is None else _short(error),
+        "last_error": heartbeat.last_error and _short(heartbeat.last_error),
         "last_error_at": moment(heartbeat.last_error_at),
         "recovered": heartbeat.recovered,
-        "waiting_for": None if waits is None else _short(waits),
-        "age_held": None if held is None else _short(held),
-        "unshipped": None if unshipped is None else _short(unshipped),
+        "waiting_for": heartbeat.waiting_for and _short(heartbeat.waiting_for),
+        "age_held": heartbeat.age_held and _short(heartbeat.age_held),
+        "unshipped": heartbeat.unshipped and _short(heartbeat.unshipped),
         "failing_rules": [_short(each) for each in heartbeat.failing_rules],
         "required_missing": [_short(each) for each in heartbeat.required_missing[:_MAX_MISSING]],
         "degraded": [_short(each) for each in unrecorded(heartbeat)],

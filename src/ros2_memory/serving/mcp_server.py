@@ -305,14 +305,20 @@ class Storing:
         return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s left"
 
 
+def _request(context: object) -> Request | None:
+    """Returns the HTTP request of a call; None over stdio."""
+    request = context.request_context.request if isinstance(context, Context) else None
+    return request if isinstance(request, Request) else None
+
+
 def _client(context: object) -> Hashable:
     """Returns an identity of the client: its session, or else its address and program.
 
     None over stdio, which has one client. It serves to give out turns fairly, and nothing else: a
     client may claim to be another.
     """
-    request = context.request_context.request if isinstance(context, Context) else None
-    if not isinstance(request, Request):
+    request = _request(context)
+    if request is None:
         return None
     # The body was parsed. Starlette would keep up to 1 MiB of it for as long as the call waits.
     request._body = b""
@@ -326,14 +332,14 @@ def _client(context: object) -> Hashable:
 
 def _robots(context: object) -> frozenset[str] | None:
     """Returns the robots that the token of a request is for; None where it is for all."""
-    request = context.request_context.request if isinstance(context, Context) else None
-    return robots_of(request.scope) if isinstance(request, Request) else None
+    request = _request(context)
+    return None if request is None else robots_of(request.scope)
 
 
 def _is_page(context: object) -> bool:
     """Returns whether the server's own page asks: only browsers name the site of a request."""
-    request = context.request_context.request if isinstance(context, Context) else None
-    return isinstance(request, Request) and request.headers.get("sec-fetch-site") == "same-origin"
+    request = _request(context)
+    return request is not None and request.headers.get("sec-fetch-site") == "same-origin"
 
 
 def _listed(tool: Tool) -> ListedTool:

@@ -151,7 +151,7 @@ def web_app(
             return Response(exposition.body, headers={"content-type": exposition.content_type})
 
         routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
-    app: ASGIApp = RequestLimits(SessionIds(Starlette(routes=routes, lifespan=lifespan)))
+    app: ASGIApp = RequestLimits(Starlette(routes=routes, lifespan=lifespan))
     if needs_token:
         app = TokenGate(app, api_token, limited=limited)
     if page is not None:
@@ -176,6 +176,12 @@ class McpEndpoint:
 
     A reply by JSON is one message, so notifications have no place in it. `RequestLimits` has read
     the body, so the first message holds all of it.
+
+    It names each conversation, for clients that require a session: a server may name one in its
+    reply to `initialize`, and clients then send that name along (MCP specification, streamable
+    HTTP, session management). Nothing is stored under it: a call needs no earlier one. Names of
+    before a restart, of another server, or none at all are answered alike, and clients that never
+    end their session cost nothing.
     """
 
     def __init__(self, plain: ASGIApp, streaming: ASGIApp) -> None:
@@ -184,17 +190,26 @@ class McpEndpoint:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
-        if scope["method"] != "POST" or _EVENTS not in Headers(scope=scope).get("accept", ""):
+        if scope["method"] != "POST":
             await self._plain(scope, receive, send)
             return
-        first = await receive()
-        unread = [first]
+        headers = Headers(scope=scope)
+        unread = [await receive()]
+        body = unread[0].get("body", b"")
+        begins = _SESSION_HEADER not in headers and _INITIALIZE in body
 
         async def receive_again() -> Message:
             return unread.pop() if unread else await receive()
 
-        app = self._streaming if _PROGRESS in first.get("body", b"") else self._plain
-        await app(scope, receive_again, send)
+        async def send_named(message: Message) -> None:
+            is_start = message["type"] == "http.response.start"
+            if begins and is_start and message["status"] == _OK:
+                MutableHeaders(scope=message)[_SESSION_HEADER] = uuid.uuid4().hex
+            await send(message)
+
+        streams = _EVENTS in headers.get("accept", "") and _PROGRESS in body
+        app = self._streaming if streams else self._plain
+        await app(scope, receive_again, send_named)
 
 
 class WebApp:
@@ -270,40 +285,3 @@ class _OpenRequest:
         if not self._is_ended:
             self._has_begun = True
             await self._send(message)
-
-
-class SessionIds:
-    """Names each conversation over streamable HTTP, for clients that require a session.
-
-    The transport lets a server name a session in its reply to `initialize`, and clients then send
-    that name along (MCP specification, streamable HTTP, session management). Nothing is stored
-    under it: a call needs no earlier one. Names of before a restart, of another server, or none at
-    all are answered alike, and clients that never end their session cost nothing.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles an ASGI connection."""
-        is_post = scope["type"] == "http" and scope["method"] == "POST"
-        has_session = any(name == _SESSION_HEADER.encode() for name, _ in scope.get("headers", ()))
-        if not is_post or scope["path"] != MCP_PATH or has_session:
-            await self._app(scope, receive, send)
-            return
-        initializes = False
-
-        async def receive_watched() -> Message:
-            nonlocal initializes
-            message = await receive()
-            # `initialize` is short, so the first chunk of the body holds it.
-            initializes = initializes or _INITIALIZE in message.get("body", b"")
-            return message
-
-        async def send_named(message: Message) -> None:
-            is_start = message["type"] == "http.response.start"
-            if initializes and is_start and message["status"] == _OK:
-                MutableHeaders(scope=message)[_SESSION_HEADER] = uuid.uuid4().hex
-            await send(message)
-
-        await self._app(scope, receive_watched, send_named)

@@ -1,17 +1,32 @@
-"""A rule: what makes it fire, and what is then kept. Pure."""
+"""A rule: what makes it fire, and what is then kept. Pure.
+
+When it fires is a fold over messages in order of time, with its state carried on.
+
+A match begins with a message that meets the condition, and ends as a sighting does: with a message
+of the topic that does not, or where the topic is silent for longer than `SILENCE_NS`; on a latched
+topic, whose publisher sends only when something changes, a silence ends nothing. It ends at a gap,
+where the recorder did not run on. A message that cannot be decoded neither begins nor ends one.
+
+A rule fires once in each match: when it begins, or once it has held for as long as the rule asks.
+A silence begins with the last message of a topic that had one since the last gap.
+
+How the stream is cut into calls changes nothing: `reach` says only how far it is known.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.bag_dir.state_files import RunRecord
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, MutableMapping
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.timebase import Ns
@@ -68,3 +83,76 @@ class Rule:
     def window(self, first: Ns, fired: Ns) -> TimeWindow:
         """Returns what is kept of a match that began at `first` and made the rule fire."""
         return TimeWindow(max(first - self.before, MIN_NS + 1), min(fired + self.after, MAX_NS - 1))
+
+
+class Firing(NamedTuple):
+    """A rule fired at a log time, for a match that began at `first` on a topic."""
+
+    rule: str
+    topic: str
+    first: Ns
+    at: Ns
+
+
+class RuleFold:
+    """The state of one rule.
+
+    Args:
+        rule: a rule over messages or silences.
+        runs: the matches that go on, by topic, changed in place; for a silence, since when each
+            topic is silent.
+    """
+
+    def __init__(self, rule: Rule, runs: MutableMapping[str, RunRecord]) -> None:
+        self._rule = rule
+        self._runs = runs
+        self._silences = rule.kind is RuleKind.SILENT
+
+    def take(
+        self, topic: str, time: Ns, *, matches: bool | None, latched: bool = False
+    ) -> Firing | None:
+        """Takes the next message; `matches` is None where it cannot be decoded."""
+        run = self._runs.get(topic)
+        if run is not None and time < run.last - SILENCE_NS:
+            run = None  # the clock was set back
+        if self._silences:
+            fired = None if run is None else self._fire(topic, run, time)
+            spoke = time if run is None else max(time, run.last)
+            self._runs[topic] = RunRecord(spoke, spoke)
+            return fired
+        fired = None
+        if run is not None and run.lasts:
+            # Its value held until now, whatever it is from now on.
+            fired = self._fire(topic, run, time)
+        elif run is not None and abs(time - run.last) > SILENCE_NS:
+            run = None
+        if matches is False:
+            run = None
+        elif matches and run is None:
+            run = RunRecord(time, time, lasts=latched)
+        if run is None:
+            self._runs.pop(topic, None)
+            return fired
+        self._runs[topic] = run
+        run.last = max(run.last, time)
+        if matches:
+            fired = fired or self._fire(topic, run, time)
+        return fired
+
+    def reach(self, until: Ns) -> Iterator[Firing]:
+        """Yields what fires because nothing more came before a moment."""
+        for topic, run in self._runs.items():
+            if self._silences or run.lasts:
+                fired = self._fire(topic, run, until)
+                if fired is not None:
+                    yield fired
+
+    def end(self) -> None:
+        """Ends what goes on: the recorder did not run on."""
+        self._runs.clear()
+
+    def _fire(self, topic: str, run: RunRecord, time: Ns) -> Firing | None:
+        if run.fired or time - run.first < self._rule.hold:
+            return None
+        run.fired = True
+        return Firing(self._rule.name, topic, run.first, run.first + self._rule.hold)

@@ -18,8 +18,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.triggers.fold import RuleFold
-from ros2_memory.triggers.rules import RuleKind
+from ros2_memory.triggers.rules import RuleFold, RuleKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,8 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
-    from ros2_memory.triggers.fold import Firing
-    from ros2_memory.triggers.rules import Rule
+    from ros2_memory.triggers.rules import Firing, Rule
     from ros2_memory.triggers.splits import SearchChain, SearchPart
 
 _BURST_NS: Final[Ns] = 5 * NS_PER_S

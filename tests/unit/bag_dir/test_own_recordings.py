@@ -109,9 +109,7 @@ class TestWhatARecorderLists:
         world.supervisor.stop()
 
     def test_both_recordings_of_a_handover(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(60)
+        world = World(tmp_path, session_duration_s=20).started(60)
         world.supervisor.stop()
         made = [each.directory for each in world.recorders if each.directory.exists()]
         assert len(made) > 2
@@ -119,9 +117,7 @@ class TestWhatARecorderLists:
         assert all(own.owns(directory) for directory in made)
 
     def test_one_whose_child_dies_at_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(0.25)
+        world = World(tmp_path).started(0.25)
         world.recorders[0].die()
         world.run(1)
         assert OwnRecordings(tmp_path).owns(world.recorders[0].directory)
@@ -146,9 +142,7 @@ class TestWhatARecorderLists:
     def test_a_list_that_is_deleted_while_recording_is_written_again_whole(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(5)
+        world = World(tmp_path, session_duration_s=20).started(5)
         shutil.rmtree(tmp_path / ".episodic")
         world.run(40)
         world.supervisor.stop()
@@ -429,9 +423,7 @@ class TestWithoutAList:
         assert not events_named(logs, "recordings_not_adopted")
 
     def test_what_is_being_recorded_stays_the_recorders(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(15)
+        world = World(tmp_path).started(15)
         (tmp_path / LIST_FILE).unlink()
         world.run(0.5)
         recording = world.recorders[0].directory
@@ -470,9 +462,7 @@ class TestBags:
         assert not claimed(tmp_path).owns_bag(tmp_path / A / name)
 
     def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=40)
-        world.supervisor.start()
-        world.run(25)
+        world = World(tmp_path, session_duration_s=40).started(25)
         foreign = embedding(world.recorders[0].directory / "x_0.mcap", None)
         last = embedding(foreign.with_name(f"{foreign.parent.name}_99.mcap"), None)
         world.run(40)

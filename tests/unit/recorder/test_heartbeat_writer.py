@@ -22,9 +22,7 @@ def no_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_recorders_that_had_to_be_restarted_are_counted_and_rotations_are_not(
     tmp_path: Path,
 ) -> None:
-    world = World(tmp_path, session_duration_s=20)
-    world.supervisor.start()
-    world.run(60)
+    world = World(tmp_path, session_duration_s=20).started(60)
     assert len(world.recorders) > 1
     assert world.heartbeat()["restarts"] == 0
     for times in (1, 2):
@@ -59,9 +57,7 @@ def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
 
 
 def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path) -> None:
-    world = World(tmp_path)
-    world.supervisor.start()
-    world.run(20)
+    world = World(tmp_path).started(20)
     world.running[0].die()
     world.run(0.25)
     beat = world.heartbeat()
@@ -75,8 +71,7 @@ def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path
 
 def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
     housekeeper = PlayedHousekeeper()
-    world = World(tmp_path, housekeeper=housekeeper)
-    world.supervisor.start()
+    world = World(tmp_path, housekeeper=housekeeper).started()
     housekeeper.failed = {"apply": "the list cannot be read"}
     world.run(30)
     assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (

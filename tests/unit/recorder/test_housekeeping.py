@@ -120,11 +120,11 @@ class TestRetention:
             keeper.apply()
             assert (old.exists(), clock.call_count) == (True, 2)
             [held] = events(captured, "age_held")
-            assert (held["bags"], held["reason"]) == (1, keeper.age_held())
+            assert (held["bags"], held["reason"]) == (1, keeper.status().age_held)
             assert "1 bag is older than 2 h" in held["reason"]
             clock.return_value = True
             keeper.apply()
-        assert (old.exists(), young.exists(), keeper.age_held()) == (False, True, None)
+        assert (old.exists(), young.exists(), keeper.status().age_held) == (False, True, None)
         assert len(events(captured, "age_no_longer_held")) == 1
         keeper.apply()
         assert clock.call_count == 3
@@ -142,7 +142,7 @@ class TestRetention:
         keeper.apply()
         assert not (tmp_path / "a").exists()
         assert all(each.exists() for each in young)
-        assert keeper.unshipped() is None
+        assert keeper.status().unshipped is None
 
     def test_what_the_budget_deletes_unshipped_is_counted_and_named(self, tmp_path: Path) -> None:
         old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 3 * 3600)
@@ -153,10 +153,10 @@ class TestRetention:
             keeper.apply()
             [lost] = events(captured, "unshipped_deleted")
             assert (lost["bags"], lost["names"]) == (2, ["a/a_0.mcap", "a/a_2.mcap"])
-            assert lost["reason"] == keeper.unshipped()
+            assert lost["reason"] == keeper.status().unshipped
             assert "2 bags were deleted unshipped" in lost["reason"]
         assert all(each.exists() for each in new)
-        assert BackgroundHousekeeper(keeper).unshipped() == keeper.unshipped()
+        assert BackgroundHousekeeper(keeper).status().unshipped == keeper.status().unshipped
 
     def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
         self, tmp_path: Path
@@ -337,13 +337,14 @@ class TestDeletionsThatFail:
         (tmp_path / ".episodic").mkdir()
         (tmp_path / ".episodic/catalogue.sqlite-wal").write_bytes(bytes(4_200_000))
         keeper = keeper_of(tmp_path, max_bytes=1_000_000)
-        assert keeper.usage() is None
+        assert keeper.status().counted_bytes is None
         with structlog.testing.capture_logs() as captured:
             keeper.apply()
         (reported,) = events(captured, "budget_not_held")
         assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
-        assert keeper.usage() == (size_of(tmp_path), 4_200_000)
-        assert BackgroundHousekeeper(keeper).usage() == keeper.usage()
+        status = keeper.status()
+        assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
+        assert BackgroundHousekeeper(keeper).status() == status
 
 
 @contextmanager

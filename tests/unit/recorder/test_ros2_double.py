@@ -1,4 +1,4 @@
-"""The parts of the double of `ros2 bag record` that need no ROS: its options and its files."""
+"""What the double of `ros2 bag record` writes, which needs no ROS."""
 
 from __future__ import annotations
 
@@ -9,91 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from tests.ros2_double.arguments import DISTROS, RefusedError, options, parser
 from tests.ros2_double.bag import Bag, Writing
 from tests.ros2_double.mcap_file import Layout, McapFile
 from tests.ros2_double.metadata import Topic
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    pass
 
 SECOND = 10**9
-COMMON = {
-    "--regex",
-    "--output",
-    "--storage",
-    "--max-bag-duration",
-    "--max-cache-size",
-    "--storage-config-file",
-    "--storage-preset-profile",
-    "--qos-profile-overrides-path",
-    "--compression-mode",
-    "--include-hidden-topics",
-    "--use-sim-time",
-}
-SINCE_JAZZY = {"--topics", "--node-name", "--custom-data", "--disable-keyboard-controls"}
-SINCE_LYRICAL = {"--repeat-transient-local", "--max-bag-files", "--max-cache-duration"}
-
-
-@pytest.mark.parametrize(
-    ("distro", "has", "lacks"),
-    [
-        ("humble", COMMON, SINCE_JAZZY | SINCE_LYRICAL),
-        ("jazzy", COMMON | SINCE_JAZZY, SINCE_LYRICAL),
-        ("kilted", COMMON | SINCE_JAZZY, SINCE_LYRICAL),
-        ("lyrical", COMMON | SINCE_JAZZY | SINCE_LYRICAL, set[str]()),
-    ],
-)
-def test_the_help_lists_the_options_of_its_distribution(
-    distro: str, has: set[str], lacks: set[str]
-) -> None:
-    listed = set(parser(distro).format_help().replace("[", " ").replace(",", " ").split())
-    assert listed >= has
-    assert not listed & lacks
-
-
-@pytest.mark.parametrize("distro", DISTROS)
-def test_an_option_that_the_distribution_lacks_exits_with_2(
-    distro: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        options(distro, ["-o", str(tmp_path / "a"), "-e", "/odom", "--no-such-option"])
-    assert ended.value.code == 2
-    assert "unrecognized arguments: --no-such-option" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("distro", ["humble", "jazzy", "kilted"])
-def test_topics_may_be_given_by_position(distro: str, tmp_path: Path) -> None:
-    given_options = options(distro, ["-o", str(tmp_path / "a"), "/odom", "/tf"])
-    assert given_options.topics == ("/odom", "/tf")
-
-
-def test_lyrical_takes_no_topics_by_position(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit):
-        options("lyrical", ["-o", str(tmp_path / "a"), "/odom"])
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        ["-e", "/odom", "-s", "sqlite3"],
-        ["-e", "/odom", "--compression-mode", "message", "--compression-format", "zstd"],
-        ["-e", "/odom", "--compression-format", "zstd"],
-        ["-e", "/odom", "--max-bag-files", "3"],
-        ["-e", "/odom", "--repeat-transient-local", "/tf_static=0"],
-        [],
-    ],
-)
-def test_what_the_double_does_not_do_is_refused(asked: list[str], tmp_path: Path) -> None:
-    with pytest.raises(RefusedError):
-        options("lyrical", ["-o", str(tmp_path / "a"), *asked])
-
-
-def test_the_storage_config_changes_the_chunks(tmp_path: Path) -> None:
-    file = tmp_path / "storage.yaml"
-    file.write_text("chunkSize: 16384\ncompression: Zstd\n")
-    asked = ["-o", str(tmp_path / "a"), "-e", "/odom", "--storage-config-file", str(file)]
-    assert options("jazzy", asked).layout == Layout(chunk_bytes=16384, zstd_level=1)
 
 
 @given(

@@ -51,8 +51,7 @@ class TestSessions:
         house = keeper_of(
             tmp_path, screening=screening_of(tmp_path, privacy(excludes_unknown=unknown))
         )
-        world = World(tmp_path, housekeeper=house, session_duration_s=20)
-        world.supervisor.start()
+        world = World(tmp_path, housekeeper=house, session_duration_s=20).started()
         for _ in range(12):
             world.run(5)
             gate = read_gate(tmp_path)
@@ -78,9 +77,7 @@ class TestSessions:
             raise OSError(errno.ENOSPC, "No space left on device")
 
         house = keeper_of(tmp_path, screening=screening_of(tmp_path, privacy()))
-        world = World(tmp_path, housekeeper=house, session_duration_s=20)
-        world.supervisor.start()
-        world.run(15)
+        world = World(tmp_path, housekeeper=house, session_duration_s=20).started(15)
         with monkeypatch.context() as patched:
             patched.setattr(SCREENED, "write", full)
             world.run(15)
@@ -91,9 +88,7 @@ class TestSessions:
         world.supervisor.stop()
 
     def test_without_rules_there_is_no_state(self, tmp_path: Path) -> None:
-        world = World(tmp_path, housekeeper=keeper_of(tmp_path))
-        world.supervisor.start()
-        world.run(10)
+        world = World(tmp_path, housekeeper=keeper_of(tmp_path)).started(10)
         world.supervisor.stop()
         assert not (tmp_path / SCREENED_FILE).exists()
 

@@ -19,6 +19,7 @@ from tests.support.simulated_recorders import (
     PlayedHousekeeper,
     World,
     assert_each_counts_once,
+    assert_what_stands_counts_once,
     events,
 )
 
@@ -27,8 +28,7 @@ pytestmark = pytest.mark.usefixtures("no_flushing")
 
 class TestDeath:
     def test_a_recorder_that_dies_is_replaced_after_a_growing_wait(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
+        world = World(tmp_path).started()
         waits = []
         for _ in range(4):
             world.run(2)
@@ -40,8 +40,7 @@ class TestDeath:
         assert waits == [1, 2, 4, 8]
 
     def test_waits_grow_until_a_good_split_was_written(self, tmp_path: Path) -> None:
-        world = World(tmp_path, split_duration_s=100)
-        world.supervisor.start()
+        world = World(tmp_path, split_duration_s=100).started()
         waits = []
         # Each of the first lives for longer than a minute and closes nothing.
         for lives_s in (70, 70, 70, 110, 70):
@@ -54,9 +53,7 @@ class TestDeath:
         assert waits == [1, 2, 4, 1, 2]
 
     def test_it_is_reported_with_its_last_words(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(2)
+        world = World(tmp_path).started(2)
         world.recorders[0].lines.append("terminate called after throwing")
         world.recorders[0].die(-6)
         with capture_logs() as logs:
@@ -69,9 +66,7 @@ class TestDeath:
 
     def test_one_that_hangs_and_must_be_killed_counts_as_a_restart(self, tmp_path: Path) -> None:
         house = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=house)
-        world.supervisor.start()
-        world.run(12)
+        world = World(tmp_path, housekeeper=house).started(12)
         hung = world.recorders[0]
         hung.deaf, hung.ends_with = True, -9
         stopped = world.wall
@@ -97,9 +92,7 @@ class TestDeath:
         assert len(events(logs, "recorder_not_ready")) == 1
 
     def test_a_new_one_that_does_not_begin_never_takes_over(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(19)
+        world = World(tmp_path, session_duration_s=20).started(19)
         world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
         world.run(125)
         old, new = world.recorders[:2]
@@ -116,17 +109,13 @@ class TestDeath:
         assert not world.recorders[0].directory.exists()
 
     def test_its_recording_is_not_named_as_open_any_more(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(2)
+        world = World(tmp_path).started(2)
         world.recorders[0].die()
         world.run(5)
         assert world.heartbeat()["recordings"] == [world.recorders[1].directory.name]
 
     def test_a_new_one_that_dies_in_a_handover_counts_for_nothing(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(22.5)
+        world = World(tmp_path, session_duration_s=20).started(22.5)
         old, new = world.recorders
         new.die()
         world.run(1)
@@ -142,30 +131,24 @@ class TestDeath:
     def test_an_old_one_that_dies_in_a_handover_counts_as_far_as_it_reaches(
         self, tmp_path: Path, after_s: float
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(after_s)
+        world = World(tmp_path, session_duration_s=20).started(after_s)
         old, new = world.recorders
         old.die()
         world.run(12)
         assert new.status is None
         assert world.supervisor.is_recording
         world.supervisor.stop()
-        stands, counts = world.published(counting=False), world.published(counting=True)
-        assert counts == dict.fromkeys(stands, 1)
+        assert_what_stands_counts_once(world)
 
     @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.5, 23.25, 23.75, 24.0])
     def test_after_a_crash_of_everything_the_next_start_settles_the_handover(
         self, tmp_path: Path, after_s: float
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(after_s)
+        world = World(tmp_path, session_duration_s=20).started(after_s)
         for recorder in world.running:
             recorder.die()
         recover_handovers(tmp_path, world.reader)
-        stands, counts = world.published(counting=False), world.published(counting=True)
-        assert counts == dict.fromkeys(stands, 1)
+        assert_what_stands_counts_once(world)
 
 
 class FailingDisk:
@@ -187,9 +170,7 @@ class TestFailingDisk:
     def test_a_restart_whose_name_cannot_be_looked_up_is_tried_again(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path).started(3)
         world.recorders[0].die()
         known = [recorder.directory for recorder in world.recorders]
         disk = FailingDisk(
@@ -206,9 +187,7 @@ class TestFailingDisk:
     def test_a_rotation_whose_name_cannot_be_looked_up_is_tried_again(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(18)
+        world = World(tmp_path, session_duration_s=20).started(18)
         known = [recorder.directory for recorder in world.recorders]
         disk = FailingDisk(
             monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
@@ -225,9 +204,7 @@ class TestFailingDisk:
     def test_a_handover_is_given_up_where_the_new_directory_cannot_be_found_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(20.75)
+        world = World(tmp_path, session_duration_s=20).started(20.75)
         old, new = world.recorders
         new.die()
         FailingDisk(monkeypatch, lambda path: path == new.directory)
@@ -239,9 +216,7 @@ class TestFailingDisk:
     def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path).started(3)
 
         def fails(_path: Path) -> Closing:
             raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
@@ -257,9 +232,7 @@ class TestFailingDisk:
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         keeper = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=keeper)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path, housekeeper=keeper).started(3)
 
         def fails() -> list[str]:
             raise OSError(errno.EIO, os.strerror(errno.EIO))

@@ -25,9 +25,7 @@ class TestRecordedTime:
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(20)
+        world = World(tmp_path, housekeeper=housekeeping).started(20)
         names, written, at_s = housekeeping.recorded[-1]
         assert [*names] == world.heartbeat()["recordings"]
         assert (written > 0, at_s) == (True, max(each[2] for each in housekeeping.recorded))
@@ -78,9 +76,7 @@ class TestSpace:
     ) -> None:
         housekeeping = PlayedHousekeeper()
         housekeeping.making = True
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path, housekeeper=housekeeping).started(3)
         world.free = 600
         world.run(200)
         assert housekeeping.asked.count("room 1200") == 1
@@ -92,9 +88,7 @@ class TestSpace:
     def test_room_that_was_made_too_little_has_recording_pause(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         housekeeping.making = True
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path, housekeeper=housekeeping).started(3)
         world.free = 600
         world.run(3)
         housekeeping.making = False
@@ -136,18 +130,14 @@ class TestSpace:
 
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20)
-        world.supervisor.start()
-        world.run(22.25)
+        world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20).started(22.25)
         world.free = 900
         world.run(3)
         assert world.running == []
         assert_each_counts_once(world)
 
     def test_a_split_that_stays_empty_is_reported(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(8)
+        world = World(tmp_path).started(8)
         world.disk_full = True
         with capture_logs() as logs:
             world.run(30)
@@ -171,9 +161,7 @@ class TestUnmounted:
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path / "bags", housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path / "bags", housekeeper=housekeeping).started(3)
         self.unmounted(world)
         with capture_logs() as logs:
             world.run(200)
@@ -185,9 +173,7 @@ class TestUnmounted:
         assert list(world.bag_dir.iterdir()) == []
 
     def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags")
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path / "bags").started(3)
         aside = self.unmounted(world)
         world.run(20)
         shutil.rmtree(world.bag_dir)
@@ -204,9 +190,7 @@ class TestUnmounted:
         assert "has been unmounted" in beat["last_error"]
 
     def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags")
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path / "bags").started(3)
         for _ in range(5):
             aside = self.unmounted(world)
             world.run(1)
@@ -219,13 +203,11 @@ class TestUnmounted:
 
 
 class TestHouse:
-    def test_what_failed_while_nobody_waited_is_reported_once_and_in_the_heartbeat(
+    def test_what_failed_is_reported_once_and_in_the_heartbeat_and_stops_nothing(
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(3)
+        world = World(tmp_path, housekeeper=housekeeping).started(3)
         housekeeping.failed = {"make_room": "the oldest bags cannot be deleted"}
         with capture_logs() as logs:
             world.run(130)
@@ -235,12 +217,11 @@ class TestHouse:
             "the oldest bags cannot be deleted",
         )
         assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
+        assert world.supervisor.is_recording
 
     def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        world.run(31)
+        World(tmp_path, housekeeper=housekeeping).started(31)
         assert housekeeping.asked.count("apply") == 3
 
     def test_it_is_kept_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
@@ -250,16 +231,6 @@ class TestHouse:
         world.supervisor.start()
         world.run(130)
         assert housekeeping.asked.count("apply") == 2
-
-    def test_what_goes_wrong_there_is_reported_once_and_stops_nothing(self, tmp_path: Path) -> None:
-        housekeeping = PlayedHousekeeper()
-        housekeeping.failed = {"apply": "the catalogue is locked"}
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.supervisor.start()
-        with capture_logs() as logs:
-            world.run(60)
-        assert len([each for each in logs if "catalogue is locked" in str(each)]) == 1
-        assert world.supervisor.is_recording
 
 
 def test_a_bag_directory_that_is_a_file_is_called_one(tmp_path: Path) -> None:

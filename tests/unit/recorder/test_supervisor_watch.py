@@ -10,16 +10,14 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.recorder.shortfall import Required
-from tests.support.simulated_recorders import World, events
+from tests.support.simulated_recorders import World, assert_what_stands_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
 
 class TestWatch:
     def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(18)
+        world = World(tmp_path).started(18)
         world.silent = True
         with capture_logs() as logs:
             world.run(300)
@@ -33,15 +31,12 @@ class TestWatch:
         world.run(100)
         assert len(world.recorders) == 3
         world.supervisor.stop()
-        stands, counts = world.published(counting=False), world.published(counting=True)
-        assert counts == dict.fromkeys(stands, 1)
+        assert_what_stands_counts_once(world)
 
     def test_a_directory_that_vanished_is_reported_and_recording_goes_on_elsewhere(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(8)
+        world = World(tmp_path).started(8)
         shutil.rmtree(world.recorders[0].directory)
         with capture_logs() as logs:
             world.run(4)
@@ -51,9 +46,7 @@ class TestWatch:
 
     def test_a_bag_directory_that_vanished_is_made_again(self, tmp_path: Path) -> None:
         bag_dir = tmp_path / "bags"
-        world = World(bag_dir)
-        world.supervisor.start()
-        world.run(8)
+        world = World(bag_dir).started(8)
         shutil.rmtree(bag_dir)
         world.run(5)
         assert world.supervisor.is_recording
@@ -63,9 +56,7 @@ class TestWatch:
     def test_a_directory_that_vanished_in_a_handover_leaves_the_other(
         self, tmp_path: Path, loser: str
     ) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(22)
+        world = World(tmp_path, session_duration_s=20).started(22)
         old, new = world.recorders
         shutil.rmtree((old if loser == "old" else new).directory)
         world.run(2)
@@ -74,8 +65,7 @@ class TestWatch:
         assert not read_handover(kept.directory).handover.hides_all
         world.run(20)
         world.supervisor.stop()
-        stands, counts = world.published(counting=False), world.published(counting=True)
-        assert counts == dict.fromkeys(stands, 1)
+        assert_what_stands_counts_once(world)
 
     def test_topics_that_brought_nothing_in_a_whole_recording_are_reported(
         self, tmp_path: Path
@@ -101,9 +91,7 @@ class TestWatch:
         assert "UDPv4" in str(reported["reason"])
 
     def test_a_warning_that_repeats_is_reported_once_for_each_topic(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(2)
+        world = World(tmp_path).started(2)
         with capture_logs() as logs:
             for number in range(40):
                 world.recorders[0].lines += [
@@ -116,9 +104,7 @@ class TestWatch:
         assert "/cam2" in str(world.heartbeat()["last_error"])
 
     def test_a_refused_publisher_is_reported_with_what_it_means(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(2)
+        world = World(tmp_path).started(2)
         world.recorders[0].lines.append(
             "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
             "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
@@ -134,9 +120,7 @@ class TestWatch:
 
 class TestHeartbeat:
     def test_it_comes_every_five_seconds(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(5)
+        world = World(tmp_path).started(5)
         moments = set()
         for _ in range(80):
             world.run(0.25)
@@ -144,9 +128,7 @@ class TestHeartbeat:
         assert len(moments) == 4
 
     def test_a_change_is_reported_at_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(7)
+        world = World(tmp_path).started(7)
         world.recorders[0].die()
         world.run(0.25)
         beat = world.heartbeat()
@@ -155,9 +137,7 @@ class TestHeartbeat:
     def test_one_that_cannot_be_written_is_reported_once_and_recording_goes_on(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(2)
+        world = World(tmp_path).started(2)
         (tmp_path / ".recorder.json.tmp").mkdir()
         with capture_logs() as logs:
             world.run(20)
@@ -165,8 +145,7 @@ class TestHeartbeat:
         assert world.supervisor.is_recording
 
     def test_bytes_count_recordings_that_ended_too(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
+        world = World(tmp_path, session_duration_s=20).started()
         sizes = []
         for _ in range(12):
             world.run(5)
@@ -179,8 +158,7 @@ class TestHeartbeat:
 
 class TestOffers:
     def test_a_topic_that_nobody_offers_is_named_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path, expected=("/bumper", "/lidar"))
-        world.supervisor.start()
+        world = World(tmp_path, expected=("/bumper", "/lidar")).started()
         with capture_logs() as logs:
             world.run(29)
             assert not events(logs, "topic_not_offered")
@@ -188,9 +166,7 @@ class TestOffers:
         assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/lidar"]]
 
     def test_nodes_that_have_gone_are_reported_until_they_come_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path, subscribe_timeout_s=6)
-        world.supervisor.start()
-        world.run(12)
+        world = World(tmp_path, subscribe_timeout_s=6).started(12)
         world.silent, world.defaults = True, {"topics": ()}
         with capture_logs() as logs:
             world.run(90)
@@ -229,9 +205,7 @@ class TestWaiting:
         assert "no publisher offers any of the listed topics" in beat["waiting_for"]
 
     def test_what_fell_silent_later_is_not_waited_for(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20)
-        world.supervisor.start()
-        world.run(12)
+        world = World(tmp_path, session_duration_s=20).started(12)
         world.silent = True
         world.run(120)
         assert len(world.recorders) > 2
@@ -262,9 +236,7 @@ class TestWaiting:
 
 
 def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> None:
-    world = World(tmp_path, expected=("/bumper", "/door", "/grip", "/arm"))
-    world.supervisor.start()
-    world.run(2)
+    world = World(tmp_path, expected=("/bumper", "/door", "/grip", "/arm")).started(2)
     world.recorders[0].lines.append(
         "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
     )
@@ -317,9 +289,7 @@ class TestShortfall:
     def test_a_regular_topic_that_stops_is_silent_until_it_comes(
         self, tmp_path: Path, still: tuple[str, ...]
     ) -> None:
-        world = World(tmp_path)
-        world.supervisor.start()
-        world.run(60)
+        world = World(tmp_path).started(60)
         assert world.heartbeat()["fell_silent"] == []
         world.running[-1].heard = still
         world.defaults["heard"] = still
@@ -347,9 +317,7 @@ class TestShortfall:
 
     def test_required_topics_are_missed_by_name_and_rate(self, tmp_path: Path) -> None:
         required = [Required("/bumper", 3.0), Required("/d*", 5.0), Required("/never")]
-        world = World(tmp_path, required=required)
-        world.supervisor.start()
-        world.run(20)
+        world = World(tmp_path, required=required).started(20)
         assert world.heartbeat()["required_missing"] == []
         world.run(40)
         rate, never = world.heartbeat()["required_missing"]
@@ -391,9 +359,7 @@ class TestShortfall:
 
 class TestChangedList:
     def test_a_changed_list_begins_a_recording_and_loses_nothing(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
-        world.supervisor.start()
-        world.run(20)
+        world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
         world.defaults |= {"topics": ("/bumper", "/lidar"), "heard": ("/bumper", "/lidar")}
         world.topics_path.write_text("topics: [/bumper, /lidar]\n")
         with capture_logs() as logs:
@@ -409,13 +375,10 @@ class TestChangedList:
         assert world.heartbeat()["fell_silent"] == []
         assert len(world.recorders) == 2
         world.supervisor.stop()
-        stands, counts = world.published(counting=False), world.published(counting=True)
-        assert counts == dict.fromkeys(stands, 1)
+        assert_what_stands_counts_once(world)
 
     def test_a_refused_list_changes_nothing_and_is_named(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags", expected=("/bumper", "/door"))
-        world.supervisor.start()
-        world.run(20)
+        world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
         before = world.heartbeat()["listed"]
         world.topics_path.write_text("topics: [no slash]\n")
         with capture_logs() as logs:

@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.triggers.fold import RuleFold
-from ros2_memory.triggers.rules import RuleKind
+from ros2_memory.triggers.rules import RuleFold, RuleKind
 from tests.support.watched_bags import S, rule
 
 if TYPE_CHECKING:
