@@ -258,8 +258,9 @@ def machine(folder: Path, env: Mapping[str, str]) -> Iterator[Machine]:
 
 @contextmanager
 def publishing(env: Mapping[str, str], *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """Publishers of numbered messages (`tests/integration/counting_publishers.py`, whose arguments)."""
-    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.counting_publishers", *arguments]
+    """Publishers of numbered messages, with arguments of `integration/counting_publishers.py`."""
+    module = "tests.integration.counting_publishers"
+    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", module, *arguments]
     known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
     process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
     try:

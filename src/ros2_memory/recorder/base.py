@@ -160,6 +160,10 @@ class Housekeeper:
         """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
         return ()
 
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return frozenset()
+
     def age_held(self) -> str | None:
         """Describes the bags that are kept although their dates make them too old, or None."""
         return None

@@ -254,6 +254,10 @@ class Housekeeping(Housekeeper):
         """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
         return () if self._screening is None else self._screening.failing_rules()
 
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return frozenset() if self._screening is None else self._screening.excluded_latched()
+
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
@@ -539,6 +543,10 @@ class BackgroundHousekeeper(Housekeeper):
     def failing_rules(self) -> tuple[str, ...]:
         """Describes each rule of `recording.exclude_when` that cannot be evaluated."""
         return self._housekeeper.failing_rules()
+
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return self._housekeeper.excluded_latched()
 
     def age_held(self) -> str | None:
         """Describes the bags that are kept though their dates make them too old, or None."""
