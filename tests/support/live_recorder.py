@@ -276,14 +276,20 @@ def number_of(payload: bytes) -> int:
     return int(struct.unpack_from("<d", payload, 4 + (12 + frame + 7) // 8 * 8)[0])
 
 
-def stall(recorder: LiveRecorder, seconds: float, *, every: bool = False) -> None:
-    """Stops its newest recorder's process for so long; `every`: all that run."""
+def stall(recorder: LiveRecorder, seconds: float, *, every: bool = False) -> tuple[float, float]:
+    """Stops its newest recorder's process for so long, or all that run; returns from when to when.
+
+    In Unix seconds.
+    """
     children = recorder.children() if every else recorder.children()[-1:]
     for child in children:
         os.kill(child.pid, signal.SIGSTOP)
+    stopped_at = time.time()
     time.sleep(seconds)  # what is injected, not waited for
+    continued_at = time.time()
     for child in children:
         os.kill(child.pid, signal.SIGCONT)
+    return stopped_at, continued_at
 
 
 @contextmanager
