@@ -4,10 +4,11 @@
 
 Each argument is a topic, its messages a second, its reliability, and more of its QoS: `latched`
 (transient local), `deadline` (of half a second) or `deep` (what waits is kept, not only the newest
-ten). Messages are geometry_msgs/PointStamped: `x` is
+ten). Messages are geometry_msgs/PoseStamped: `x` is
 the number of the message, from 0, and the header's stamp that of its tick. `--first N` begins with
 another number. `--speed N` simulates: `/clock` begins at 0 and runs N times as fast as the wall
-clock, and the topics' rates and stamps are by it. All of it ends with the process: kill it.
+clock, and the topics' rates and stamps are by it. `--log FILE` has a line for each message: topic,
+number and when it was sent (ns). All of it ends with the process: kill it.
 """
 
 from __future__ import annotations
@@ -15,10 +16,13 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import nullcontext
+from pathlib import Path
+from typing import TextIO
 
 import rclpy
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped
+from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -33,7 +37,15 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("topics", nargs="+")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--speed", type=float)
+    parser.add_argument("--log", type=Path)
     given = parser.parse_args(arguments)
+    # Whole lines: it is killed.
+    with given.log.open("w", buffering=1) if given.log else nullcontext() as log:
+        publish(given, log)
+
+
+def publish(given: argparse.Namespace, log: TextIO | None) -> None:
+    """Publishes for ever, and writes down when."""
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("counting")
     topics = []
@@ -45,7 +57,7 @@ def main(arguments: list[str]) -> None:
             profile.durability = DurabilityPolicy.TRANSIENT_LOCAL
         if "deadline" in more:
             profile.deadline = Duration(seconds=0.5)
-        topics.append((node.create_publisher(PointStamped, topic, profile), 1 / float(hz)))
+        topics.append((node.create_publisher(PoseStamped, topic, profile), 1 / float(hz)))
     clock = node.create_publisher(Clock, "/clock", 10) if given.speed else None
     speed, origin = given.speed or 1.0, time.time()
     began = 0.0 if clock else origin
@@ -59,10 +71,14 @@ def main(arguments: list[str]) -> None:
         for index, (publisher, period_s) in enumerate(topics):
             due = began + ticks[index] * period_s
             if now >= due:
-                message = PointStamped()
+                message = PoseStamped()
                 message.header.stamp = stamp(due)
-                message.point.x = float(given.first + ticks[index])
+                message.pose.position.x = float(given.first + ticks[index])
                 publisher.publish(message)
+                if log is not None:
+                    log.write(
+                        f"{publisher.topic_name} {given.first + ticks[index]} {time.time_ns()}\n"
+                    )
                 ticks[index] += 1
         time.sleep(0.001)
 

@@ -21,9 +21,8 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.integration.test_recorder_reception import publishing
 from tests.support.examples import LONG
-from tests.support.live_recorder import NS_PER_S, bag_files, machine
+from tests.support.live_recorder import NS_PER_S, bag_files, machine, number_of, publishing
 from tests.support.ros_processes import ros_environment, wait_for
 
 if TYPE_CHECKING:
@@ -84,8 +83,7 @@ def numbers(bag_dir: Path, topics: Sequence[str]) -> dict[str, Counter[int]]:
     found: dict[str, Counter[int]] = {}
     for path in bag_files(bag_dir):
         for record in reader.records(path, topics, TimeWindow.everything()):
-            point = getattr(reader.decode(record), "point")  # noqa: B009 - its type is known there
-            found.setdefault(record.channel.topic, Counter())[round(point.x)] += 1
+            found.setdefault(record.channel.topic, Counter())[number_of(record.payload)] += 1
     return found
 
 

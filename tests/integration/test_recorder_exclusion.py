@@ -8,6 +8,7 @@ import subprocess
 from typing import TYPE_CHECKING
 
 import pytest
+import yaml
 from mcap.reader import make_reader
 
 from ros2_memory.bag_dir.state_files import read_gate
@@ -50,9 +51,9 @@ def robot(site: Machine, tmp_path: Path) -> Iterator[subprocess.Popen[bytes]]:
         end(process)
 
 
-def numbers(path: Path) -> set[int]:
+def numbers(path: Path, topic: str = "/odom") -> set[int]:
     with path.open("rb") as stream:
-        found = [each.data for _, _, each in make_reader(stream).iter_messages(topics=["/odom"])]
+        found = [each.data for _, _, each in make_reader(stream).iter_messages(topics=[topic])]
     # After an empty frame_id the point follows at the next multiple of eight.
     return {int(struct.unpack_from("<d", data, 4 + 16)[0]) for data in found}
 
@@ -70,11 +71,19 @@ class Server:
             include_active=True,
         )
 
-    def finds(self) -> set[int]:
+    def finds(self, topic: str = "/odom") -> set[int]:
         found: set[int] = set()
         for bag in self._index.refresh().bags:
-            found |= numbers(bag.path)
+            found |= numbers(bag.path, topic)
         return found
+
+
+def turned(robot: subprocess.Popen[bytes], truth: Path, sign: signal.Signals) -> int:
+    """Sends the robot a signal; returns the number from which on it counts."""
+    lines = truth.read_text().splitlines()
+    robot.send_signal(sign)
+    wait_for(lambda: truth.read_text().splitlines() != lines, "a change", alive=robot)
+    return int(truth.read_text().splitlines()[-1])
 
 
 def test_nothing_of_it_is_ever_served(
@@ -88,11 +97,6 @@ def test_nothing_of_it_is_ever_served(
         "recording.split_duration_s=2",
         "recording.session_duration_s=8",
     )
-
-    def turned(count: int, sign: signal.Signals) -> int:
-        robot.send_signal(sign)
-        wait_for(lambda: len(truth.read_text().splitlines()) == count, "a change", alive=robot)
-        return int(truth.read_text().splitlines()[-1])
 
     def served(recorder: LiveRecorder, enough: Callable[[set[int]], bool], what: str) -> None:
         server = Server(recorder.bag_dir)
@@ -115,7 +119,7 @@ def test_nothing_of_it_is_ever_served(
     private = range(0)
     recorder = site.record("private", *given, topics=TOPICS)
     served(recorder, lambda found: len(found) > 100, "two seconds")
-    first = turned(2, signal.SIGUSR1)
+    first = turned(robot, truth, signal.SIGUSR1)
     private = range(first, 2**60)
     wait_for(has_excluded_a_split, "a split that is excluded", alive=recorder.process)
     recorder.wait_for("rotated", len(recorder.events("rotated")) + 1)
@@ -123,7 +127,7 @@ def test_nothing_of_it_is_ever_served(
     assert max(Server(recorder.bag_dir).finds()) < first
     recorder = site.record("private", *given, topics=TOPICS)
     wait_for(has_excluded_a_split, "another split that is excluded", alive=recorder.process)
-    last = turned(3, signal.SIGUSR2)
+    last = turned(robot, truth, signal.SIGUSR2)
     private = range(first, last)
     served(recorder, lambda found: max(found, default=0) > last + 100, "what came after it")
     recorder.stop()
@@ -136,3 +140,60 @@ def test_nothing_of_it_is_ever_served(
     assert everywhere == found
     gate = read_gate(recorder.bag_dir)
     assert not any(gate.holds_some(each.name) for each in recorder.bag_dir.glob("rec_*"))
+
+
+def test_a_latched_message_of_an_excluded_time_is_not_asked_for_again(
+    site: Machine, robot: subprocess.Popen[bytes], tmp_path: Path
+) -> None:
+    """Once a screening has seen it. The maps before and after it are in each recording."""
+    rules, truth = tmp_path / "exclusions.yaml", tmp_path / "truth"
+    rules.write_text(RULES)
+    recorder = site.record(
+        "maps",
+        f"recording.exclude_when={rules}",
+        "recording.split_duration_s=2",
+        "recording.session_duration_s=6",
+        topics=(*TOPICS, "/map"),
+    )
+    server = Server(recorder.bag_dir)
+    private: set[int] = set()
+
+    def rotate(times: int, until: Callable[[], bool]) -> list[str]:
+        """Waits for rotations, of which the last ones began when it was so; returns these."""
+        asked: list[str] = []
+        seen = {each["next"] for each in recorder.events("rotation_begun")}
+
+        def is_over() -> bool:
+            assert not private & server.finds("/map"), "a private map is served"
+            for each in recorder.events("rotation_begun"):
+                if each["next"] not in seen:
+                    seen.add(each["next"])
+                    asked[:] = [*asked, each["next"]] if until() else []
+            return len(asked) >= times
+
+        wait_for(is_over, "rotations", timeout_s=2 * PATIENCE_S, alive=recorder.process)
+        recorder.wait_for("rotated", next=asked[-1])
+        return asked
+
+    def asks_for_maps() -> bool:
+        profiles = yaml.safe_load((recorder.bag_dir / "recorder.qos.yaml").read_text())
+        return bool(profiles.get("/map", {}).get("durability") == "transient_local")
+
+    # From when on the mode is known.
+    wait_for(server.finds, "what is served", timeout_s=PATIENCE_S, alive=recorder.process)
+    public = {turned(robot, truth, signal.SIGHUP)}
+    again = rotate(2, asks_for_maps)
+    private = {turned(robot, truth, signal.SIGUSR1)}
+    turned(robot, truth, signal.SIGUSR2)
+    without = rotate(3, lambda: not asks_for_maps())
+    later = turned(robot, truth, signal.SIGHUP)
+    again += rotate(2, asks_for_maps)
+    recorder.stop()
+    assert server.finds("/map") == {*public, later}
+    maps: dict[str, set[int]] = {}
+    for bag in recorder.bag_dir.glob("rec_*/*.mcap"):
+        maps[bag.parent.name] = maps.get(bag.parent.name, set()) | numbers(bag, "/map")
+    assert not private & set[int]().union(*maps.values())
+    assert all(maps[name] for name in again)
+    # The last of them may still have recorded when it was made.
+    assert all(maps[name] <= {later} for name in without)

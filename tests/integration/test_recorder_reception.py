@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import struct
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +15,14 @@ import yaml
 from mcap.reader import make_reader
 
 from ros2_memory.bag_dir.state_files import read_losses
-from tests.support.live_recorder import LiveRecorder, Machine, machine
+from tests.support.live_recorder import (
+    LiveRecorder,
+    Machine,
+    machine,
+    number_of,
+    publishing,
+    stall,
+)
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder
 from tests.support.ros_processes import end, ros_environment, wait_for
@@ -36,38 +38,14 @@ def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
         yield found
 
 
-@contextmanager
-def publishing(env: Mapping[str, str], *topics: str) -> Iterator[subprocess.Popen[bytes]]:
-    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", "tests.integration.counting_publishers", *topics]
-    known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
-    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        sys.stdout.write(f"publishers: {process.poll()} (None: they ran)\n")
-        end(process)
-
-
 def numbers(bag_dir: Path, recordings: str = "rec_*") -> dict[str, list[int]]:
     """The numbers of the messages of each topic that any closed split has, ascending."""
     found: dict[str, set[int]] = {}
     for split in bag_dir.glob(f"{recordings}/*.mcap"):
         with suppress(Exception), split.open("rb") as stream:  # what is still being written
             for _, channel, message in make_reader(stream).iter_messages():
-                frame = struct.unpack_from("<I", message.data, 12)[0]
-                at = 4 + (12 + frame + 7) // 8 * 8
-                found.setdefault(channel.topic, set()).add(
-                    int(struct.unpack_from("<d", message.data, at)[0])
-                )
+                found.setdefault(channel.topic, set()).add(number_of(message.data))
     return {topic: sorted(each) for topic, each in found.items()}
-
-
-def stall(recorder: LiveRecorder, seconds: float) -> None:
-    """Stops its recorder's process for so long."""
-    pid = recorder.children()[-1].pid
-    os.kill(pid, signal.SIGSTOP)
-    time.sleep(seconds)  # what is injected, not waited for
-    os.kill(pid, signal.SIGCONT)
 
 
 def overrides(recorder: LiveRecorder) -> dict[str, dict[str, object]]:

@@ -11,6 +11,7 @@ import os
 import random
 import shutil
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -38,7 +39,7 @@ from tests.integration.test_server_process import Served, serving
 from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import env_without_ros
 from tests.support.robot_run import ask
-from tests.support.ros_processes import wait_for
+from tests.support.ros_processes import end, wait_for
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -253,6 +254,42 @@ def machine(folder: Path, env: Mapping[str, str]) -> Iterator[Machine]:
             recorder.discard()
             # Shown where a test failed: the files of a machine that runs tests are soon gone.
             sys.stdout.write(recorder.log.read_text(errors="replace")[-20_000:])
+
+
+@contextmanager
+def publishing(env: Mapping[str, str], *arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Publishers of numbered messages, with arguments of `integration/counting_publishers.py`."""
+    module = "tests.integration.counting_publishers"
+    argv = [env["ROS2_LIVE_PYTHON"], "-P", "-m", module, *arguments]
+    known = {**env, "PYTHONPATH": env["ROS2_LIVE_PYTHONPATH"]}
+    process = subprocess.Popen(argv, env=known, stdin=subprocess.DEVNULL)
+    try:
+        yield process
+    finally:
+        sys.stdout.write(f"publishers: {process.poll()} (None: they ran)\n")
+        end(process)
+
+
+def number_of(payload: bytes) -> int:
+    """The number of a message of the counting publishers: `x`, behind the text in the header."""
+    frame = struct.unpack_from("<I", payload, 12)[0]
+    return int(struct.unpack_from("<d", payload, 4 + (12 + frame + 7) // 8 * 8)[0])
+
+
+def stall(recorder: LiveRecorder, seconds: float, *, every: bool = False) -> tuple[float, float]:
+    """Stops its newest recorder's process for so long, or all that run; returns from when to when.
+
+    In Unix seconds.
+    """
+    children = recorder.children() if every else recorder.children()[-1:]
+    for child in children:
+        os.kill(child.pid, signal.SIGSTOP)
+    stopped_at = time.time()
+    time.sleep(seconds)  # what is injected, not waited for
+    continued_at = time.time()
+    for child in children:
+        os.kill(child.pid, signal.SIGCONT)
+    return stopped_at, continued_at
 
 
 @contextmanager

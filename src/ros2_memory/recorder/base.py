@@ -180,6 +180,10 @@ class Housekeeper:
         """Returns what the heartbeat shows. Cheap, and raises nothing."""
         return HouseStatus()
 
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return frozenset()
+
     def faults(self) -> Mapping[str, str]:
         """Maps each task that failed in the background, such as `apply`, to the reason."""
         return {}

@@ -257,6 +257,10 @@ class Housekeeping(Housekeeper):
             failing_rules=self._screening.failing_rules(),
         )
 
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return frozenset() if self._screening is None else self._screening.excluded_latched()
+
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
@@ -533,6 +537,10 @@ class BackgroundHousekeeper(Housekeeper):
     def status(self) -> HouseStatus:
         """Returns what the heartbeat shows."""
         return self._housekeeper.status()
+
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received."""
+        return self._housekeeper.excluded_latched()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""

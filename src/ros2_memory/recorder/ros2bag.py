@@ -33,7 +33,7 @@ from ros2_memory.recorder.process.environment import (
     robot_environment,
 )
 from ros2_memory.recorder.process.topics import TopicsFile
-from ros2_memory.recorder.reception.reception import Reception, newest_split
+from ros2_memory.recorder.reception.reception import Reception, newest_splits
 from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.shortfall import Required
 from ros2_memory.recorder.supervisor import Supervisor
@@ -170,9 +170,7 @@ class Ros2BagRecorder(Recorder):
         if not self._checked:
             self.check()
         self._checked = False
-        newest = newest_split(self._bag_dir)
-        if newest is not None:
-            self._reception.recall(newest)
+        self._reception.recall(newest_splits(self._bag_dir))
         self._supervisor.start()
 
     def tick(self) -> None:

@@ -355,6 +355,8 @@ class Supervisor:
             )
             self._events.warn("no_growth", sentence, recording=current.name)
         self._rotating_for_silence = silent and not over
+        # A recorder that receives nothing may have missed what is latched now.
+        self._reception.skip_latched(() if silent else self._housekeeper.excluded_latched())
         try:
             self._sessions.begin_handover(now)
         except RecorderError as error:
@@ -484,6 +486,7 @@ class Supervisor:
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
+        self._reception.skip_latched(())
         self._sessions.begin(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
 

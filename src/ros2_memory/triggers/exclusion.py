@@ -214,10 +214,14 @@ class Cut:
         """Returns whether a message is deleted."""
         if topic not in self._latched:
             return lies_inside(self._all, log_time)
-        published = publish_time if 0 < publish_time < log_time else log_time
-        return lies_inside(self._held, published) or (
-            lies_inside(self._known, published) and lies_inside(self._all, log_time)
+        return self.takes_always(log_time, publish_time) or (
+            lies_inside(self._known, _published(log_time, publish_time))
+            and lies_inside(self._all, log_time)
         )
+
+    def takes_always(self, log_time: Ns, publish_time: Ns) -> bool:
+        """Returns whether a latched message is deleted whenever it is received."""
+        return lies_inside(self._held, _published(log_time, publish_time))
 
     def touches(self, topic: str, first: Ns, last: Ns) -> bool:
         """Returns whether messages of a topic between two log times may be deleted."""
@@ -244,6 +248,10 @@ def add_excluded(
         spans = [(each.start, each.stop) for each in (*known, *parts) if each.held is held]
         joined += (Excluded(*span, held=held) for span in united(spans))
     return sorted(joined, key=lambda each: (each.start, each.stop))
+
+
+def _published(log_time: Ns, publish_time: Ns) -> Ns:
+    return publish_time if 0 < publish_time < log_time else log_time
 
 
 def _widened(spans: Iterable[tuple[Ns, Ns]], margin: Ns) -> Spans:

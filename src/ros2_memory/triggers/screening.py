@@ -140,6 +140,7 @@ class Screening:
         self._refusals: dict[str, str] = {}
         self._evaluated: set[str] = set()
         self._logged_s: dict[str, float] = {}
+        self._excluded_latched = frozenset[str]()
 
     def announce(self, recording: str) -> None:
         """Holds back a recording of which nothing exists yet.
@@ -183,6 +184,13 @@ class Screening:
             f"{held} not served, because recording.exclude_when could not be applied: "
             f"{name}: {reason}"
         )
+
+    def excluded_latched(self) -> frozenset[str]:
+        """Returns the latched topics whose newest message is excluded whenever it is received.
+
+        Not those that decide: each recording needs their value.
+        """
+        return self._excluded_latched.difference(each.topic for each in self._rules)
 
     def _step(self, names: Sequence[str], live: Collection[str]) -> None:
         """Reads closed files, and releases those that can be released.
@@ -419,11 +427,15 @@ class Screening:
         topics = {
             each.topic for each in summary.topics if cut.touches(each.topic, each.first, each.last)
         }
-        gone = Counter(
-            each.channel.topic
-            for each in self._reader.records(path, sorted(topics), TimeWindow.everything())
-            if cut.takes(each.channel.topic, each.log_time, each.publish_time)
-        )
+        gone = Counter[str]()
+        newest: dict[str, tuple[Ns, bool]] = {}
+        for each in self._reader.records(path, sorted(topics), TimeWindow.everything()):
+            topic, published = each.channel.topic, each.publish_time
+            if cut.takes(topic, each.log_time, published):
+                gone[topic] += 1
+            if topic in latched:
+                shown = (published or each.log_time, cut.takes_always(each.log_time, published))
+                newest[topic] = max(shown, newest.get(topic, shown))
         if gone and split_number(ready.recording, path.name) is None:
             raise BagError(str(path), "it is not named as a split of its recording")
         if gone:
@@ -445,6 +457,8 @@ class Screening:
                 file=path.name,
                 messages=gone.total(),
             )
+        returning = {topic for topic, (_, is_excluded) in newest.items() if is_excluded}
+        self._excluded_latched = (self._excluded_latched - newest.keys()) | returning
         return stretches
 
     def _end(self, name: str, state: ScreenState) -> None:

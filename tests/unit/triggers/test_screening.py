@@ -208,6 +208,24 @@ class TestRotations:
         # Before the first second nothing was known.
         assert bags.seconds("/map") == [1.0, 11.0]
 
+    def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(self, tmp_path: Path) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        # Nothing is known of the mode yet: what the next recording receives again may be served.
+        bags.split(name, [word(1, "/map"), *words(0, 10)])
+        bags.split(name, [mode(12, value=False), *words(10, 20)])
+        bags.step()
+        assert bags.screening.excluded_latched() == set()
+        bags.split(name, [mode(22, value=True), word(25, "/map"), *words(20, 30)])
+        bags.split(name, [mode(32, value=False), *words(30, 40)])
+        bags.split(name, words(40, 50))
+        bags.step()
+        assert bags.screening.excluded_latched() == {"/map"}
+        bags.split(name, [word(55, "/map"), *words(50, 60)])
+        bags.end()
+        assert bags.screening.excluded_latched() == set()
+        assert bags.seconds("/map") == [55.0]
+
 
 class TestFaults:
     def test_a_full_disk_holds_splits_back(

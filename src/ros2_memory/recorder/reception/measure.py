@@ -69,8 +69,10 @@ class SplitMeasure:
     arrivals: Mapping[str, Arrival] = field(default_factory=dict)
 
 
-def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
+def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> SplitMeasure:
     """Returns how each topic of a closed split arrived.
+
+    `end_only`: of a small split, too, only the last seconds are measured, and no holes.
 
     Raises:
         BagError: the split cannot be read.
@@ -80,7 +82,8 @@ def measure_split(reader: BagReader, path: Path) -> SplitMeasure:
     for channel in reader.channels(path):
         texts = offers.setdefault(channel.topic, [])
         texts += [text for name, text in channel.metadata if name == "offered_qos_profiles"]
-    window, is_whole = TimeWindow.everything(), path.stat().st_size <= SPLIT_BYTES
+    window = TimeWindow.everything()
+    is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
     if not is_whole:
         summary = reader.summarize(path)
         if not summary.empty:

@@ -158,7 +158,8 @@ def qos_overrides(
         flows: the topics whose QoS is known.
         plan: the depths of their queues.
         latched: the topics that count as latched and may have many publishers. All of their
-            messages are asked for, unless their publishers are known to be volatile.
+            messages are asked for, unless their publishers are known to be volatile, or it is one
+            of `volatile`.
         weakest: topics with a publisher that was refused. They are asked for with what fits every
             publisher: rosbag2 itself asks for more where it knows none of them yet.
         volatile: topics whose earlier messages are not asked for again, though they are latched.
@@ -182,7 +183,7 @@ def qos_overrides(
             ),
         }
     for topic in latched:
-        if topic not in flows or flows[topic].offered.latched:
+        if topic not in flows or (flows[topic].offered.latched and topic not in volatile):
             reliable = topic not in flows or flows[topic].offered.reliable
             profiles[topic] = {
                 "history": "keep_all",

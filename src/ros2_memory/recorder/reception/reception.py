@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -97,6 +98,7 @@ class Reception:
         self._lock = threading.Lock()
         self._flows: dict[str, TopicFlow] = {}
         self._asked_anew: set[str] = set()
+        self._skipped = frozenset[str]()
         self._recordings: dict[str, _Recording] = {}
         self._deepened_s: float | None = None
         self._asked_s: dict[str, float] = {}
@@ -118,13 +120,27 @@ class Reception:
             latched = [topic for topic in self._latched if topic not in self._asked_anew]
             # A latched topic that is asked for as volatile would lose what was published before.
             weakest = self._asked_anew.difference(self._latched)
+            alone = (name for name, flow in self._flows.items() if flow.offered.publishers == 1)
+            volatile = {*self._volatile, *self._skipped.intersection(alone)}
             return qos_overrides(
-                self._flows, plan, latched=latched, weakest=weakest, volatile=self._volatile
+                self._flows, plan, latched=latched, weakest=weakest, volatile=volatile
             )
 
-    def recall(self, path: Path) -> None:
-        """Measures a closed split of an earlier run at once. Raises nothing."""
-        self._measure("", path)
+    def skip_latched(self, topics: Collection[str]) -> None:
+        """Sets the topics whose latched message the next recordings are not to ask for.
+
+        Of several publishers only one may have such a message: all are asked for theirs.
+        """
+        with self._lock:
+            self._skipped = frozenset(topics)
+
+    def recall(self, paths: Sequence[Path]) -> None:
+        """Measures the ends of closed splits of an earlier run at once, in order. Raises nothing.
+
+        No holes: what an earlier run recorded was counted by that.
+        """
+        for path in paths:
+            self._measure("", path)
 
     def learn(self, recording: str, path: Path) -> None:
         """Measures a closed split of a recording, later."""
@@ -231,7 +247,7 @@ class Reception:
 
     def _measure(self, recording: str, path: Path) -> None:
         try:
-            split = measure_split(self._reader, path)
+            split = measure_split(self._reader, path, end_only=not recording)
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
@@ -256,7 +272,6 @@ class Reception:
             self._losses.unclear(recording, split.unclear)
             if recording:
                 self._arrivals.measured(split)
-            # What an earlier run recorded was counted by that.
             losses = self._losses.measured(recording, split.progress) if recording else []
         self._report(losses)
         for topic in sorted(short - before):
@@ -268,18 +283,18 @@ class Reception:
             )
 
 
-def newest_split(bag_dir: Path) -> Path | None:
-    """Returns the newest closed split in a bag directory, by the names of its recordings."""
-    try:
+def newest_splits(bag_dir: Path) -> list[Path]:
+    """Returns the newest splits in a bag directory, by the names of its recordings, in order.
+
+    More than one: the last of a run may have been recorded when the robot's nodes had ended.
+    """
+    found: list[Path] = []
+    with suppress(OSError):
         folders = sorted(each for each in bag_dir.iterdir() if has_own_name(each.name))
-        for folder in reversed(folders[-_LOOKED_AT:]):
+        for folder in folders[-_LOOKED_AT:]:
             splits = sorted(folder.glob("*.mcap"), key=lambda split: split.stat().st_mtime_ns)
-            for split in reversed(splits[-_LOOKED_AT:]):
-                if split.stat().st_size:
-                    return split
-    except OSError:
-        return None
-    return None
+            found += (split for split in splits if split.stat().st_size)
+    return found[-_LOOKED_AT:]
 
 
 def _in_thread() -> Callable[[Callable[[], None]], None]:

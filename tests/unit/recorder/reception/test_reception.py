@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,12 @@ import yaml
 
 from ros2_memory.recorder.reception import measure
 from ros2_memory.recorder.reception.measure import burst_of, measure_split
+from ros2_memory.recorder.reception.profiles import OfferedQos
 from ros2_memory.recorder.reception.reception import (
     ASK_AGAIN_S,
     DEEPEN_EVERY_S,
     Reception,
-    newest_split,
+    newest_splits,
 )
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -75,7 +77,7 @@ def test_a_slow_topic_needs_no_rotation(tmp_path: Path) -> None:
 
 def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_path: Path) -> None:
     made = reception()
-    made.recall(split(tmp_path / "old.mcap", 50, 4))
+    made.recall([split(tmp_path / "old.mcap", 50, 4)])
     assert "/odom" in profiles(made, "a")
     made.refused("a", "/odom")
     # The recording that refused it still states what the other publishers offered.
@@ -129,14 +131,28 @@ def test_an_unreadable_split_teaches_nothing(tmp_path: Path) -> None:
     assert made.rotation_due("a", 10.0) is None
 
 
-def test_the_newest_split_of_an_earlier_run_is_found(tmp_path: Path) -> None:
-    assert newest_split(tmp_path) is None
-    assert newest_split(tmp_path / "none") is None
-    split(tmp_path / "rec_20261120T080000Z" / "x_0.mcap", 5, 1)
+def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
+    assert newest_splits(tmp_path) == []
+    assert newest_splits(tmp_path / "none") == []
+    older = [split(tmp_path / "rec_20261120T080000Z" / f"x_{n}.mcap", 5, 1) for n in range(3)]
     split(tmp_path / "other" / "x_0.mcap", 5, 1)
     newest = split(tmp_path / "rec_20261120T090000Z" / "x_0.mcap", 5, 1)
     (tmp_path / "rec_20261120T090000Z" / "x_1.mcap").touch()
-    assert newest_split(tmp_path) == newest
+    assert newest_splits(tmp_path) == [*older[1:], newest]
+
+
+def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "rec_20261120T080000Z"
+    split(folder / "x_0.mcap", 100, 20)
+    (folder / "x_1.mcap").write_bytes(b"nothing")
+    split(folder / "x_2.mcap", 50, 1, topic="/scan")
+    made = reception()
+    made.recall(newest_splits(tmp_path))
+    asked = profiles(made, "a")
+    assert (asked["/odom"]["depth"], asked["/scan"]["depth"]) == (400, 200)
+    assert made.lost_in_last_hour(T0) == {}
 
 
 def test_a_burst_counts_two_seconds_and_a_young_topic_goes_on() -> None:
@@ -164,3 +180,25 @@ def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) ->
     made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
     asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
     assert asked == {"/rosout": "volatile", "/map": "transient_local"}
+
+
+def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> None:
+    """Unless another publisher of the topic may have one, or it is not known who publishes it."""
+    made = reception()
+    topics = ("/map", "/tf_static", "/shared", "/plan")
+    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
+    layout = McapLayout(latched=frozenset(topics))
+    made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
+    made._flows["/shared"] = replace(
+        made._flows["/shared"], offered=OfferedQos(reliable=True, latched=True, publishers=2)
+    )
+    made.skip_latched(["/map", "/tf_static", "/shared", "/unknown"])
+    asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
+    assert asked == {
+        "/map": "volatile",
+        "/tf_static": "volatile",
+        "/shared": "transient_local",
+        "/plan": "transient_local",
+    }
+    made.skip_latched([])
+    assert {each["durability"] for each in profiles(made, "c").values()} == {"transient_local"}

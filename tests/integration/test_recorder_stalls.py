@@ -1,0 +1,273 @@
+"""Gaps of the real recorder: times in which no message arrived, and no others.
+
+Its process is stopped again and again. What was sent is in the publishers' own log, what was
+recorded is in the bags; what the server says is compared with both.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections import Counter
+from itertools import groupby, pairwise
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import pytest
+from mcap.reader import make_reader
+
+from ros2_memory.bag_dir.state_files import read_losses
+from tests.support.examples import LONG
+from tests.support.live_recorder import (
+    NS_PER_S,
+    Machine,
+    answer,
+    answering,
+    bag_files,
+    machine,
+    number_of,
+    publishing,
+    stall,
+)
+from tests.support.ros_processes import ros_environment, wait_for
+from tests.timing import in_time
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from tests.integration.test_server_process import Served
+    from tests.support.live_recorder import LiveRecorder
+    from tests.support.real_recorder import RealRecorder
+
+STALLS: Final = 3
+STALL_S: Final = 3.0
+LEAST_S: Final = 0.5
+"""The shortest gap of topics that come with 6 Hz or more."""
+ABSENT_S: Final = 0.6
+LATE_S: Final = 0.1
+PERIOD_S: Final = 0.02
+"""Of the second most frequent topic."""
+EDGE_S: Final = 2 * PERIOD_S + 0.06
+NEVER: Final = {"condition_type": "above", "field": "position.x", "value": 1e12}
+BUSY_S: Final = 300.0
+TOPICS: Final = ("/odom", "/scan", "/slow")
+ROBOTS: Final = {
+    "best effort": ("/odom:200:best_effort", "/scan:50:best_effort", "/slow:2:best_effort"),
+    "reliable": ("/odom:50:reliable", "/scan:50:reliable", "/slow:2:reliable"),
+}
+BOTH: Final = ("/odom:50:reliable", "/scan:50:best_effort", "/slow:2:reliable")
+FOREVER: Final = (0, 2**62)
+
+Span = tuple[float, float]
+"""Unix seconds."""
+
+
+class Sent(NamedTuple):
+    """A message that was published, and when (ns)."""
+
+    topic: str
+    number: int
+    at: int
+
+
+class Drive(NamedTuple):
+    """What was sent, in order of time, and each message's log times in all files (ns).
+
+    `stalls` are those in which no recorder ran.
+    """
+
+    stalls: Sequence[Span]
+    recorder: LiveRecorder
+    sent: Sequence[Sent]
+    logged: Mapping[tuple[str, int], Sequence[int]]
+
+    def pauses(self) -> list[Span]:
+        """Between which log times no message lies, of any topic, for more than `LEAST_S`."""
+        times = sorted(at for each in self.logged.values() for at in each)
+        return [
+            (before / NS_PER_S, after / NS_PER_S)
+            for before, after in pairwise(times)
+            if after - before > LEAST_S * NS_PER_S
+        ]
+
+    def absences(self) -> list[Span]:
+        """From the first to the last of messages in a row, of all topics, that did not arrive.
+
+        No file has them, or they were recorded more than `LATE_S` after they were sent: a recorder
+        that stalls reads what DDS has kept for it only then.
+        """
+        runs = [[*run] for arrived, run in groupby(self.recorded(), self.arrived) if not arrived]
+        spans = [(run[0].at / NS_PER_S, run[-1].at / NS_PER_S) for run in runs]
+        return [span for span in spans if span[1] - span[0] >= ABSENT_S]
+
+    def arrived(self, sent: Sent) -> bool:
+        logged = self.logged.get((sent.topic, sent.number))
+        return logged is not None and min(logged) - sent.at <= LATE_S * NS_PER_S
+
+    def recorded(self) -> Sequence[Sent]:
+        """What was sent from the first to the last message that a file has."""
+        there = [self.is_there(each) for each in self.sent]
+        return self.sent[there.index(True) : len(there) - there[::-1].index(True)]
+
+    def is_there(self, sent: Sent) -> bool:
+        return (sent.topic, sent.number) in self.logged
+
+
+@pytest.fixture
+def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
+    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+        yield found
+
+
+def drive(
+    site: Machine,
+    robot: Sequence[str],
+    session_s: int,
+    stalled: Callable[[LiveRecorder], Sequence[Span]],
+) -> Drive:
+    """Records a robot from before until after `stalled`."""
+    name = f"drive{len(site.recorders)}"
+    log = site.folder / f"{name}.sent"
+    with publishing(site.env, "--log", str(log), *robot):
+        recorder = site.record(
+            name,
+            "recording.split_duration_s=4",
+            f"recording.session_duration_s={session_s}",
+            topics=TOPICS,
+        )
+        stalls = stalled(recorder)
+        recorder.stop()
+    lines = [line.split() for line in log.read_text().splitlines() if line.count(" ") == 2]
+    sent = [Sent(topic, int(number), int(at)) for topic, number, at in lines]
+    logged: dict[tuple[str, int], list[int]] = {}
+    for file in bag_files(recorder.bag_dir):
+        with file.open("rb") as stream:
+            for _, channel, message in make_reader(stream).iter_messages(topics=[*TOPICS]):
+                key = (channel.topic, number_of(message.data))
+                logged.setdefault(key, []).append(message.log_time)
+    return Drive(stalls, recorder, sent, logged)
+
+
+def stalls_after_each_other(recorder: LiveRecorder) -> Sequence[Span]:
+    """Once its queues are deep."""
+    recorder.wait_for("rotated")
+    stalls: list[Span] = []
+    for _ in range(STALLS):
+        stalls.append(stall(recorder, STALL_S))
+        await_whole_split(recorder)
+    return stalls
+
+
+def await_whole_split(recorder: LiveRecorder) -> None:
+    """Returns when the newest recording has closed a split that it opened since."""
+    name = recorder.children()[-1].recording
+    closed = [each for each in recorder.events("split_closed") if each["recording"] == name]
+    recorder.wait_for("split_closed", len(closed) + 2, recording=name)
+
+
+def stalls_at_rotations(recorder: LiveRecorder) -> Sequence[Span]:
+    """Of the recorders of one rotation together; of the next one the new one stalls alone."""
+    recorder.wait_for("rotated")
+    both, _ = (stall_at_rotation(recorder, every=every) for every in (True, False))
+    await_whole_split(recorder)
+    return [both]
+
+
+def stall_at_rotation(recorder: LiveRecorder, *, every: bool) -> Span:
+    rotated = len(recorder.events("rotated"))
+    recorder.wait_for("rotation_begun", rotated + 1)
+    found = stall(recorder, STALL_S, every=every)
+    recorder.wait_for("rotated", rotated + 1)
+    return found
+
+
+def gaps_of(served: Served) -> list[Span]:
+    reply = answer(served, "data_time_range")
+    assert reply["clock_steps"] == []
+    return [(gap["start"], gap["end"]) for gap in reply["gaps"]]
+
+
+def assert_gaps_are_what_did_not_arrive(
+    found: Drive, gaps: Sequence[Span], precision_s: float
+) -> None:
+    """Each gap is a pause of the files and a stall, and each absence is in a gap.
+
+    It begins and ends within `EDGE_S` of the stall: two periods of the second most frequent topic,
+    and what a process takes to run again.
+    """
+    absences, pauses = found.absences(), found.pauses()
+    lost = Counter(each.topic for each in found.recorded() if not found.is_there(each))
+    sys.stdout.write(f"lost {lost}\nabsences {absences}\npauses {pauses}\ngaps {gaps}\n")
+    assert [edge for gap in gaps for edge in gap] == pytest.approx(
+        [edge for pause in pauses for edge in pause], abs=precision_s
+    )
+    for first, last in absences:
+        assert [gap for gap in gaps if gap[0] < first and last < gap[1]], (first, last)
+    assert [edge for gap in gaps for edge in gap] == pytest.approx(
+        [edge for stalled in found.stalls for edge in stalled], abs=EDGE_S
+    )
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_each_stall_is_a_gap_and_nothing_else_is(site: Machine, robot: Sequence[str]) -> None:
+    def stalling() -> None:
+        found = drive(site, robot, 600, stalls_after_each_other)
+        # But where DDS makes the publishers wait for a process that stands still.
+        assert found.absences()
+        with answering(found.recorder.bag_dir, site.folder / "server.log") as served:
+            gaps = gaps_of(served)
+            assert_gaps_are_what_did_not_arrive(found, gaps, 1e-6)
+            assert_replies_name_them(served, gaps)
+
+    in_time(stalling)
+
+
+def assert_replies_name_them(served: Served, gaps: Sequence[Span]) -> None:
+    status = answer(served, "memory_status")
+    assert sorted((gap["start"], gap["end"]) for gap in status["gaps"]) == gaps
+    health: dict[str, Any] = json.loads(served.get("/health")[1])
+    seconds = sum(end - start for start, end in gaps)
+    assert health["gaps_last_hour"] == {
+        "count": len(gaps),
+        "seconds": pytest.approx(seconds, abs=0.01),
+    }
+    for start, end in gaps:
+        position = answer(served, "get_position_at", timestamp=(start + end) / 2)
+        assert (position["error"], position.get("reason")) == ("no_data", "gap"), position
+        inside = {"start": start + 0.5, "end": end - 0.5}
+        none = answer(served, "find_matches", topic="/odom", **NEVER, **inside)
+        assert (none["error"], none["reason"]) == ("no_data", "gap")
+        around = {"start": start - 1.0, "end": end + 1.0}
+        some = answer(served, "find_matches", topic="/odom", **NEVER, **around)
+        assert [note for note in some["notes"] if f"{start:.6f} to {end:.6f}" in note]
+
+
+def test_a_stall_at_a_rotation_is_a_gap_where_both_recorders_stall(site: Machine) -> None:
+    def stalling() -> None:
+        found = drive(site, BOTH, 12, stalls_at_rotations)
+        with answering(found.recorder.bag_dir, site.folder / "server.log") as served:
+            assert_gaps_are_what_did_not_arrive(found, gaps_of(served), PERIOD_S)
+
+    in_time(stalling)
+
+
+@pytest.mark.skipif(not LONG, reason=f"takes {BUSY_S:.0f} s: EPISODIC_LONG=1")
+def test_a_busy_publisher_has_no_gap_and_no_loss_that_is_none(site: Machine) -> None:
+    robot = ("/odom:200:best_effort", "/scan:200:reliable", "/slow:10:reliable")
+
+    def none(recorder: LiveRecorder) -> Sequence[Span]:
+        over = time.monotonic() + BUSY_S
+        wait_for(lambda: time.monotonic() > over, "the end", timeout_s=2 * BUSY_S)
+        assert recorder.process.poll() is None
+        return ()
+
+    found = drive(site, robot, 60, none)
+    lost = Counter(each.topic for each in found.recorded() if not found.is_there(each))
+    told = Counter[str]()
+    for loss in read_losses(found.recorder.bag_dir, *FOREVER):
+        told[loss.topic] += loss.lost
+    sys.stdout.write(f"{len(found.sent)} sent, {lost} lost, {told} told\n")
+    assert told <= lost
+    with answering(found.recorder.bag_dir, site.folder / "server.log") as served:
+        assert_gaps_are_what_did_not_arrive(found, gaps_of(served), PERIOD_S)
