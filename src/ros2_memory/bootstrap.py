@@ -31,6 +31,7 @@ from ros2_memory.config import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, ConfigError, InvalidArgumentsError
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
@@ -77,13 +78,19 @@ _MOST_SPLITS = 5000
 """The splits of one recording that `bag_dir.state_files` takes."""
 
 
-def build_reader(settings: Settings, *, cache_mb: int | None = None) -> BagReader:
+def build_reader(
+    settings: Settings, *, cache_mb: int | None = None, large: LargeReads | None = None
+) -> BagReader:
     """Returns the bag reader that the configuration chooses, with `cache_mb` if that is given.
+
+    `large` is the turn to hold much of a bag, where several threads read.
 
     Raises:
         ConfigError: it cannot be built.
     """
-    own: dict[str, object] = {} if cache_mb is None else {"cache_mb": cache_mb}
+    own: dict[str, object] = {"large": large}
+    if cache_mb is not None:
+        own["cache_mb"] = cache_mb
     return instantiated("storage", settings.storage, BagReader, **own)  # type: ignore[type-abstract]  # only compared with
 
 
@@ -350,9 +357,13 @@ def claim(own: OwnRecordings) -> None:
 
 
 class SharedParts(NamedTuple):
-    """What memories of the same settings can share, with its caches: the reader and the decoder."""
+    """What memories of the same settings can share, with its caches: the reader and the decoder.
+
+    `large` is the reader's turn to hold much of a bag.
+    """
 
     reader: BagReader
+    large: LargeReads
     schemas: Mapping[str, Mapping[str, str]]
     extractor: SchemaExtractor
 
@@ -369,7 +380,10 @@ def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedPa
 
     schemas = load_message_schemas(settings)
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
-    return SharedParts(build_reader(settings, cache_mb=cache_mb), schemas, extractor)
+    large = LargeReads()
+    return SharedParts(
+        build_reader(settings, cache_mb=cache_mb, large=large), large, schemas, extractor
+    )
 
 
 def build_memory(
@@ -409,10 +423,11 @@ def build_memory(
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
         only=settings.data.recording,
         setting=setting or BAG_DIR_SETTING,
+        large=shared.large,
     )
     scanner = Scanner(columns, bag_dir, reading_of(settings, schemas))
     limits = query_settings_of(settings)
-    return Memory(index, reader, shared.extractor, clock, limits, scanner)
+    return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 
 
 def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
@@ -561,7 +576,15 @@ def _backfill(
     limits = StoreLimits(store.max_share, round(store.max_gb * GB))
     return Backfill(
         memory,
-        Filling(scanner, memory.reader, bag_dir, memory.clock, limits, are_files=are_files),
+        Filling(
+            scanner,
+            memory.reader,
+            bag_dir,
+            memory.clock,
+            limits,
+            are_files=are_files,
+            large=memory.large,
+        ),
     )
 
 
@@ -656,6 +679,7 @@ def build_dispatcher(
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,
+        large=memory.large,
     )
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
@@ -98,7 +98,7 @@ from ros2_memory.insights.status import (
 from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -150,11 +150,12 @@ def topic_range(
     """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
-    total, chosen = view.pick(name, window, max_samples)
+    total, picked = view.pick(name, window, max_samples)
+    chosen = _each_shown(view, picked, fields)
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    samples, types = _samples(view, chosen, window, fields)
+    samples, types = _samples(view, chosen, window)
     if len(types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
@@ -709,8 +710,30 @@ def _value(
     )
 
 
+class _Shown(NamedTuple):
+    """A message as a reply shows it; or without it, why it cannot be decoded."""
+
+    time: Ns
+    type_name: str
+    shown: Extracted | None
+    failure: str = ""
+
+
+def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
+    """Returns messages as a reply shows them. None is in memory when the next one is read."""
+    found: list[_Shown] = []
+    for each in picked:
+        type_name = each.record.channel.type
+        try:
+            found.append(_Shown(each.time, type_name, _extracted(view, each, fields)))
+        except NoDataError as error:
+            found.append(_Shown(each.time, type_name, None, error.detail))
+        del each
+    return found
+
+
 def _samples(
-    view: View, chosen: Sequence[StoredMessage], window: TimeWindow, fields: Sequence[str]
+    view: View, chosen: Sequence[_Shown], window: TimeWindow
 ) -> tuple[tuple[Sample, ...], list[str]]:
     """Returns the samples that can be decoded, and their types in order of appearance.
 
@@ -720,14 +743,12 @@ def _samples(
     samples: list[Sample] = []
     types: dict[str, None] = {}
     failures: Counter[str] = Counter()
-    for found in chosen:
-        try:
-            shown = _extracted(view, found, fields)
-        except NoDataError as error:
-            failures[error.detail] += 1
+    for time, type_name, shown, failure in chosen:
+        if shown is None:
+            failures[failure] += 1
             continue
-        samples.append(Sample(found.time, shown.value))
-        types[found.record.channel.type] = None
+        samples.append(Sample(time, shown.value))
+        types[type_name] = None
         for sentence in shown.notes:
             view.notes.add(sentence)
     if failures and not samples:

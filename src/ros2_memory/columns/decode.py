@@ -18,6 +18,7 @@ from ros2_memory.columns.plan import UnplannedError, plan_of
 from ros2_memory.columns.table import Table, joined, order_of
 from ros2_memory.columns.walk import NotWalkedError, walked
 from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
@@ -25,7 +26,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.plan import Plan
-    from ros2_memory.storage.base import BagReader, Batch, Channel, Record, Schema
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import BagReader, Batch, Channel, Schema
 
 T = TypeVar("T")
 
@@ -34,6 +36,7 @@ GROUP_BYTES: Final = 64 << 20
 BULKY_BYTES: Final = 64 << 10
 """In large files, topics with larger messages have no columns."""
 LARGE_FILE_BYTES: Final = 64 << 20
+"""A file counts as large, and what a small one decompresses to from there on."""
 BULKY_TYPES: Final = frozenset(
     {
         "sensor_msgs/msg/Image",
@@ -48,6 +51,8 @@ BULKY_TYPES: Final = frozenset(
 )
 """Images and clouds, which have no columns in any file."""
 _BULKY: Final = "images, clouds and the like have no columns"
+MOST_OF_ONE_BYTES: Final = LARGE_BYTES
+"""From the first larger message on its topic has no columns in a bag of any size."""
 _NOT_ASKED: Final = "only times were asked for"
 _DECODED_BYTES: Final = 1 << 20
 """Payloads whose decoded messages are in memory at once."""
@@ -138,21 +143,24 @@ def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeW
     if not table.undecodable:
         return table
     channel = table.channel
-    records: list[Record] = []
+    rows: list[tuple[Ns, Ns, int]] = []
     found = reader.records(path, [channel.topic], window)
     while True:
         try:
-            records.extend(record for record in found if record.channel.schema == channel.schema)
+            rows.extend(
+                (record.log_time, record.publish_time, zlib.crc32(record.payload))
+                for record in found
+                if record.channel.schema == channel.schema
+            )
             break
         except BagError as error:
             if error.lost is None:
                 raise
-    times = np.array([record.log_time for record in records], np.int64)
-    hashes = np.array([zlib.crc32(record.payload) for record in records], np.int64)
+    times, published, hashes = np.ascontiguousarray(np.array(rows, np.int64).reshape(-1, 3).T)
     return Table(
         channel,
         times,
-        np.array([record.publish_time for record in records], np.int64),
+        published,
         np.zeros(times.size, np.int64),
         left_out={"": f"some cannot be decoded: {table.undecodable_reason}"},
         payload_hashes=None if table.payload_hashes is None else hashes,
@@ -182,11 +190,12 @@ class _Kind:
 
 @dataclass(slots=True)
 class _Kinds:
-    """The kinds of the channels of one bag."""
+    """The kinds of the channels of one bag, of which `read_bytes` were read so far."""
 
     reader: BagReader
     hashed: Callable[[Channel], bool]
     columns: bool
+    read_bytes: int = 0
     # By identity, since hashing a channel hashes its definition.
     _known: dict[int, _Kind] = field(default_factory=dict)
     _bulky: set[str] = field(default_factory=set)
@@ -216,6 +225,13 @@ class _Kinds:
             known = _Kind(channel, plan, reason, self.hashed(channel))
             self._known[id(channel)] = known
         return known
+
+    def leave_out_large(self, batch: Batch) -> None:
+        """Has no more columns made of a channel with large messages."""
+        most = MOST_OF_ONE_BYTES if self.read_bytes <= LARGE_FILE_BYTES else BULKY_BYTES
+        kind = self.of(batch.channel)
+        if kind.plan is not None and batch.sizes.max() > most:
+            self._known[id(batch.channel)] = replace(kind, plan=None, reason=_BULKY)
 
     def _plan(self, channel: Channel) -> tuple[Plan | None, str]:
         if not self.columns:
@@ -258,11 +274,20 @@ class _Group:
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._bytes += len(batch.buffer)
+            self.kinds.read_bytes += len(batch.buffer)
         if not batch.sizes.size:
             return
         channel = batch.channel
+        parts = self._parts.setdefault((channel.topic, channel.encoding, channel.schema), [])
+        self.kinds.leave_out_large(batch)
         table = _table(self.kinds, batch)
-        self._parts.setdefault((channel.topic, channel.encoding, channel.schema), []).append(table)
+        if "" in table.left_out and parts and "" not in parts[0].left_out:
+            parts[:] = [
+                replace(part, columns={}, elements={}, left_out=table.left_out) for part in parts
+            ]
+        elif parts and "" in parts[0].left_out:
+            table = replace(table, columns={}, elements={}, left_out=parts[0].left_out)
+        parts.append(table)
 
     def tables(self) -> list[Table]:
         """Returns the tables, each of all its parts."""

@@ -16,6 +16,7 @@ from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, BagKey
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import united
@@ -24,7 +25,7 @@ from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.scanner import Scanner
@@ -84,6 +85,7 @@ class Filling:
         clock: says now.
         limits: how much the store may take.
         are_files: whether bags are files, which change; those of a lake do not.
+        large: the turn to hold much of a bag, which is passed on after each group of tables.
     """
 
     def __init__(
@@ -95,7 +97,9 @@ class Filling:
         limits: StoreLimits,
         *,
         are_files: bool = True,
+        large: LargeReads | None = None,
     ) -> None:
+        self._large = large or LargeReads()
         if scanner.store is None:
             raise ValueError("a scanner without a store has nothing to fill")
         self.store: ColumnStore = scanner.store
@@ -256,7 +260,7 @@ class Filling:
             tables = self._whole(bag, first)
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
-        every = (self._whole(bag, tables) for tables in chain(begin, groups))
+        every = (self._whole(bag, tables) for tables in chain(begin, self._passing_on(groups)))
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
         budget = self._share([bag]) + max(left, 0)
@@ -264,6 +268,16 @@ class Filling:
         return self.store.put_long(
             key, bag, every, hashed=hashed, budget=budget, is_current=is_current
         )
+
+    def _passing_on(self, groups: Iterator[list[Table]]) -> Iterator[list[Table]]:
+        """Yields groups of tables, and lets others have their turn before each."""
+        while True:
+            self._large.pass_on()
+            tables = next(groups, None)
+            if tables is None:
+                return
+            yield tables
+            del tables
 
     def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)

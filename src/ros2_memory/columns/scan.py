@@ -50,7 +50,7 @@ _MOST_LOOKED_UP: Final = 64
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 _MOST_BYTES: Final = 64 << 20
-"""Columns of one bag that are held at once; those of a bag with more are not, and it is read."""
+"""Columns that are held at once; those of a bag with more are not, and it is read."""
 _TOO_LARGE: Final = "its messages are too large to hold their columns"
 
 
@@ -243,9 +243,14 @@ class Scan:
                 BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
             ]
             self._decoded[source.bag.file] = known
-            if len(self._decoded) > _MOST_DECODED:
+            while len(self._decoded) > _MOST_DECODED or (
+                len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
+            ):
                 self._decoded.popitem(last=False)
         return known
+
+    def _decoded_bytes(self) -> int:
+        return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
 
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""

@@ -150,7 +150,7 @@ class _FleetQuestions:
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None]:
             return robot.asked(
-                lambda memory: _single(asked.question(memory, own)),
+                lambda memory: _single(_answer(asked.question, memory, own)),
                 lake=self._is_of_lake,
                 begin_of=partial(_begin_of, asked.given),
             )
@@ -225,7 +225,7 @@ class _FleetQuestions:
         is_ahead = latest is not None and latest > memory.clock.now() + _AHEAD_NS
         # Rows of those whose clock is ahead come last, whenever they are.
         call.rows_in = None if is_ahead else page.window()
-        answer = _single(question(memory, call))
+        answer = _single(_answer(question, memory, call))
         if isinstance(answer, Sightings) and not is_ahead:
             page.add(each.last for each in answer.sightings)
         value = as_json(answer, memory.index.bag_dir)
@@ -249,6 +249,12 @@ def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns) -> Ns 
     if isinstance(start, int | float):
         return ns_from_unix(start)
     return latest - ns_from_unix(last_s) if isinstance(last_s, int | float) else None
+
+
+def _answer(question: Question, memory: Memory, call: Call) -> Answer:
+    """Returns a robot's answer, in the thread that it is asked in."""
+    with call.reading(memory.large):
+        return question(memory, call)
 
 
 def _single(answer: Answer) -> OneAnswer:

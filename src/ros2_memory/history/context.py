@@ -6,16 +6,20 @@ import math
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
+from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns
+from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns, unix_from_ns
 from ros2_memory.index.listed_splits import absent_splits
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
@@ -107,7 +111,7 @@ class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
     `columns` scans topics, from its store where that has the bags; every answer is the same without
-    the store.
+    the store. `large` is the turn to hold much of a bag, which the reader takes.
     """
 
     index: SnapshotSource
@@ -116,6 +120,7 @@ class Memory:
     clock: Clock
     limits: QuerySettings
     columns: Scanner
+    large: LargeReads = field(default_factory=LargeReads)
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.
@@ -167,7 +172,7 @@ class _StageTimer:
 
 
 class Stages:
-    """How long one call spent where: `index`, `read`, `extract`; `spent` has nanoseconds."""
+    """How long one call spent where (`index`, `read`, `extract`, `wait`); `spent` has ns."""
 
     __slots__ = ("spent",)
 
@@ -187,6 +192,8 @@ class Stages:
         return {stage: round(ms_from_ns(spent), 3) for stage, spent in self.spent.items()}
 
 
+WAIT: Final = "wait"
+"""The stage of a call that waits until it may hold much of a bag; it is part of another one."""
 READING_S: Final = 4.0
 """How long a call reads bags that are not stored, before its answer is partial."""
 
@@ -217,9 +224,26 @@ class Call:
     def partial_after(self, budget_s: float) -> Deadline:
         """Returns when an answer is given with what was read until then, `budget_s` from now.
 
-        A call that may take as long as it needs (`Deadline.never()`) is answered whole.
+        To wait for others does not count. A call that may take as long as it needs
+        (`Deadline.never()`) is answered whole.
         """
-        return Deadline.after(budget_s) if self.deadline.at_s < math.inf else self.deadline
+        if self.deadline.at_s == math.inf:
+            return self.deadline
+        return Deadline.after(budget_s, self._reading_time)
+
+    def _reading_time(self) -> float:
+        return time.monotonic() - unix_from_ns(self.stages.spent.get(WAIT, 0))
+
+    def reading(self, large: LargeReads) -> AbstractContextManager[None]:
+        """Returns the block in which this call reads, and may have to wait for its turn."""
+        return large.during(self._require_time, partial(self.stages.add, WAIT))
+
+    def _require_time(self) -> None:
+        if self.deadline.expired():
+            raise QueryTimeoutError(
+                "other questions that hold large parts of bags in memory came first; ask again, "
+                "with fewer at once"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -99,11 +99,14 @@ class View:
         touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
         return without_steps(self, touched) if touched else touched
 
-    def pick(self, topic: str, window: TimeWindow, at_most: int) -> tuple[int, list[StoredMessage]]:
+    def pick(
+        self, topic: str, window: TimeWindow, at_most: int
+    ) -> tuple[int, Iterator[StoredMessage]]:
         """Returns how many messages the window holds, and `at_most` of them, evenly spaced.
 
         The first and the last are always among them. Reads payloads of the chosen ones only,
-        except where recordings overlap or latched messages may have been received again.
+        except where recordings overlap or latched messages may have been received again; each when
+        it is its turn.
         """
         groups = groups_of(self.stream, topic, window)
         merged = {group: self._times_in(topic, group) for group in groups if group.has_duplicates}
@@ -112,17 +115,19 @@ class View:
             for group in groups
         ]
         indices = evenly(sum(sizes), at_most)
-        chosen: list[StoredMessage] = []
-        begin = 0
-        for group, size in zip(groups, sizes, strict=True):
-            inside = indices[bisect_left(indices, begin) : bisect_left(indices, begin + size)]
-            wanted = [index - begin for index in inside]
-            if group in merged:
-                chosen.extend(self._fetch(topic, merged[group], wanted))
-            else:
-                chosen.extend(group.fetch(wanted))
-            begin += size
-        return sum(sizes), chosen
+
+        def chosen() -> Iterator[StoredMessage]:
+            begin = 0
+            for group, size in zip(groups, sizes, strict=True):
+                inside = indices[bisect_left(indices, begin) : bisect_left(indices, begin + size)]
+                wanted = [index - begin for index in inside]
+                if group in merged:
+                    yield from self._fetch(topic, merged[group], wanted)
+                else:
+                    yield from group.fetch(wanted)
+                begin += size
+
+        return sum(sizes), chosen()
 
     def _fetch(
         self, topic: str, times: IntArray, indices: Sequence[int]

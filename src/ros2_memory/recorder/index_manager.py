@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import ms_from_ns, ns_from_unix
 from ros2_memory.index.bag_table import BagTable
@@ -65,6 +66,7 @@ class IndexManager:
             and its content decides.
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
         setting: the one that names the bag directory, for sentences.
+        large: the turn to hold much of a bag, for which no scan waits.
 
     Attributes:
         bag_dir: the bag directory.
@@ -85,7 +87,9 @@ class IndexManager:
         trusts_mtime: bool = True,
         only: str | None = None,
         setting: str = BAG_DIR_SETTING,
+        large: LargeReads | None = None,
     ) -> None:
+        self._large = large or LargeReads()
         self._setting = setting
         self._trusts_mtime = trusts_mtime
         self._only = only
@@ -177,7 +181,8 @@ class IndexManager:
         )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
-        with _gc_paused() if self.published is None else nullcontext():
+        # Who has the turn may wait for this scan.
+        with self._large.set_aside(), _gc_paused() if self.published is None else nullcontext():
             return self._scan_changes(patrolling=patrolling)
 
     def _scan_changes(self, *, patrolling: bool) -> Snapshot:

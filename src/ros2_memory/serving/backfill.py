@@ -74,6 +74,15 @@ class Backfill:
         self.undecodable: dict[str, str] = {}
         self._of_others: list[Ns] | None = None
 
+    async def in_thread(self, work: Callable[[], T]) -> T:
+        """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
+
+        def done() -> T:
+            with self._memory.large.during():
+                return work()
+
+        return await anyio.to_thread.run_sync(done, abandon_on_cancel=True)
+
     def progress(self) -> Progress:
         """Returns how much is stored."""
         timeline = self._memory.index.snapshot().timeline
@@ -159,6 +168,7 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         memory.columns.write_fragments()
+        memory.large.pass_on()
     memory.columns.write_fragments()
 
 
@@ -226,35 +236,32 @@ class Filler:
     async def _fill(self) -> None:
         backfill = self._backfill
         due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
-        await _in_thread(partial(backfill.look_after, thorough=due))
-        waiting = await _in_thread(backfill.waiting)
+        in_thread = backfill.in_thread
+        await in_thread(partial(backfill.look_after, thorough=due))
+        waiting = await in_thread(backfill.waiting)
         store = None if backfill.filling is None else backfill.filling.store
         # A store that is in memory cannot be filled by another process.
         has_file = store is not None and store.path is not None
         is_helped = self._helper and len(waiting) > BACKLOG and has_file
         if is_helped and await _run_helper(self._helper):
             # Bags that the helper could not store are tried here, and refused if they fail.
-            waiting = await _in_thread(backfill.waiting)
+            waiting = await in_thread(backfill.waiting)
         if not waiting:
-            await _in_thread(backfill.write_again)
+            await in_thread(backfill.write_again)
         done = 0
         for bag in waiting[: BACKLOG if self._helper else _BACKLOG_ALONE]:
-            done += await _in_thread(partial(backfill.store, bag))
+            done += await in_thread(partial(backfill.store, bag))
             if store is not None and store.is_failing:
                 break
-        await _in_thread(backfill.merge)
+        await in_thread(backfill.merge)
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
-            await _in_thread(backfill.precompute)
+            await in_thread(backfill.precompute)
             self._is_precomputed = True
-        if self._warm_up and len(waiting) <= BACKLOG and await _in_thread(self._warm_up):
+        if self._warm_up and len(waiting) <= BACKLOG and await in_thread(self._warm_up):
             self._warm_up = None
         if due:
-            await _in_thread(backfill.prune)
+            await in_thread(backfill.prune)
             self._pruned_s = time.monotonic()
-
-
-async def _in_thread(work: Callable[[], T]) -> T:
-    return await anyio.to_thread.run_sync(work, abandon_on_cancel=True)
 
 
 async def _run_helper(helper: Sequence[str]) -> bool:

@@ -25,6 +25,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
 from ros2_memory.core.text import abbreviate
@@ -70,7 +71,8 @@ class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
     `readable`: tools that only the resources use. `log_arguments`: whether log events show what a
-    caller wrote, cut short. `most_questions`: how many calls are kept for the page.
+    caller wrote, cut short. `most_questions`: how many calls are kept for the page. `large`: the
+    turn of the memory's reader to hold much of a bag.
 
     Attributes:
         questions: the latest calls with their replies.
@@ -91,7 +93,9 @@ class Dispatcher:
         telemetry: Telemetry = SILENT,
         log_arguments: bool = True,
         most_questions: int = 0,
+        large: LargeReads | None = None,
     ) -> None:
+        self._large = large or LargeReads()
         self.tools = (*tools,)
         self.questions = QuestionLog(most_questions)
         self._memory = memory
@@ -179,7 +183,7 @@ class Dispatcher:
         self._begun += 1
 
         def made() -> tuple[str, Reply]:
-            return self._asked(lambda: Reply(to_json_text(work(self._memory, call))), wait)
+            return self._asked(lambda: Reply(to_json_text(work(self._memory, call))), call, wait)
 
         with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
             try:
@@ -291,11 +295,16 @@ class Dispatcher:
                 found = question(self._memory, call)
             return self._replies.answer(found, from_active=call.used_active, now=call.now)
 
-        return self._asked(answer, wait)
+        return self._asked(answer, call, wait)
 
-    def _asked(self, answer: Callable[[], Reply], wait: _Wait) -> tuple[str, Reply]:
+    def _asked(self, answer: Callable[[], Reply], call: Call, wait: _Wait) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""
         wait.end()
+        # Around all of it: an error keeps what was read alive until it has become a reply.
+        with call.reading(self._large):
+            return self._outcome_of(answer, wait)
+
+    def _outcome_of(self, answer: Callable[[], Reply], wait: _Wait) -> tuple[str, Reply]:
         try:
             return "ok", answer()
         except NoDataError as error:

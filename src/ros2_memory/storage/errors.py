@@ -119,11 +119,11 @@ def as_unreadable() -> Iterator[None]:
     """Raises every exception that damaged bytes cause as an `UnreadableError`.
 
     For parts of a file whose neighbours may be whole. OSError and MemoryError pass, since whole
-    bytes raise them too.
+    bytes raise them too, and that the time of a call is over.
     """
     try:
         yield
-    except (UnreadableError, OSError, MemoryError):
+    except (UnreadableError, EpisodicError, OSError, MemoryError):
         raise
     except Exception as error:
         raise UnreadableError(reason_of(error)) from error

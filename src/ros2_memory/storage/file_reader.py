@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.storage.base import BagReader, batched
 from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.errors import raise_if_lost, reading
@@ -22,6 +23,10 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Batch, Channel, Definition, Record
     from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.sqlite_bag import SqliteBags
+
+
+MUCH_DECODED_BYTES: Final = 1 << 20
+"""A larger message counts as large: decoded it may take thirty times as much."""
 
 
 class OpenedBag(NamedTuple):
@@ -43,13 +48,15 @@ class FileReader(BagReader):
 
     Args:
         custom_msg_paths: folders of `.msg` files for types that a bag holds no definition of.
+        large: the turn to hold much of a bag.
 
     Raises:
         ConfigError: one of the paths cannot be used.
     """
 
-    def __init__(self, custom_msg_paths: Sequence[Path | str]) -> None:
+    def __init__(self, custom_msg_paths: Sequence[Path | str], large: LargeReads) -> None:
         self._decoding = Decoding(custom_msg_paths)
+        self._large = large
 
     @abstractmethod
     def _open(self, path: Path) -> AbstractContextManager[OpenedBag]:
@@ -97,6 +104,8 @@ class FileReader(BagReader):
                 if isinstance(bags, McapBags):
                     yield from bags.batches(here, topics, window, bare)
                 else:
+                    if here.stat().st_size > LARGE_BYTES:
+                        self._large.take()
                     records = bags.records(here, topics, window, newest_first=False)
                     yield from batched(enumerate(records))
 
@@ -128,6 +137,8 @@ class FileReader(BagReader):
 
     def decode(self, record: Record) -> object:
         """Decodes the message of a record."""
+        if len(record.payload) > MUCH_DECODED_BYTES:
+            self._large.take()
         return self._decoding.decode(record)
 
     def definition(self, channel: Channel) -> Definition | None:

@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import TYPE_CHECKING
 
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.file_reader import FileReader, OpenedBag
@@ -37,6 +38,7 @@ class Rosbag2Reader(FileReader):
         unpack_max_mb: disk space that decompressed files may take in the folder for temporary
             files, in MiB.
         max_chunk_mb: decompressed size up to which a chunk or a message is read, in MiB.
+        large: the turn to hold much of a bag.
 
     Raises:
         ConfigError: one of the paths cannot be used.
@@ -48,10 +50,12 @@ class Rosbag2Reader(FileReader):
         cache_mb: int = 64,
         unpack_max_mb: int = 1024,
         max_chunk_mb: int = MAX_CHUNK_MB,
+        large: LargeReads | None = None,
     ) -> None:
-        super().__init__(custom_msg_paths)
-        self._mcap = McapBags(cache_mb, max_chunk_mb)
-        self._sqlite = SqliteBags(max_chunk_mb)
+        large = large or LargeReads()
+        super().__init__(custom_msg_paths, large)
+        self._mcap = McapBags(cache_mb, max_chunk_mb, large)
+        self._sqlite = SqliteBags(max_chunk_mb, large)
         self._scratch = Scratch(unpack_max_mb << 20)
 
     def reads(self, path: Path) -> bool:

@@ -20,6 +20,7 @@ from itertools import starmap, zip_longest
 from operator import eq
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import MAX_NS
@@ -140,9 +141,11 @@ class SqliteBags:
 
     Args:
         max_message_mb: size up to which a message, or another value of a file, is read, in MiB.
+        large: the turn to hold much of a bag.
     """
 
-    def __init__(self, max_message_mb: int = MAX_CHUNK_MB) -> None:
+    def __init__(self, max_message_mb: int = MAX_CHUNK_MB, large: LargeReads | None = None) -> None:
+        self._large = large or LargeReads()
         self._max_message_bytes = max_message_mb << 20
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
         # Whether the indexes of a file agree with its table.
@@ -249,7 +252,9 @@ class SqliteBags:
         if found[1:] != (time, number):
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
-        payload = uncompressed_payload(channel, found[0], self._max_message_bytes)
+        if len(found[0]) > LARGE_BYTES:
+            self._large.take()
+        payload = uncompressed_payload(channel, found[0], self._max_message_bytes, self._large.take)
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import threading
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import zstandard
 
+from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.errors import (
     MAX_COMPRESSION_RATIO,
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 # As large as a block, so that the data before a damaged block is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
 
+
+Uncompressed: TypeAlias = "Callable[[Channel, bytes], bytes]"
+"""Returns a payload as it was before rosbag2's message compression; see `uncompressed_payload`."""
 
 FRAME_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 _SKIPPABLE: Final = b"\x2a\x4d\x18"
@@ -105,8 +109,10 @@ class _Own(threading.local):
 _OWN: Final = _Own()
 
 
-def decompress_zstd(compressed: bytes, max_bytes: int) -> bytes:
-    """Decompresses one zstd frame.
+def decompress_zstd(
+    compressed: bytes, max_bytes: int, take_turn: Callable[[], None] = lambda: None
+) -> bytes:
+    """Decompresses one zstd frame; calls `take_turn` before that takes more than `LARGE_BYTES`.
 
     Raises:
         UnreadableError: it decompresses to more than `max_bytes`, or states more than its blocks
@@ -120,15 +126,27 @@ def decompress_zstd(compressed: bytes, max_bytes: int) -> bytes:
     if stated > (len(compressed) // _MIN_BLOCK_BYTES + 1) * _MAX_BLOCK_BYTES:
         raise UnreadableError("damaged: compressed data states more than it can hold")
     if stated >= 0:
+        if stated > LARGE_BYTES:
+            take_turn()
         return _OWN.decompressor.decompress(compressed)
-    with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
-        data = stream.read(max_bytes + 1)
+    data = zstd_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
+    if LARGE_BYTES < len(data) <= max_bytes:
+        take_turn()
+        data = zstd_front(compressed, max_bytes + 1)
     if len(data) > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
     return data
 
 
-def uncompressed_payload(channel: Channel, payload: bytes, max_bytes: int) -> bytes:
+def zstd_front(compressed: bytes, size: int) -> bytes:
+    """Returns the first `size` bytes of a zstd frame that may end early, or all that it has."""
+    with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
+        return stream.read(size)
+
+
+def uncompressed_payload(
+    channel: Channel, payload: bytes, max_bytes: int, take_turn: Callable[[], None]
+) -> bytes:
     """Returns a serialized message as it was before rosbag2's message compression.
 
     Nothing but the magic of the frame marks a compressed payload; no CDR message begins with it. A
@@ -138,7 +156,7 @@ def uncompressed_payload(channel: Channel, payload: bytes, max_bytes: int) -> by
     if channel.encoding != "cdr" or payload[:4] != FRAME_MAGIC:
         return payload
     try:
-        return decompress_zstd(payload, max_bytes)
+        return decompress_zstd(payload, max_bytes, take_turn)
     except (UnreadableError, zstandard.ZstdError, MemoryError):
         return payload
 

@@ -79,9 +79,11 @@ class TestReadingOnlyWhatIsWanted:
         path = write_mcap(tmp_path / "a.mcap", chatter(4, 300_000), SMALL)
         read_chunks: list[int] = []
 
-        def noting(file: OpenFile, chunk: Chunk, at_most: int) -> bytes:
+        def noting(
+            file: OpenFile, chunk: Chunk, at_most: int, take_turn: Callable[[], None]
+        ) -> bytes:
             read_chunks.append(chunk.offset)
-            return chunk_data(file, chunk, at_most)
+            return chunk_data(file, chunk, at_most, take_turn)
 
         monkeypatch.setattr(bag_file, "chunk_data", noting)
         reader = McapReader(cache_mb=1)

@@ -394,7 +394,8 @@ def signals_of(
         NoDataError: there is no message in this time, or none can be decoded.
     """
     view, extractor = asked.view, asked.memory.extractor
-    total, messages = view.pick(topic, asked.window, _MOST_SAMPLES)
+    total, picked = view.pick(topic, asked.window, _MOST_SAMPLES)
+    messages = [*picked]
     decoded = [(each, view.bags.decode(each)) for each in messages]
     readable = [(each, message) for each, message in decoded if message is not None]
     if not readable:

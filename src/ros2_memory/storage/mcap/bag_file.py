@@ -23,6 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Header
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import (
@@ -88,6 +89,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.zstd_bag import Uncompressed
 
 
 _LARGE_BYTES: Final = 8 << 20
@@ -129,10 +131,20 @@ class McapBags:
     Args:
         cache_mb: memory that indexes and decompressed chunks may take between calls, in MiB.
         max_chunk_mb: decompressed size up to which a chunk is read, in MiB.
+        large: the turn to hold much of a bag.
     """
 
-    def __init__(self, cache_mb: int = 64, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
+    def __init__(
+        self,
+        cache_mb: int = 64,
+        max_chunk_mb: int = MAX_CHUNK_MB,
+        large: LargeReads | None = None,
+    ) -> None:
         self._max_chunk_bytes = max_chunk_mb << 20
+        self._large = large or LargeReads()
+        self._uncompressed = partial(
+            uncompressed_payload, max_bytes=self._max_chunk_bytes, take_turn=self._large.take
+        )
         self._indexes: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
@@ -268,7 +280,7 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        for group in read_groups(file, chunks.together, self._max_chunk_bytes):
+        for group in read_groups(file, chunks.together, self._max_chunk_bytes, self._large.take):
             yield from self._batches_of_group(file, group, wanted, window, passed)
             del group  # before the next is read
         for chunk in chunks.alone:
@@ -285,7 +297,7 @@ class McapBags:
         """Yields the messages outside chunks."""
         loose = [column for channel, column in index.loose.items() if channel in wanted]
         column = joined([part.between(window.start, window.stop) for part in loose])
-        fetch = _fetch_loose(file, wanted, self._max_chunk_bytes)
+        fetch = _fetch_loose(file, wanted, self._uncompressed)
         pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
         return batched((loose_place(place), fetch(place, time)) for place, time in pairs)
 
@@ -300,7 +312,7 @@ class McapBags:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
         if group.buffer is not None:
             with suppress(UnreadableError, ValueError, IndexError):
-                batches = batches_of(group, wanted, window, self._max_chunk_bytes)
+                batches = batches_of(group, wanted, window, self._uncompressed)
                 passed.update({chunk.offset: chunk for chunk in group.chunks})
                 yield from batches
                 return
@@ -339,7 +351,7 @@ class McapBags:
             new = ~np.isin(column.places, known.places)
             column = Column(column.times[new], column.places[new])
         if column.times.size:
-            yield from batches_of_chunk(chunk, data, column, wanted, self._max_chunk_bytes)
+            yield from batches_of_chunk(chunk, data, column, wanted, self._uncompressed)
 
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         """Returns the latest message of the topic inside the window.
@@ -387,7 +399,7 @@ class McapBags:
         if best is None:
             return None
         time, _, place, data = best
-        return _fetch_from_chunk(data, wanted, self._max_chunk_bytes)(place, time)
+        return _fetch_from_chunk(data, wanted, self._uncompressed)(place, time)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
         """Returns the log times of a topic's messages inside the window, ascending.
@@ -445,13 +457,14 @@ class McapBags:
         last_used = lru_cache(1)(partial(self._chunk_data, file))
 
         def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
-            return _fetch_from_chunk(last_used(chunk), wanted, self._max_chunk_bytes)(place, time)
+            return _fetch_from_chunk(last_used(chunk), wanted, self._uncompressed)(place, time)
 
         def rows_of(chunk: Chunk) -> Rows[Record | LostError] | None:
+            last_used.cache_clear()  # before the next is decompressed
             # Of a chunk that cannot be read, only what is wanted by its index is lost.
             try:
                 with as_unreadable():
-                    data = self._chunk_data(file, chunk)
+                    data = last_used(chunk)
             except UnreadableError as error:
                 lost = self._lost(file, chunk, wanted, window, str(error))
                 return _lost_row(lost, newest_first=newest_first) if lost else None
@@ -459,7 +472,7 @@ class McapBags:
             column = joined([each.between(window.start, window.stop) for each in columns])
             if not column.times.size:
                 return None
-            fetch = _fetch_from_chunk(data, wanted, self._max_chunk_bytes)
+            fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
             if len(data) > _LARGE_BYTES:
                 fetch = partial(fetch_large, chunk)
             return _rows(column, fetch, newest_first=newest_first)
@@ -469,7 +482,7 @@ class McapBags:
         loose = [column for channel, column in index.loose.items() if channel in wanted]
         column = joined([part.between(window.start, window.stop) for part in loose])
         if column.times.size:
-            fetch = _fetch_loose(file, wanted, self._max_chunk_bytes)
+            fetch = _fetch_loose(file, wanted, self._uncompressed)
             rows = _rows(column, fetch, newest_first=newest_first)
             yield SortedRun(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
@@ -480,7 +493,7 @@ class McapBags:
         reason = self._contradictions.get(file.key)
         if reason is not None:
             return self._index_without_indexes(file, reason)
-        return self._cache_index(file, _read_index(file, self._max_chunk_bytes))
+        return self._cache_index(file, _read_index(file, self._max_chunk_bytes, self._large.take))
 
     def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
         self._indexes.put(file.key, index, index.memory_bytes)
@@ -588,6 +601,7 @@ class McapBags:
                 self._compared(file, chunk, data)
             except _ContradictedError as error:
                 raise _ContradictedError(str(error)) from error
+            del data  # before the next is read
 
     def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> list[Column]:
         """Returns all messages of a chunk, compared with its records.
@@ -631,6 +645,7 @@ class McapBags:
                 columns = self._compared(file, chunk, data)
                 if index.declared is not None:
                     _require_declared(index.declared, data, columns)
+                del data  # before the next is read
         except _ContradictedError as error:
             return self._distrust(file, error)
         return index
@@ -643,25 +658,25 @@ class McapBags:
         return self._index_without_indexes(file, reason)
 
     def _index_without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
-        index = index_by_scan(file, self._max_chunk_bytes, reason)
+        index = index_by_scan(file, self._max_chunk_bytes, reason, self._large.take)
         return self._cache_index(file, index._replace(contradiction=reason))
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
         data = self._chunks.get(key)
         if data is None:
-            data = chunk_data(file, chunk, self._max_chunk_bytes)
+            data = chunk_data(file, chunk, self._max_chunk_bytes, self._large.take)
             self._chunks.put(key, data, len(data))
         return data
 
 
-def _read_index(file: OpenFile, max_chunk_bytes: int) -> McapIndex:
+def _read_index(file: OpenFile, max_chunk_bytes: int, take_turn: Callable[[], None]) -> McapIndex:
     if not is_finished(file):
-        return index_by_scan(file, max_chunk_bytes)
+        return index_by_scan(file, max_chunk_bytes, take_turn=take_turn)
     try:
         return index_from_summary(file)
     except DoubtError as doubt:
-        return index_by_scan(file, max_chunk_bytes, str(doubt))
+        return index_by_scan(file, max_chunk_bytes, str(doubt), take_turn)
 
 
 def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:
@@ -770,7 +785,7 @@ def _rows(
 
 
 def _fetch_from_chunk(
-    data: bytes, channels: dict[int, Channel], max_bytes: int
+    data: bytes, channels: dict[int, Channel], uncompressed: Uncompressed
 ) -> Callable[[int, Ns], Record]:
     """Returns what fetches messages from a decompressed chunk."""
     unpack = MESSAGE.unpack_from
@@ -783,37 +798,37 @@ def _fetch_from_chunk(
         end = place + RECORD.size + length
         if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
             raise UnreadableError(NOT_THERE)
+        channel = _channel(channels, number)
         payload = data[place + MESSAGE.size : end]
-        return _record(channels, number, log_time, publish_time, payload, max_bytes=max_bytes)
+        return _record(channel, log_time, publish_time, payload, uncompressed)
 
     return fetch
 
 
 def _fetch_loose(
-    file: OpenFile, channels: dict[int, Channel], max_bytes: int
+    file: OpenFile, channels: dict[int, Channel], uncompressed: Uncompressed
 ) -> Callable[[int, Ns], Record]:
     """Returns what fetches messages outside of chunks."""
 
     def fetch(place: int, time: Ns) -> Record:
         head = MESSAGE.unpack(file.read(place, MESSAGE.size))
+        channel = _channel(channels, head[2])
         payload = file.read(place + MESSAGE.size, head[1] + RECORD.size - MESSAGE.size)
-        return _record(channels, head[2], time, head[5], payload, max_bytes=max_bytes)
+        return _record(channel, time, head[5], payload, uncompressed)
 
     return fetch
 
 
-def _record(
-    channels: dict[int, Channel],
-    number: int,
-    log_time: Ns,
-    publish_time: Ns,
-    payload: bytes,
-    *,
-    max_bytes: int,
-) -> Record:
+def _channel(channels: dict[int, Channel], number: int) -> Channel:
     channel = channels.get(number)
     if channel is None:
         raise UnreadableError("damaged: a message is not of the channel that its index says")
+    return channel
+
+
+def _record(
+    channel: Channel, log_time: Ns, publish_time: Ns, payload: bytes, uncompressed: Uncompressed
+) -> Record:
     if payload.startswith(FRAME_MAGIC):
-        payload = uncompressed_payload(channel, payload, max_bytes)
+        payload = uncompressed(channel, payload)
     return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import BATCH_BYTES, Batch
 from ros2_memory.storage.errors import MAX_CHUNK_MESSAGES, UnreadableError
@@ -24,16 +26,17 @@ from ros2_memory.storage.mcap.chunk import (
     decompressed_chunk,
 )
 from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
-from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import Channel, IntArray, Mask
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import Column
     from ros2_memory.storage.mcap.summary import Chunk
+    from ros2_memory.storage.zstd_bag import Uncompressed
 
 MAX_GROUP_CHUNKS: Final = 4096
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
@@ -93,12 +96,18 @@ class ReadChunks(NamedTuple):
 
 
 def read_groups(
-    file: OpenFile, chunks: Sequence[Chunk], max_chunk_bytes: int
+    file: OpenFile,
+    chunks: Sequence[Chunk],
+    max_chunk_bytes: int,
+    take_turn: Callable[[], None],
 ) -> Iterator[ReadChunks]:
     """Yields chunks, decompressed in groups of up to `BATCH_BYTES`; a larger one comes alone.
 
+    `take_turn` is called before a group takes more than `LARGE_BYTES`.
+
     Raises:
         OSError, MemoryError: the disk or the machine fails.
+        EpisodicError: what `take_turn` raises.
     """
     whole = _at_once(file, chunks)
     begin = 0
@@ -117,12 +126,14 @@ def read_groups(
                 end += 1
                 head = chunk_head(body)
                 compressed = body[head.data_at : head.data_at + head.data_size]
-                parts.append(decompressed_chunk(head, compressed, max_chunk_bytes))
+                parts.append(decompressed_chunk(head, compressed, max_chunk_bytes, take_turn))
                 indexes.append(index)
                 left -= len(parts[-1])
+                if BATCH_BYTES - left > LARGE_BYTES:
+                    take_turn()
             del body
             buffer = parts[0] if len(parts) == 1 else b"".join(parts)
-        except (OSError, MemoryError):
+        except (OSError, MemoryError, EpisodicError):
             raise
         except Exception:  # noqa: BLE001, S110 - whoever reads them one by one finds the reason
             pass
@@ -223,7 +234,10 @@ def _pairs(chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: IntArray) 
 
 
 def batches_of(
-    content: ReadChunks, channels: Mapping[int, Channel], window: TimeWindow, max_bytes: int
+    content: ReadChunks,
+    channels: Mapping[int, Channel],
+    window: TimeWindow,
+    uncompressed: Uncompressed,
 ) -> Sequence[Batch]:
     """Returns the messages of some channels in decompressed chunks, compared with the records.
 
@@ -231,7 +245,7 @@ def batches_of(
         content: the chunks.
         channels: the wanted channels by their number.
         window: of log time.
-        max_bytes: the size up to which compressed messages are read.
+        uncompressed: decompresses messages.
 
     Raises:
         UnreadableError: the indexes do not agree with the records, or messages end past their
@@ -288,7 +302,7 @@ def batches_of(
             starts[rows],
             lengths[rows],
         )
-        found += _decompressed(batch, max_bytes) if has_frames else [batch]
+        found += _decompressed(batch, uncompressed) if has_frames else [batch]
     return found
 
 
@@ -306,7 +320,11 @@ def _published(stated: IntArray, logged: IntArray) -> IntArray:
 
 
 def batches_of_chunk(
-    chunk: Chunk, data: bytes, column: Column, channels: Mapping[int, Channel], max_bytes: int
+    chunk: Chunk,
+    data: bytes,
+    column: Column,
+    channels: Mapping[int, Channel],
+    uncompressed: Uncompressed,
 ) -> Iterator[Batch]:
     """Yields some messages of one decompressed chunk, whose indexes may be missing.
 
@@ -334,10 +352,10 @@ def batches_of_chunk(
     for number in np.unique(numbers).tolist():
         channel = channels[number]
         whole = Batch(channel, times, published, places, data, starts, sizes)
-        yield from _decompressed(whole.taken(numbers == number), max_bytes)
+        yield from _decompressed(whole.taken(numbers == number), uncompressed)
 
 
-def _decompressed(batch: Batch, max_bytes: int) -> Iterator[Batch]:
+def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
     """Yields a batch; or several where rosbag2 compressed each message."""
     compressed = _are_frames(batch.buffer, batch.starts, batch.sizes)
     if batch.channel.encoding != "cdr" or not compressed.any():
@@ -348,7 +366,7 @@ def _decompressed(batch: Batch, max_bytes: int) -> Iterator[Batch]:
     for nth in range(compressed.size):
         payload = batch.payload(nth)
         if compressed[nth]:
-            payload = uncompressed_payload(batch.channel, payload, max_bytes)
+            payload = uncompressed(batch.channel, payload)
         payloads.append(payload)
         size += len(payload)
         if size >= BATCH_BYTES or nth == compressed.size - 1:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import lz4.frame  # type: ignore[import-untyped]  # has no types
 import numpy as np
-import zstandard
 from mcap.opcode import Opcode
 
+from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import (
     MAX_CHUNK_DECLARATIONS,
@@ -30,7 +30,7 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE_FIELDS,
     RECORD,
 )
-from ros2_memory.storage.zstd_bag import decompress_zstd
+from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -407,17 +407,23 @@ def chunk_head(body: bytes) -> ChunkHead:
     return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
 
 
-def decompressed_chunk(head: ChunkHead, compressed: bytes, max_bytes: int) -> bytes:
+def decompressed_chunk(
+    head: ChunkHead,
+    compressed: bytes,
+    max_bytes: int,
+    take_turn: Callable[[], None] = lambda: None,
+) -> bytes:
     """Decompresses a whole chunk, and verifies its checksum if it has one.
 
-    Nothing is allocated by the size that the chunk states.
+    Nothing is allocated by the size that the chunk states. `take_turn` is called before it takes
+    more than `LARGE_BYTES`.
 
     Raises:
         UnreadableError: it is damaged, larger than `max_bytes`, or its compression is unknown.
     """
     if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
-    data = _decompressed(head.compression, compressed, max_bytes)
+    data = _decompressed(head.compression, compressed, max_bytes, take_turn)
     if len(data) > max_bytes:
         raise UnreadableError(too_large("a chunk", max_bytes))
     if head.crc and zlib.crc32(data) != head.crc:
@@ -425,20 +431,40 @@ def decompressed_chunk(head: ChunkHead, compressed: bytes, max_bytes: int) -> by
     return data
 
 
-def decompressed_prefix(head: ChunkHead, compressed: bytes, max_bytes: int) -> bytes:
+def decompressed_prefix(
+    head: ChunkHead,
+    compressed: bytes,
+    max_bytes: int,
+    take_turn: Callable[[], None] = lambda: None,
+) -> bytes:
     """Decompresses the front of a chunk that its file ends in."""
     if head.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(compressed) as stream:
-            return stream.read(max_bytes)
-    return _decompressed(head.compression, compressed, max_bytes)[:max_bytes]
+        data = zstd_front(compressed, min(LARGE_BYTES, max_bytes))
+        if len(data) < LARGE_BYTES:
+            return data
+        take_turn()
+        return zstd_front(compressed, max_bytes)
+    return _decompressed(head.compression, compressed, max_bytes, take_turn)[:max_bytes]
 
 
-def _decompressed(compression: str, compressed: bytes, max_bytes: int) -> bytes:
+def _decompressed(
+    compression: str, compressed: bytes, max_bytes: int, take_turn: Callable[[], None]
+) -> bytes:
     """Returns at most one byte more than `max_bytes`, so that the caller sees the excess."""
     if not compression:
+        if len(compressed) > LARGE_BYTES:
+            take_turn()
         return compressed
     if compression == "zstd":
-        return decompress_zstd(compressed, max_bytes)
+        return decompress_zstd(compressed, max_bytes, take_turn)
     if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, max_bytes + 1))
+        data = _lz4_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
+        if LARGE_BYTES < len(data) <= max_bytes:
+            take_turn()
+            data = _lz4_front(compressed, max_bytes + 1)
+        return data
     raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
+
+
+def _lz4_front(compressed: bytes, size: int) -> bytes:
+    return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, size))

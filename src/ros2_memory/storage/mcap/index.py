@@ -49,7 +49,7 @@ from ros2_memory.storage.mcap.summary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from mcap.records import Statistics
 
@@ -238,8 +238,10 @@ def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
     return file.read(chunk.offset + chunk.length, chunk.index_length)
 
 
-def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
-    """Returns the decompressed records of a chunk.
+def chunk_data(
+    file: OpenFile, chunk: Chunk, max_bytes: int, take_turn: Callable[[], None] = lambda: None
+) -> bytes:
+    """Returns the decompressed records of a chunk; see `decompressed_chunk`.
 
     Raises:
         UnreadableError: the chunk is damaged or larger than `max_bytes`.
@@ -247,8 +249,8 @@ def chunk_data(file: OpenFile, chunk: Chunk, max_bytes: int) -> bytes:
     body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
     head, compressed = read_compressed_chunk(file, body_at, body_size, max_bytes)
     if chunk.usable is not None:
-        return decompressed_prefix(head, compressed, max_bytes)[: chunk.usable]
-    return decompressed_chunk(head, compressed, max_bytes)
+        return decompressed_prefix(head, compressed, max_bytes, take_turn)[: chunk.usable]
+    return decompressed_chunk(head, compressed, max_bytes, take_turn)
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:

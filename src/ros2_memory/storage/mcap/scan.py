@@ -41,7 +41,7 @@ from ros2_memory.storage.mcap.summary import Chunk
 from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from mcap.records import Statistics
 
@@ -55,18 +55,24 @@ if TYPE_CHECKING:
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
 
-def index_by_scan(file: OpenFile, max_chunk_bytes: int, note: str = "") -> McapIndex:
+def index_by_scan(
+    file: OpenFile,
+    max_chunk_bytes: int,
+    note: str = "",
+    take_turn: Callable[[], None] = lambda: None,
+) -> McapIndex:
     """Returns the index of the messages that can be read.
 
     Args:
         file: the open file.
         max_chunk_bytes: the decompressed size up to which a chunk is read; larger ones are noted.
         note: why the summary section was not used; empty where no user needs to know.
+        take_turn: is called before a chunk takes more than `LARGE_BYTES`.
 
     Raises:
         UnreadableError: the file is not MCAP, or is empty.
     """
-    scan = _Scan(file, max_chunk_bytes, ChunkOpener(file, max_chunk_bytes))
+    scan = _Scan(file, max_chunk_bytes, ChunkOpener(file, max_chunk_bytes, take_turn))
     for record in file_records(file):
         scan.add(record)
     return scan.index(note)

@@ -34,7 +34,7 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import ChunkContent
@@ -123,9 +123,15 @@ class ChunkOpener:
     A file of some MB can hold chunks that decompress to terabytes.
     """
 
-    def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
+    def __init__(
+        self,
+        file: OpenFile,
+        max_chunk_bytes: int,
+        take_turn: Callable[[], None] = lambda: None,
+    ) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
+        self._take_turn = take_turn
         self._bytes = 0
         self._chunks = 0
 
@@ -147,7 +153,7 @@ class ChunkOpener:
             head, compressed = read_compressed_chunk(
                 self._file, record.body_at, in_file, self._max_chunk_bytes
             )
-            data = decompress(head, compressed, self._max_chunk_bytes)
+            data = decompress(head, compressed, self._max_chunk_bytes, self._take_turn)
             self._bytes += len(data)
             content = walk_chunk(data)
         self._bytes += MESSAGE_BYTES * content.messages
