@@ -425,7 +425,7 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
         large=shared.large,
     )
-    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas))
+    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas), shared.large)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 

@@ -20,6 +20,7 @@ from ros2_memory.columns.walk import NotWalkedError, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.base import BATCH_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -280,7 +281,11 @@ class _Group:
         channel = batch.channel
         parts = self._parts.setdefault((channel.topic, channel.encoding, channel.schema), [])
         self.kinds.leave_out_large(batch)
-        table = _table(self.kinds, batch)
+        for piece in _pieces(batch):
+            self._add(parts, _table(self.kinds, piece))
+
+    def _add(self, parts: list[Table], table: Table) -> None:
+        """Adds a table to those of its topic, of which all have columns or none has."""
         if "" in table.left_out and parts and "" not in parts[0].left_out:
             parts[:] = [
                 replace(part, columns={}, elements={}, left_out=table.left_out) for part in parts
@@ -297,6 +302,16 @@ class _Group:
             _, parts = self._parts.popitem()
             found.append(joined(parts))
         return found[::-1]
+
+
+def _pieces(batch: Batch) -> Iterator[Batch]:
+    """Yields a batch of a large chunk in pieces: to walk one takes some times its bytes."""
+    if batch.sizes.sum() <= BATCH_BYTES:
+        yield batch
+        return
+    numbers = np.cumsum(batch.sizes) // BATCH_BYTES
+    for rows in np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers)) + 1):
+        yield batch.taken(rows)
 
 
 def _table(kinds: _Kinds, batch: Batch) -> Table:

@@ -7,7 +7,6 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
-from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.handover_file import sure_handover
@@ -260,7 +259,8 @@ class Filling:
             tables = self._whole(bag, first)
             return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
         begin = [first] if second is None else [first, second]
-        every = (self._whole(bag, tables) for tables in chain(begin, self._passing_on(groups)))
+        del first, second
+        every = self._each_once(bag, begin, groups)
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
         budget = self._share([bag]) + max(left, 0)
@@ -269,15 +269,20 @@ class Filling:
             key, bag, every, hashed=hashed, budget=budget, is_current=is_current
         )
 
-    def _passing_on(self, groups: Iterator[list[Table]]) -> Iterator[list[Table]]:
-        """Yields groups of tables, and lets others have their turn before each."""
+    def _each_once(
+        self, bag: BagFile, begin: list[list[Table]], groups: Iterator[list[Table]]
+    ) -> Iterator[list[Table]]:
+        """Yields groups of tables, each until the next is asked for; then others have a turn."""
         while True:
-            self._large.pass_on()
-            tables = next(groups, None)
-            if tables is None:
+            group = begin.pop(0) if begin else next(groups, None)
+            if group is None:
                 return
+            tables = self._whole(bag, group)
+            del group
             yield tables
-            del tables
+            tables.clear()  # who asks for the next still has the list
+            if not begin:
+                self._large.pass_on()
 
     def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)

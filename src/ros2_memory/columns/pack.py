@@ -52,6 +52,7 @@ import zstandard
 
 from ros2_memory.columns.steps import EXACT, MOST_RELATIVE, Step
 from ros2_memory.columns.table import IN_PART, Column, Numbers, Texts, Zone, letters_of
+from ros2_memory.core.large_reads import LARGE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -194,6 +195,11 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
 def compressed(data: bytes) -> bytes:
     """Returns the bytes as a zstd frame that states its size."""
     return zstandard.ZstdCompressor(level=LEVEL).compress(data)
+
+
+def is_large(data: bytes) -> bool:
+    """Returns whether `decompressed` returns more than `LARGE_BYTES`, as the frame states."""
+    return bool(data) and zstandard.frame_content_size(data) > LARGE_BYTES
 
 
 def decompressed(data: bytes) -> bytes:

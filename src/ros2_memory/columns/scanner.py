@@ -15,11 +15,12 @@ import numpy as np
 from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.fragments import Fragments
-from ros2_memory.columns.pack import Packed, decompressed, unpack
+from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Zone, column_bytes
 from ros2_memory.columns.units import GoneError, PartUnit
 from ros2_memory.columns.zones import PartZones, Zones
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -99,6 +100,7 @@ class Scanner:
         store: the store; None where nothing is stored.
         bag_dir: the bag directory.
         settings: what fragments depend on besides the bags, as a text.
+        large: the turn to hold much of a bag, which large columns need, too.
 
     Attributes:
         events: by part, what happened in it; of parts of which all rows count.
@@ -109,8 +111,15 @@ class Scanner:
         things: by settings, what was estimated of all bags of a timeline.
     """
 
-    def __init__(self, store: ColumnStore | None, bag_dir: Path, settings: str = "") -> None:
+    def __init__(
+        self,
+        store: ColumnStore | None,
+        bag_dir: Path,
+        settings: str = "",
+        large: LargeReads | None = None,
+    ) -> None:
         self.store = store
+        self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
         self._columns: ByteLru[Column] = ByteLru(48 << 20)
         self._known: ByteLru[Packed] = ByteLru(16 << 20)
@@ -281,6 +290,7 @@ class Scanner:
         topics = self.store.topics()
         if data is None or self.store.failures != failures:
             return None
+        self._wait_for(data)
         tables = unpack_tables(data, topics)
         return [table for number, table in tables if topics[number].channel.topic == topic]
 
@@ -296,10 +306,16 @@ class Scanner:
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError
+            self._wait_for(stored)
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
         self._columns.put((part, path), column, column_bytes(column))
         return column
+
+    def _wait_for(self, stored: bytes) -> None:
+        """Waits for the turn that what is stored needs where it is large."""
+        if is_large(stored):
+            self._large.take()
 
 
 class _PartColumns(Mapping[str, "Packed"]):
