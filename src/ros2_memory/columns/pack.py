@@ -198,8 +198,11 @@ def compressed(data: bytes) -> bytes:
 
 
 def is_large(data: bytes) -> bool:
-    """Returns whether `decompressed` returns more than `LARGE_BYTES`, as the frame states."""
-    return bool(data) and zstandard.frame_content_size(data) > LARGE_BYTES
+    """Returns whether `decompressed` returns more than `LARGE_BYTES`; False if it refuses it."""
+    try:
+        return zstandard.frame_content_size(data) > LARGE_BYTES
+    except zstandard.ZstdError:
+        return False
 
 
 def decompressed(data: bytes) -> bytes:
