@@ -10,12 +10,11 @@ import os
 import sys
 import time
 from collections import Counter
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-
-import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.state_files import read_losses
@@ -24,6 +23,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG
 from tests.support.live_recorder import NS_PER_S, bag_files, machine, number_of, publishing
 from tests.support.ros_processes import ros_environment, wait_for
+from tests.timing import each_in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -92,15 +92,20 @@ def missing(found: Counter[int]) -> int:
     return max(found) - min(found) + 1 - len(found)
 
 
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
+@contextmanager
+def site_in(folder: Path, real_recorder: RealRecorder) -> Iterator[Machine]:
+    """A robot's machine. Where no program runs for seconds there is a gap, and no loss."""
+    with ros_environment(folder, real=real_recorder) as env, machine(folder, env) as found:
         yield found
 
 
-def test_what_is_lost_under_load_is_counted(site: Machine) -> None:
+@each_in_time
+def test_what_is_lost_under_load_is_counted(real_recorder: RealRecorder, tmp_path: Path) -> None:
     """Publishers keep what waits, as what they overwrite is lost before anybody can count it."""
-    with publishing(site.env, *(f"{topic}:{HZ}:reliable:deep" for topic in LOAD)):
+    with (
+        site_in(tmp_path, real_recorder) as site,
+        publishing(site.env, *(f"{topic}:{HZ}:reliable:deep" for topic in LOAD)),
+    ):
         recorder = site.record(
             "load", *(() if LONG else ("recording.split_duration_s=2",)), topics=LOAD
         )
@@ -132,10 +137,15 @@ def test_what_is_lost_under_load_is_counted(site: Machine) -> None:
     assert cost.daemon_mb < MOST_DAEMON_MB
 
 
-def test_simulated_time_is_recorded_by_its_clock(site: Machine) -> None:
+@each_in_time
+def test_simulated_time_is_recorded_by_its_clock(
+    real_recorder: RealRecorder, tmp_path: Path
+) -> None:
     """Rotations and losses among it: the wall clock that paces them runs at another speed."""
-    with publishing(
-        site.env, "--speed", f"{SPEED:g}", "/odom:1:reliable:deep", "/rare:0.1:reliable:deep"
+    topics = ("/odom:1:reliable:deep", "/rare:0.1:reliable:deep")
+    with (
+        site_in(tmp_path, real_recorder) as site,
+        publishing(site.env, "--speed", f"{SPEED:g}", *topics),
     ):
         recorder = site.record(
             "simulated",

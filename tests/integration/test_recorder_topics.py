@@ -6,14 +6,13 @@ import json
 import os
 import signal
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
-
-import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.live_recorder import LiveRecorder, Machine, bag_files, machine, ticks
 from tests.support.ros_processes import Robot, publishing_robot, ros_environment, wait_for
+from tests.timing import each_in_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -25,17 +24,15 @@ if TYPE_CHECKING:
 TOPICS = ("/odom", "/tf", "/cmd_vel", "/px4/position")
 
 
-@pytest.fixture
-def site(real_recorder: RealRecorder, tmp_path: Path) -> Iterator[Machine]:
-    with ros_environment(tmp_path, real=real_recorder) as env, machine(tmp_path, env) as found:
-        yield found
-
-
-@pytest.fixture
-def robot(site: Machine, tmp_path: Path) -> Iterator[Robot]:
+@contextmanager
+def recorded_robot(folder: Path, real_recorder: RealRecorder) -> Iterator[tuple[Machine, Robot]]:
     options = ("--topics", *TOPICS, "--hz", "50")
-    with publishing_robot(site.env, tmp_path / "truth.json", *options) as found:
-        yield found
+    with (
+        ros_environment(folder, real=real_recorder) as env,
+        machine(folder, env) as site,
+        publishing_robot(site.env, folder / "truth.json", *options) as robot,
+    ):
+        yield site, robot
 
 
 def wait_until(recorder: LiveRecorder, says: Callable[[Heartbeat], bool], what: str) -> None:
@@ -46,54 +43,62 @@ def wait_until(recorder: LiveRecorder, says: Callable[[Heartbeat], bool], what: 
     wait_for(is_so, what, alive=recorder.process)
 
 
+@each_in_time
 def test_a_changed_list_loses_nothing_of_topics_that_stay(
-    site: Machine, robot: Robot, tmp_path: Path
+    real_recorder: RealRecorder, tmp_path: Path
 ) -> None:
-    recorder = site.record("listed", "recording.split_duration_s=2", topics=("/odom", "/tf"))
-    recorder.wait_for("split_closed", 4)
-    # The first recording has rosbag2's own queues of ten messages, which a busy machine overruns.
-    recorder.wait_for("rotated")
-    begun = time.time_ns()
-    before = len(recorder.events("rotated"))
-    file = tmp_path / "listed" / "topics.yaml"
-    file.write_text("topics: [/odom, /cmd_vel]\n")
-    [changed] = recorder.wait_for("topics_changed")
-    assert (changed["added"], changed["dropped"]) == (["/cmd_vel"], ["/tf"])
-    recorder.wait_for("rotated", before + 1)
-    wait_until(recorder, lambda beat: {*beat.subscribed} == {"/odom", "/cmd_vel"}, "the new list")
-    file.write_text("topics: nonsense\n")
-    wait_until(recorder, lambda beat: beat.list_refused is not None, "a refusal")
-    recorder.wait_for("split_closed", len(recorder.events("split_closed")) + 2)
-    recorder.stop()
-    robot.stop()
-    t0 = int(json.loads((tmp_path / "truth.json").read_text())["t0_ns"])
-    first = (begun - t0) * 50 // NS_PER_S
-    recorded = ticks(bag_files(recorder.bag_dir), t0, 50)
-    numbers = [each.number for each in recorded if each.number > first]
-    assert numbers == [*range(numbers[0], numbers[-1] + 1)]
+    with recorded_robot(tmp_path, real_recorder) as (site, robot):
+        recorder = site.record("listed", "recording.split_duration_s=2", topics=("/odom", "/tf"))
+        recorder.wait_for("split_closed", 4)
+        # The first recording has rosbag2's own queues of ten messages: a busy machine overruns them.
+        recorder.wait_for("rotated")
+        begun = time.time_ns()
+        before = len(recorder.events("rotated"))
+        file = tmp_path / "listed" / "topics.yaml"
+        file.write_text("topics: [/odom, /cmd_vel]\n")
+        [changed] = recorder.wait_for("topics_changed")
+        assert (changed["added"], changed["dropped"]) == (["/cmd_vel"], ["/tf"])
+        recorder.wait_for("rotated", before + 1)
+        wait_until(
+            recorder, lambda beat: {*beat.subscribed} == {"/odom", "/cmd_vel"}, "the new list"
+        )
+        file.write_text("topics: nonsense\n")
+        wait_until(recorder, lambda beat: beat.list_refused is not None, "a refusal")
+        recorder.wait_for("split_closed", len(recorder.events("split_closed")) + 2)
+        recorder.stop()
+        robot.stop()
+        t0 = int(json.loads((tmp_path / "truth.json").read_text())["t0_ns"])
+        first = (begun - t0) * 50 // NS_PER_S
+        recorded = ticks(bag_files(recorder.bag_dir), t0, 50)
+        numbers = [each.number for each in recorded if each.number > first]
+        assert numbers == [*range(numbers[0], numbers[-1] + 1)]
 
 
-def test_a_child_that_lives_and_writes_nothing_is_replaced(site: Machine, robot: Robot) -> None:
+@each_in_time
+def test_a_child_that_lives_and_writes_nothing_is_replaced(
+    real_recorder: RealRecorder, tmp_path: Path
+) -> None:
     """As rosbag2 issue 2463 has it; meanwhile a topic of an unknown type is named as such."""
-    recorder = site.record(
-        "stuck",
-        "recording.split_duration_s=2",
-        "recording.required=[/px4/*, {topic: /odom, min_hz: 10}]",
-        topics=TOPICS,
-    )
-    recorder.wait_for("subscribed", 3)
-    [stuck] = recorder.children()
-    os.kill(stuck.pid, signal.SIGSTOP)
-    try:
-        recorder.wait_for("no_growth")
-        recorder.wait_for("split_closed")
-        assert recorder.children()[-1].pid != stuck.pid
-        # Until the next heartbeat /odom is missing, too: nothing of it has come to the stuck child.
-        missing = ("/px4/position: ros2 bag record does not know its type",)
-        wait_until(recorder, lambda beat: beat.required_missing == missing, "what is required")
-        beat = recorder.heartbeat.heartbeat
-        assert beat is not None
-        assert (beat.unknown_types, beat.missing) == (("/px4/position",), ())
-    finally:
-        with suppress(ProcessLookupError):
-            os.kill(stuck.pid, signal.SIGCONT)
+    with recorded_robot(tmp_path, real_recorder) as (site, _):
+        recorder = site.record(
+            "stuck",
+            "recording.split_duration_s=2",
+            "recording.required=[/px4/*, {topic: /odom, min_hz: 10}]",
+            topics=TOPICS,
+        )
+        recorder.wait_for("subscribed", 3)
+        [stuck] = recorder.children()
+        os.kill(stuck.pid, signal.SIGSTOP)
+        try:
+            recorder.wait_for("no_growth")
+            recorder.wait_for("split_closed")
+            assert recorder.children()[-1].pid != stuck.pid
+            # Until the next heartbeat /odom is missing, too: the stuck child got nothing of it.
+            missing = ("/px4/position: ros2 bag record does not know its type",)
+            wait_until(recorder, lambda beat: beat.required_missing == missing, "what is required")
+            beat = recorder.heartbeat.heartbeat
+            assert beat is not None
+            assert (beat.unknown_types, beat.missing) == (("/px4/position",), ())
+        finally:
+            with suppress(ProcessLookupError):
+                os.kill(stuck.pid, signal.SIGCONT)
