@@ -50,7 +50,7 @@ def test_a_changed_list_loses_nothing_of_topics_that_stay(
     with recorded_robot(tmp_path, real_recorder) as (site, robot):
         recorder = site.record("listed", "recording.split_duration_s=2", topics=("/odom", "/tf"))
         recorder.wait_for("split_closed", 4)
-        # The first recording has rosbag2's own queues of ten messages: a busy machine overruns them.
+        # The first recording has rosbag2's own queues of ten messages, soon overrun.
         recorder.wait_for("rotated")
         begun = time.time_ns()
         before = len(recorder.events("rotated"))
