@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
@@ -117,34 +118,44 @@ class Robot:
     ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
-        With `lake` that is the memory of the lake, where there is one; the mounted one answers what
-        needs messages that the lake does not hold, and for a robot of which it has nothing.
-        `begin_of` returns from when an answer is, by it and the newest log time.
+        With `lake` the memory of the lake comes first, where it has anything of the robot; the
+        mounted one answers what needs messages that the lake does not have. Without `lake` the
+        mounted one comes first, unless it has no bag; the lake answers where it has no data, as
+        retention deletes bags. `begin_of` returns from when an answer is, by it and the newest log
+        time.
 
         Raises:
-            NotInLakeError: it needs those, and no other memory is mounted.
+            NoDataError: none of the two has an answer; it is that of the mounted one, if any.
+            NotInLakeError: it needs such messages, and no other memory is mounted.
         """
         source = self._lake_source
-        if source is not None and (lake or not self.is_mounted):
-            begin: Ns | None = None
+        if source is None:
+            return ask(self.memory()), None
+        if not lake and self._has_bags():
             try:
-                try:
-                    found = ask(source.memory)
-                    if source.latest is not None:
-                        begin = begin_of(found, source.latest)
-                finally:
-                    # Also of an answer that failed: they are not those of the next one.
-                    notes = (*source.notes(begin),)
-                if source.latest is not None or not self.is_mounted:
-                    return found, FromLake(source.latest, notes)
-            except NoDataError as error:
-                if source.latest is not None or not self.is_mounted:
-                    detail = "; ".join((error.detail, *notes))
-                    raise NoDataError(error.reason, detail, error.notes) from error
-            except NotInLakeError:
-                if not self.is_mounted:
-                    raise
+                return ask(self.memory()), None
+            except NoDataError:
+                with suppress(NoDataError, NotInLakeError):
+                    return _of_lake(source, ask, begin_of)
+                raise
+        try:
+            found = _of_lake(source, ask, begin_of)
+            if source.latest is not None or not self.is_mounted:
+                return found
+        except NoDataError:
+            if source.latest is not None or not self.is_mounted:
+                raise
+        except NotInLakeError:
+            if not self.is_mounted:
+                raise
         return ask(self.memory()), None
+
+    def _has_bags(self) -> bool:
+        """Returns whether there are bags besides those of the lake, or may be."""
+        if not self.is_mounted:
+            return False
+        snapshot = self.memory().index.snapshot()
+        return bool(snapshot.bags) or snapshot.problem is not None
 
     def latest_known(self) -> Ns:
         """Returns the log time of its newest data as of the last scan; the least before the first.
@@ -154,6 +165,24 @@ class Robot:
         published = None if self._memory is None else self._memory.index.published
         latest = None if published is None else published.latest
         return MIN_NS if latest is None else latest
+
+
+def _of_lake(
+    source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
+) -> tuple[T, FromLake]:
+    """Returns what `ask` finds in a lake, with its notes; raises what it raises."""
+    begin: Ns | None = None
+    try:
+        try:
+            found = ask(source.memory)
+            if source.latest is not None:
+                begin = begin_of(found, source.latest)
+        finally:
+            # Also of an answer that failed: they are not those of the next one.
+            notes = (*source.notes(begin),)
+    except NoDataError as error:
+        raise NoDataError(error.reason, "; ".join((error.detail, *notes)), error.notes) from error
+    return found, FromLake(source.latest, notes)
 
 
 class Fleet:

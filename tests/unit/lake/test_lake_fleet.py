@@ -22,7 +22,7 @@ from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.fleets import SEEN
-from tests.support.lakes import robot_bags, ship, write_bag
+from tests.support.lakes import START_S, robot_bags, ship, write_bag
 from tests.unit.lake.test_questions import reply
 
 CUP: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
@@ -50,6 +50,30 @@ def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -
     assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
     assert fleet.robots["attic"].is_mounted
     assert not fleet.robots["hall"].is_mounted
+
+
+@pytest.mark.parametrize("left", [0, 1], ids=["none", "the newest"])
+def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
+    tmp_path: Path, left: int
+) -> None:
+    bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    for bag in bags[: 2 - left]:
+        bag.unlink()
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    asked = {"robot": "hall", "topic": "/chatter"}
+    old = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 1})
+    assert old["value"] == {"value": "n1"}
+    assert old["notes"][-1].startswith("from the lake")
+    new = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 11})
+    assert new["value"] == {"value": "n101"}
+    assert ("notes" in new) is not left
+    found = reply(fleet, "data_time_range", {"robot": "hall"})
+    assert found["earliest"] == (START_S + 10 if left else START_S)
+    nothing = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 500})
+    assert nothing["error"] == "no_data"
+    assert ("lake" in json.dumps(nothing)) is not left
 
 
 def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_path: Path) -> None:

@@ -236,5 +236,5 @@ class LakeReader(BagReader):
 def _not_shipped(topic: str) -> NotInLakeError:
     return NotInLakeError(
         f"the lake has only the times of {topic}, whose messages are large: name it in "
-        "lake.messages of ros2-memory ship, or ask the robot's own memory"
+        "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's own memory"
     )
