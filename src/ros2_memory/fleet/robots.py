@@ -126,7 +126,7 @@ class Robot:
 
         Raises:
             NoDataError: none of the two has an answer; it is that of the mounted one, if any.
-            NotInLakeError: it needs such messages, and no other memory is mounted.
+            NotInLakeError: it needs such messages, and the robot has no bags of its own.
         """
         source = self._lake_source
         if source is None:
@@ -146,7 +146,7 @@ class Robot:
             if source.latest is not None or not self.is_mounted:
                 raise
         except NotInLakeError:
-            if not self.is_mounted:
+            if not self._has_bags():
                 raise
         return ask(self.memory()), None
 

@@ -6,6 +6,7 @@ import importlib.util
 import json
 import shutil
 from pathlib import Path
+from random import Random
 
 import anyio
 import pytest
@@ -16,11 +17,13 @@ from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.bootstrap_lake import engine_of
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
 from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
+from tests.support.bags import text, write_mcap
 from tests.support.fleets import SEEN
 from tests.support.lakes import START_S, robot_bags, ship, write_bag
 from tests.unit.lake.test_questions import reply
@@ -74,6 +77,24 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
     nothing = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 500})
     assert nothing["error"] == "no_data"
     assert ("lake" in json.dumps(nothing)) is not left
+
+
+def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    draw = Random(0)
+    long = [
+        text((START_S + nth) * NS_PER_S, draw.randbytes(2000).hex(), "/camera") for nth in range(30)
+    ]
+    write_mcap(tmp_path / "hall" / "rec" / "rec_1.mcap", long)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    for bag in (tmp_path / "hall").rglob("*.mcap"):
+        bag.unlink()
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    asked = {"robot": "hall", "topic": "/camera", "timestamp": START_S + 5}
+    assert reply(fleet, "get_topic_at_time", asked)["error"] == "not_in_lake"
+    asked = {"robot": "hall", "topic": "/camera", "condition_type": "contains", "value": "x"}
+    assert reply(fleet, "find_last_match", asked)["error"] == "not_in_lake"
 
 
 def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_path: Path) -> None:
