@@ -118,11 +118,11 @@ def assert_whole(bag_dir: Path) -> None:
         assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         rows = base.execute(
             "SELECT bag.path, bag.messages, bag.size,"
-            " EXISTS (SELECT 1 FROM split WHERE split.bag = bag.id),"
-            " (SELECT count(*) FROM part, json_each(part.bags) WHERE value = bag.id) FROM bag"
+            " (SELECT count(DISTINCT whole) FROM part, json_each(part.bags) WHERE value = bag.id)"
+            " FROM bag"
         ).fetchall()
-    for path, _, size, is_split, parts in rows:
-        assert size < 0 or bool(is_split) != bool(parts), path
+    for path, _, size, kinds in rows:
+        assert size < 0 or kinds == 1, path
 
 
 def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_answers(
@@ -183,7 +183,7 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
         whole = LongBag.end
         patch.setattr(LongBag, "end", end)
         patch.setattr(fill, "decoded", in_groups)
-        assert filling.fill(merge=False) == 1
+        assert filling.fill_alone() == 1
     assert found == [set()]
     assert asking.stored() == filling.stored() != set()
 

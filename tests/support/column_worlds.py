@@ -10,7 +10,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.stored import StoredTable
@@ -25,9 +25,11 @@ from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
+    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
     from ros2_memory.history.context import Memory
 
@@ -69,19 +71,25 @@ class World:
     def store(self) -> ColumnStore:
         return self.filling.store
 
-    def fill(self, *, merge: bool = True) -> int:
+    def fill(self) -> int:
         """Stores all that waits; returns how many bags were stored."""
         done = 0
         while True:
             timeline = self.memory.index.snapshot().timeline
-            stored = sum(self.filling.fill(bag, timeline) for bag in self.filling.waiting(timeline))
-            if merge:
-                make_fragments(self.memory, self.filling.merge(timeline))
-                self.filling.thin()
+            batches = self.filling.batches(timeline)
+            stored = sum(self.filling.fill(batch, timeline) for batch in batches)
+            make_fragments(self.memory, self.filling.whole_since())
+            self.filling.thin()
             self.filling.trim()
             if not stored:
                 return done
             done += stored
+
+    def fill_alone(self, bags: Iterable[BagFile] | None = None) -> int:
+        """Stores bags, all that wait, each in parts of its own; returns how many."""
+        timeline = self.memory.index.snapshot().timeline
+        some = self.filling.waiting(timeline) if bags is None else bags
+        return sum(self.filling.fill(Batch([bag], whole=False), timeline) for bag in some)
 
     def prune(self) -> None:
         self.filling.prune(self.memory.index.snapshot().timeline)

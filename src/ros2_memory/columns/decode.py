@@ -37,7 +37,7 @@ GROUP_BYTES: Final = 64 << 20
 BULKY_BYTES: Final = 64 << 10
 """In large files, topics with larger messages have no columns."""
 LARGE_FILE_BYTES: Final = 64 << 20
-"""A file counts as large, and what a small one decompresses to from there on."""
+"""Files of this size, or that decompressed to it so far, count as large."""
 BULKY_TYPES: Final = frozenset(
     {
         "sensor_msgs/msg/Image",
@@ -52,8 +52,8 @@ BULKY_TYPES: Final = frozenset(
 )
 """Images and clouds, which have no columns in any file."""
 _BULKY: Final = "images, clouds and the like have no columns"
-MOST_OF_ONE_BYTES: Final = LARGE_BYTES
-"""From the first larger message on its topic has no columns in a bag of any size."""
+LARGEST_MESSAGE_BYTES: Final = LARGE_BYTES
+"""A topic has no columns in a bag once a message of it is larger."""
 _NOT_ASKED: Final = "only times were asked for"
 _DECODED_BYTES: Final = 1 << 20
 """Payloads whose decoded messages are in memory at once."""
@@ -229,7 +229,7 @@ class _Kinds:
 
     def leave_out_large(self, batch: Batch) -> None:
         """Has no more columns made of a channel with large messages."""
-        most = MOST_OF_ONE_BYTES if self.read_bytes <= LARGE_FILE_BYTES else BULKY_BYTES
+        most = LARGEST_MESSAGE_BYTES if self.read_bytes <= LARGE_FILE_BYTES else BULKY_BYTES
         kind = self.of(batch.channel)
         if kind.plan is not None and batch.sizes.max() > most:
             self._known[id(batch.channel)] = replace(kind, plan=None, reason=_BULKY)

@@ -1,4 +1,4 @@
-"""Fills the store: decodes each closed bag that is missing, and merges splits into parts."""
+"""Fills the store: decodes each closed bag that is missing, and bags of ten minutes together."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.store import LONG_NS, BagKey
-from ros2_memory.columns.writing import PART_NS
+from ros2_memory.columns.writing import PART_NS, DecodedBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
@@ -43,6 +43,8 @@ LEAST_BYTES_PER_S: Final = 200
 """What the columns of a second may take however small the bags are."""
 IN_MEMORY_BYTES: Final = 64 << 20
 """What the store may take where no file can be written."""
+_MOST_HELD: Final = 64 << 20
+"""Bytes of columns after which bags become parts, though more of their ten minutes wait."""
 _TRIMMED_TO: Final = 0.9
 """A store above its limit is trimmed to this share of it."""
 _MOST_REFUSED: Final = 10_000
@@ -72,6 +74,16 @@ class Progress:
     stored: int = 0
     waiting: int = 0
     refused: int = 0
+
+
+class Batch(NamedTuple):
+    """Bags of one recording that are stored in the same parts.
+
+    `whole`: their ten minutes are over, and these are all bags of them that no whole parts have.
+    """
+
+    bags: Sequence[BagFile]
+    whole: bool
 
 
 class Filling:
@@ -140,58 +152,56 @@ class Filling:
             sum(map(self._is_refused, [*self._refused])),
         )
 
-    def fill(self, bag: BagFile, timeline: Timeline) -> bool:
-        """Stores one bag; returns False if it must wait, has changed meanwhile, or is refused."""
-        if not self._is_settled(bag):
-            return False
-        begun, refusals = time.perf_counter_ns(), self.store.refusals
-        try:
-            if self._is_renewed(bag):
-                return True
-            stored = self._store(bag, hashed=self._is_shared(bag, timeline))
-        except BagError as error:
-            self._refuse(bag, error.reason)
-            return False
-        except Exception as error:
-            log.exception("bag_not_stored", path=str(bag.path))
-            self._refuse(bag, type(error).__name__)
-            return False
-        if stored:
-            spent = ms_from_ns(time.perf_counter_ns() - begun)
-            log.debug("bag_stored", path=str(bag.path), duration_ms=round(spent, 3))
-        elif self.store.refusals > refusals:
-            self._refuse(bag, self.store.refused_for or "")
-        return stored
+    def batches(self, timeline: Timeline) -> list[Batch]:
+        """Returns the bags to be stored, the newest first: alone until their ten minutes are over.
 
-    def merge(self, timeline: Timeline) -> list[TimeWindow]:
-        """Makes parts of bags whose ten minutes are over and all stored.
-
-        They have all columns until `thin` is called: what follows from parts is made of these.
-
-        Returns:
-            The times in which there are parts since the last call, the newest first.
+        Then with those beside them that were stored alone.
         """
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        waiting = {self._slot(bag) for bag in self.waiting(timeline)}
-        slots: dict[tuple[str, Ns, bool], list[tuple[int, BagFile]]] = defaultdict(list)
-        hashed = self.store.hashed()
-        for number in sorted(self.store.splits()):
-            bag = coverage.bag(number)
-            if bag is not None and (slot := self._slot(bag)) not in waiting:
-                slots[(*slot, number in hashed)].append((number, bag))
-        for (_, begin, _), bags in slots.items():
+        stored = [coverage.bag(number) for number in self.store.unmerged()]
+        alone = [bag for bag in stored if bag and not self._is_refused(self._key(bag))]
+        slots: dict[tuple[str, Ns], list[BagFile]] = defaultdict(list)
+        found: list[Batch] = []
+        for bag in [*self.waiting(timeline), *alone]:
+            slots[self._slot(bag)].append(bag)
+        for (_, begin), bags in slots.items():
             if self._is_over(begin, timeline):
-                parts = self.store.merge([number for number, _ in bags])
-                if parts:
-                    self._merged.append((begin, begin + PART_NS))
-                    self._whole_parts.append((parts, [bag for _, bag in bags]))
+                found.append(Batch(bags, whole=True))
+            else:
+                found += [Batch([bag], whole=False) for bag in bags if bag not in alone]
+        return found
+
+    def fill(self, batch: Batch, timeline: Timeline) -> int:
+        """Stores bags; returns how many. Others must wait, have changed, or are refused."""
+        bags, whole = batch
+        hashed = any(self._is_shared(bag, timeline) for bag in bags)
+        decoded_bags: list[DecodedBag] = []
+        done = held = 0
+        for bag in sorted(bags, key=in_time):
+            found = self._decoded(bag, hashed=hashed)
+            self._large.release()
+            if isinstance(found, bool):
+                done += found
+                continue
+            decoded_bags.append(found)
+            held += sum(table.memory_bytes for table in found.tables)
+            if held > _MOST_HELD:
+                done += self._put(decoded_bags, hashed=hashed, whole=whole)
+                decoded_bags, held = [], 0
+        return done + self._put(decoded_bags, hashed=hashed, whole=whole)
+
+    def whole_since(self) -> list[TimeWindow]:
+        """Returns the times in which there are whole parts since the last call, the newest first.
+
+        They have all columns until `thin` is called: what follows from parts is made of these.
+        """
         merged, self._merged = united(self._merged), []
         return [TimeWindow(*span) for span in reversed(merged)]
 
     def thin(self) -> None:
-        """Drops columns of the parts that `merge` made, as far as they are beyond the share.
+        """Drops columns of the newest whole parts, as far as they are beyond the share.
 
         A robot that drives has more to store than one that stands: what other bags left of their
         share is theirs.
@@ -249,30 +259,70 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _store(self, bag: BagFile, *, hashed: bool) -> bool:
-        is_hashed = partial(_is_hashed, everything=hashed)
-        groups = decoded(self._reader, bag.path, hashed=is_hashed)
-        first = next(groups, [])
-        second = next(groups, None)
-        key, is_current = self._key(bag), partial(self._is_settled, bag)
-        if second is None and bag.end - bag.start <= LONG_NS:
-            tables = self._whole(bag, first)
-            return self.store.put(key, bag, tables, hashed=hashed, is_current=is_current)
-        begin = [first] if second is None else [first, second]
-        del first, second
-        every = self._each_once(bag, begin, groups)
+    def _decoded(self, bag: BagFile, *, hashed: bool) -> DecodedBag | bool:
+        """Returns a bag with its messages; or whether it is stored, where that is settled here."""
+        if not self._is_settled(bag):
+            return False
+        try:
+            if self._is_renewed(bag):
+                return True
+            groups = decoded(self._reader, bag.path, hashed=partial(_is_hashed, everything=hashed))
+            first = next(groups, [])
+            second = next(groups, None)
+            if second is None and bag.end - bag.start <= LONG_NS:
+                tables = self._whole(bag, first)
+                return DecodedBag(self._key(bag), bag, tables, partial(self._is_settled, bag))
+            begin = [first] if second is None else [first, second]
+            del first, second
+            return self._put_long(bag, self._released_groups(bag, begin, groups), hashed=hashed)
+        except BagError as error:
+            self._refuse(bag, error.reason)
+        except Exception as error:
+            log.exception("bag_not_stored", path=str(bag.path))
+            self._refuse(bag, type(error).__name__)
+        return False
+
+    def _put(self, bags: Sequence[DecodedBag], *, hashed: bool, whole: bool) -> int:
+        """Stores bags in parts together; each alone where the database refuses that."""
+        if not bags:
+            return 0
+        begun, refusals = time.perf_counter_ns(), self.store.refusals
+        written = self.store.put(bags, hashed=hashed, whole=whole)
+        if self.store.refusals > refusals:
+            if len(bags) > 1:
+                return sum(self._put([bag], hashed=hashed, whole=whole) for bag in bags)
+            self._refuse(bags[0].bag, self.store.refused_for or "")
+        if written.parts and whole:
+            begin = self._slot(bags[0].bag)[1]
+            self._merged.append((begin, begin + PART_NS))
+            self._whole_parts.append(([*written.parts], [bag.bag for bag in bags]))
+        if written.bags:
+            spent = ms_from_ns(time.perf_counter_ns() - begun)
+            log.debug("bags_stored", bags=written.bags, whole=whole, duration_ms=round(spent, 3))
+        return written.bags
+
+    def _put_long(self, bag: BagFile, groups: Iterator[list[Table]], *, hashed: bool) -> bool:
+        """Stores a bag as parts of ten minutes each, group by group."""
+        refusals = self.store.refusals
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
-        budget = self._share([bag]) + max(left, 0)
         self._merged.append((bag.start, bag.end + 1))
-        return self.store.put_long(
-            key, bag, every, hashed=hashed, budget=budget, is_current=is_current
+        is_stored = self.store.put_long(
+            self._key(bag),
+            bag,
+            groups,
+            hashed=hashed,
+            budget=self._share([bag]) + max(left, 0),
+            is_current=partial(self._is_settled, bag),
         )
+        if not is_stored and self.store.refusals > refusals:
+            self._refuse(bag, self.store.refused_for or "")
+        return is_stored
 
-    def _each_once(
+    def _released_groups(
         self, bag: BagFile, begin: list[list[Table]], groups: Iterator[list[Table]]
     ) -> Iterator[list[Table]]:
-        """Yields groups of tables, each until the next is asked for; then others have a turn."""
+        """Yields groups of tables. Each is freed, and the turn released, before the next."""
         while True:
             group = begin.pop(0) if begin else next(groups, None)
             if group is None:
@@ -282,7 +332,7 @@ class Filling:
             yield tables
             tables.clear()  # who asks for the next still has the list
             if not begin:
-                self._large.pass_on()
+                self._large.release()
 
     def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)

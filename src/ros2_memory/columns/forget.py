@@ -8,13 +8,11 @@ file is written again. And the write-ahead log has everything that was written l
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import time
 from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.columns.blob import topics_in
 from ros2_memory.columns.database import files_of, is_busy
 from ros2_memory.columns.store import TABLES
 from ros2_memory.columns.writing import delete_bags
@@ -146,13 +144,7 @@ def _beside_deleted(base: sqlite3.Connection) -> list[str]:
 
 def _delete_unused(base: sqlite3.Connection) -> None:
     """Deletes what only deleted bags had: topics, definitions, and what their summaries say."""
-    splits = base.execute("SELECT tables FROM split")
-    in_splits = {topic for (blob,) in splits for topic in topics_in(blob)}
-    base.execute(
-        "DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)"
-        " AND id NOT IN (SELECT value FROM json_each(?))",
-        (json.dumps([*in_splits]),),
-    )
+    base.execute("DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)")
     base.execute("DELETE FROM definition WHERE id NOT IN (SELECT definition FROM topic)")
     base.execute("DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)")
 

@@ -88,13 +88,12 @@ class Asked:
 
 
 class _Source(NamedTuple):
-    """Where rows come from: a part, or a bag with its number in the store (-1: not stored)."""
+    """Where rows come from: a part, or a bag that is not stored."""
 
     first: Ns
     last: Ns
     part: PartHead | None
     bag: BagFile | None = None
-    number: int = -1
 
 
 class Scan:
@@ -196,8 +195,8 @@ class Scan:
             failures = store.failures
             self._coverage = self._scanner.coverage(self._asked.timeline)
             found = [*self._found(reach)]
-            # Meanwhile another process may have made parts of splits, or the file may have failed:
-            # rows would be missing.
+            # Meanwhile another process may have replaced parts, or the file may have failed: rows
+            # would be missing.
             if self._coverage is None:
                 return found
             before, now = self._coverage.state, store.state()
@@ -219,12 +218,11 @@ class Scan:
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        splits = [(coverage.bag(number), number) for number in self._scanner.store.splits()]
-        for bag, number in [*splits, *((missing, -1) for missing in coverage.missing)]:
-            if bag is not None and bag.summary.of(topic):
+        for bag in coverage.missing:
+            if bag.summary.of(topic):
                 first, last = bag.summary.span_of([topic])
                 if reach.overlaps(first, last):
-                    yield _Source(first, last, None, bag, number)
+                    yield _Source(first, last, None, bag)
 
     def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is not None and self._coverage is not None:
@@ -233,12 +231,8 @@ class Scan:
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         known = self._decoded.get(source.bag.file)
         if known is None:
-            tables = None
-            if source.number >= 0:
-                tables = self._scanner.split(source.number, self._asked.topic)
-            if tables is None:
-                hashed = bool(self._shared) or self._asked.relatches
-                tables = _bounded(self._asked.decode(source.bag, self._asked.topic, hashed))
+            hashed = bool(self._shared) or self._asked.relatches
+            tables = _bounded(self._asked.decode(source.bag, self._asked.topic, hashed))
             known = [
                 BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
             ]

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.blob import unpack_tables
 from ros2_memory.columns.coverage import Covering
 from ros2_memory.columns.fragments import Fragments
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.stored import Topic
-    from ros2_memory.columns.table import Column, Table
+    from ros2_memory.columns.table import Column
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
@@ -282,18 +281,6 @@ class Scanner:
                 raise GoneError
         return None if known is _ABSENT else known
 
-    def split(self, number: int, topic: str) -> list[Table] | None:
-        """Returns the tables of a topic in a bag that is no part yet; None if they are gone."""
-        assert self.store is not None  # noqa: S101 - there are no splits without one
-        failures = self.store.failures
-        data = self.store.split_data(number)
-        topics = self.store.topics()
-        if data is None or self.store.failures != failures:
-            return None
-        self._wait_for(data)
-        tables = unpack_tables(data, topics)
-        return [table for number, table in tables if topics[number].channel.topic == topic]
-
     def _column(self, part: int, path: str, packed: Packed) -> Column:
         column = self._columns.get((part, path))
         if column is not None:
@@ -315,7 +302,7 @@ class Scanner:
     def _wait_for(self, stored: bytes) -> None:
         """Waits for the turn that what is stored needs where it is large."""
         if is_large(stored):
-            self._large.take()
+            self._large.acquire()
 
 
 class _PartColumns(Mapping[str, "Packed"]):

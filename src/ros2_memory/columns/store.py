@@ -1,12 +1,13 @@
 """The columns of closed bags in one SQLite file that outlives the process.
 
 Everything here is derived: deleting the file changes no answer, only how long it takes. A bag is
-stored whole or not at all. Until the ten minutes that it begins in are over, its columns lie in one
-row (`split`). Then those of one recording become parts, one for each topic (`part`), column by
-column (`part_column`). What is known of a column without unpacking it lies apart from the parts
-(`zone`), next to that of the same column in the other parts: a search reads it at once. A part has
-rows of several bags, and names them: rows of a bag that is not in `bag` any more do not count.
-What follows from parts, as the path of the poses in them, is stored with them (`fragment`).
+stored whole or not at all, as parts, one for each topic (`part`), column by column (`part_column`).
+Once the ten minutes that it begins in are over, whole parts take the place of its own: they have
+the rows of all bags of its recording that begin in them. What is known of a column without
+unpacking it lies apart from the parts (`zone`), next to that of the same column in the other parts:
+a search reads it at once. A part names the bags that it has rows of: rows of a bag that is not in
+`bag` any more do not count. What follows from whole parts, as the path of the poses in them, is
+stored with them (`fragment`).
 
 A bag is known by its path below the bag directory, its size and mtime, and the mtime of the sidecar
 that says which of its messages count. Its number is never used twice.
@@ -16,30 +17,26 @@ from __future__ import annotations
 
 import json
 import os
-from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.database import Database, Tables
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
-from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
+    UNMERGED,
+    DecodedBag,
     Layouts,
     LongBag,
     delete_bags,
-    insert_bag,
-    insert_parts,
-    lacks_definitions,
+    insert_bags,
     thin_parts,
-    topic_of,
     zone_of,
 )
 from ros2_memory.columns.zones import Zones
@@ -69,7 +66,6 @@ TABLES: Final = Tables(
         "summary",
         "topic",
         "definition",
-        "split",
         "part",
         "part_column",
         "zone",
@@ -92,11 +88,11 @@ CREATE TABLE topic (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL,
   UNIQUE (name, encoding, latched, definition, layout));
 CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TEXT NOT NULL,
   text BLOB NOT NULL, UNIQUE (type, encoding, text));
-CREATE TABLE split (bag INTEGER PRIMARY KEY, tables BLOB NOT NULL);
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL);
+  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, whole INTEGER NOT NULL);
 CREATE INDEX part_of_topic ON part (topic);
+CREATE INDEX part_not_whole ON part (id) WHERE NOT whole;
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
   data BLOB, UNIQUE (part, path));
 CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
@@ -142,7 +138,7 @@ class State(NamedTuple):
     """What changes with every change of the store.
 
     Attributes:
-        part: the newest part: while it is the same, splits became no parts.
+        part: the newest part.
         deletion: the newest deletion: while it is the same, what was stored is stored.
         change: the newest change, of another connection or of this one.
     """
@@ -150,6 +146,13 @@ class State(NamedTuple):
     part: int
     deletion: int
     change: tuple[int, int]
+
+
+class Written(NamedTuple):
+    """How many bags are stored, and the numbers of the parts that were made of them."""
+
+    bags: int
+    parts: tuple[int, ...]
 
 
 class StoredBag(NamedTuple):
@@ -178,6 +181,7 @@ class PartHead:
         bags: the numbers of the bags that its rows are of, ascending.
         messages: how many rows it has.
         dropped: the paths of its columns that are beyond the topic's share.
+        is_whole: whether it stays as it is, as its ten minutes are over.
     """
 
     number: int
@@ -187,6 +191,7 @@ class PartHead:
     bags: IntArray
     messages: int
     dropped: tuple[str, ...]
+    is_whole: bool
 
 
 class ColumnStore(Database):
@@ -276,24 +281,11 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def splits(self) -> frozenset[int]:
-        """Returns the numbers of the bags that are not in parts yet."""
+    def unmerged(self) -> frozenset[int]:
+        """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
 
         def ask(connection: sqlite3.Connection) -> frozenset[int]:
-            return frozenset(
-                self.offset + row[0] for row in connection.execute("SELECT bag FROM split")
-            )
-
-        return self.read(ask, frozenset())
-
-    def hashed(self) -> frozenset[int]:
-        """Returns the numbers of the splits in which copies of messages can be recognised."""
-
-        def ask(connection: sqlite3.Connection) -> frozenset[int]:
-            rows = connection.execute(
-                "SELECT id FROM bag WHERE hashed AND id IN (SELECT bag FROM split)"
-            )
-            return frozenset(self.offset + row[0] for row in rows)
+            return frozenset(self.offset + row[0] for row in connection.execute(UNMERGED))
 
         return self.read(ask, frozenset())
 
@@ -376,7 +368,7 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped FROM part"
+                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped, whole FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?) AND id > ?"
                 " ORDER BY first_ns, id",
                 (topic, max(after - self.offset, 0)),
@@ -390,8 +382,9 @@ class ColumnStore(Database):
                     np.array(json.loads(bags), np.int64) + self.offset,
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
+                    bool(whole),
                 )
-                for number, of_topic, first, last, bags, messages, dropped in rows
+                for number, of_topic, first, last, bags, messages, dropped, whole in rows
             ]
 
         return self.read(ask, [])
@@ -435,17 +428,6 @@ class ColumnStore(Database):
                 " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
                 " WHERE own.part = ? AND own.path = ?",
                 (part - self.offset, path),
-            ).fetchone()
-            return None if row is None else row[0]
-
-        return self.read(ask, None)
-
-    def split_data(self, bag: int) -> bytes | None:
-        """Returns the packed tables of a bag; None if they are gone, or in parts by now."""
-
-        def ask(connection: sqlite3.Connection) -> bytes | None:
-            row = connection.execute(
-                "SELECT tables FROM split WHERE bag = ?", (bag - self.offset,)
             ).fetchone()
             return None if row is None else row[0]
 
@@ -521,40 +503,35 @@ class ColumnStore(Database):
 
         return self.write(write)
 
-    def put(
-        self,
-        key: BagKey,
-        bag: BagFile,
-        tables: Sequence[Table],
-        *,
-        hashed: bool,
-        is_current: Callable[[], bool] = lambda: True,
-    ) -> bool:
-        """Stores a bag, in place of what its path was stored with; returns whether it did.
+    def put(self, bags: Sequence[DecodedBag], *, hashed: bool, whole: bool) -> Written:
+        """Stores bags of one recording in the same parts, in place of what they were stored with.
+
+        One that is in whole parts stays as it is: another program has stored it.
 
         Args:
-            key: of the bag.
-            bag: the bag, for its times.
-            tables: all of its messages.
+            bags: all messages of each. One that changed meanwhile is left out.
             hashed: whether all tables have the hashes of their payloads.
-            is_current: whether the bag may be stored, asked once nobody else can write.
+            whole: whether their ten minutes are over, so that their parts stay as they are.
         """
-        stored = False
+        written = Written(0, ())
 
         def write(connection: sqlite3.Connection) -> None:
-            nonlocal stored
-            stored = is_current()
-            if not stored:
-                return
-            delete_bags(connection, [key.path])
-            definitions = self._definitions if lacks_definitions(tables) else ""
-            number = insert_bag(connection, key, bag, definitions, hashed=hashed)
-            entries = [
-                Entry(*topic_of(connection, table, self._layouts), table) for table in tables
-            ]
-            connection.execute("INSERT INTO split VALUES (?, ?)", (number, pack_tables(entries)))
+            nonlocal written
+            rows = connection.execute(
+                "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE hashed >= ?"
+                " AND definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
+                f" AND id NOT IN ({UNMERGED})",
+                (hashed, self._definitions, json.dumps([bag.key.path for bag in bags])),
+            )
+            done = {BagKey(*row) for row in rows}
+            new = [bag for bag in bags if bag.key not in done and bag.is_current()]
+            delete_bags(connection, [bag.key.path for bag in new])
+            parts = insert_bags(
+                connection, new, self._definitions, self._layouts, hashed=hashed, whole=whole
+            )
+            written = Written(len(done) + len(new), tuple(self.offset + part for part in parts))
 
-        return self.write(write) and stored
+        return written if self.write(write) else Written(0, ())
 
     def renew(self, key: BagKey, bag: BagFile) -> bool:
         """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.
@@ -617,43 +594,6 @@ class ColumnStore(Database):
                 self.write(long.delete_half)
         return is_whole
 
-    def merge(self, bags: Sequence[int]) -> list[int]:
-        """Makes parts of bags of one recording; returns their numbers, none if it did not.
-
-        Args:
-            bags: their numbers. Nothing is done unless each of them is a split.
-        """
-        topics = self.topics()
-        made: list[int] = []
-
-        def write(connection: sqlite3.Connection) -> None:
-            made.clear()
-            numbers = [bag - self.offset for bag in bags]
-            rows = connection.execute(
-                "SELECT bag, tables FROM split WHERE bag IN (SELECT value FROM json_each(?))"
-                " ORDER BY bag",
-                (json.dumps(numbers),),
-            ).fetchall()
-            if len(rows) < len(numbers):
-                return  # another program merges them
-            found: dict[int, list[tuple[int, Table]]] = defaultdict(list)
-            for bag, blob in rows:
-                for topic, table in unpack_tables(blob, topics):
-                    if len(table):
-                        found[topic].append((bag, table))
-            packed = {
-                topic: [packed_part(topics[topic].layout, tables)]
-                for topic, tables in found.items()
-            }
-            made.extend(insert_parts(connection, packed))
-            connection.execute(
-                "DELETE FROM split WHERE bag IN (SELECT value FROM json_each(?))",
-                (json.dumps(numbers),),
-            )
-
-        is_written = self.write(write)
-        return [self.offset + part for part in made] if is_written else []
-
     def thin(self, parts: Sequence[int], at_least: int, spare: int) -> bool:
         """Drops the columns of the largest topics of some parts, beyond what these may take.
 
@@ -674,14 +614,14 @@ class ColumnStore(Database):
         return self.write(partial(delete_bags, paths=paths))
 
     def merged_bytes(self) -> tuple[int, int]:
-        """Returns the bytes of the bags that are in parts, and those of the columns of parts."""
+        """Returns the bytes of the bags that are in whole parts, and those of their columns."""
 
         def ask(connection: sqlite3.Connection) -> tuple[int, int]:
             [bags] = connection.execute(
-                "SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN (SELECT bag FROM split)"
+                f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
             ).fetchone()
             [columns] = connection.execute(
-                "SELECT total(bytes) FROM part WHERE dropped = ''"
+                "SELECT total(bytes) FROM part WHERE whole AND dropped = ''"
             ).fetchone()
             return int(bags), int(columns)
 

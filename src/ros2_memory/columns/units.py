@@ -40,7 +40,7 @@ class Unit(ABC):
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
         recording: that all the rows are of.
-        part: the number of the part; None where it is a bag's.
+        part: the number of the part; None where it may be replaced, or they are a bag's.
     """
 
     key: object
@@ -72,7 +72,7 @@ class Unit(ABC):
 
 
 class BagUnit(Unit):
-    """A table of one bag: decoded, or from its split. `nth` tells tables of one bag apart."""
+    """A table of a bag that is not stored. `nth` tells tables of one bag apart."""
 
     def __init__(self, bag: BagFile, table: Table, nth: int) -> None:
         self.key = (bag.file, nth)
@@ -118,7 +118,8 @@ class PartUnit(Unit):
         counting: IntArray,
         bag_of: Callable[[int], BagFile],
     ) -> None:
-        self.key = self.part = head.number
+        self.key = head.number
+        self.part = head.number if head.is_whole else None
         self.table = table
         self.first, self.last = head.first, head.last
         self.recording = bag_of(int(counting[0])).recording
@@ -191,7 +192,7 @@ class Rows:
 
     @property
     def part(self) -> int | None:
-        """The number of the part of which all rows count; None where it is not so."""
+        """The number of the whole part of which all rows count; None where it is not so."""
         return self._unit.part if self.index is None else None
 
     @property

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import ALWAYS, DROPPED, ZONE_ALONE, pack_rows
+from ros2_memory.columns.parts import ALWAYS, DROPPED, ZONE_ALONE, pack_rows, packed_part
 from ros2_memory.columns.table import Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -25,8 +25,26 @@ if TYPE_CHECKING:
 
 PART_NS: Final[Ns] = 600 * NS_PER_S
 """Bags of one recording that begin in the same ten minutes become one part for each topic."""
+UNMERGED: Final = "SELECT value FROM part, json_each(part.bags) WHERE NOT whole"
+"""Selects the bags whose parts are not those of whole ten minutes."""
 _MOST_INTEGER: Final = 2**63 - 1
 _MOST_LAYOUTS: Final = 4_096
+
+
+class DecodedBag(NamedTuple):
+    """A bag to be stored.
+
+    Attributes:
+        key: of the bag.
+        bag: the bag, for its times.
+        tables: all of its messages.
+        is_current: whether the bag may be stored, asked once nobody else can write.
+    """
+
+    key: BagKey
+    bag: BagFile
+    tables: Sequence[Table]
+    is_current: Callable[[], bool] = lambda: True
 
 
 class LongBag:
@@ -80,7 +98,7 @@ class LongBag:
             for rows in _in_parts(table) if len(table) else ():
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
-        parts = insert_parts(connection, packed)
+        parts = insert_parts(connection, packed, whole=True)
         thin_parts(connection, parts, round(self._share * sum(len(table) for table in tables)))
 
     def end(self, connection: sqlite3.Connection) -> None:
@@ -182,18 +200,47 @@ def insert_bag(
     return int(cursor.lastrowid or 0)
 
 
+def insert_bags(
+    connection: sqlite3.Connection,
+    bags: Sequence[DecodedBag],
+    definitions: str,
+    layouts: Layouts,
+    *,
+    hashed: bool,
+    whole: bool,
+) -> list[int]:
+    """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
+    tables: dict[int, list[tuple[int, Table]]] = defaultdict(list)
+    layout_of: dict[int, Layout] = {}
+    for bag in bags:
+        needed = definitions if lacks_definitions(bag.tables) else ""
+        number = insert_bag(connection, bag.key, bag.bag, needed, hashed=hashed)
+        for table in bag.tables:
+            topic, layout_of[topic] = topic_of(connection, table, layouts)
+            if len(table):
+                tables[topic].append((number, table))
+    packed = {topic: [packed_part(layout_of[topic], some)] for topic, some in tables.items()}
+    return insert_parts(connection, packed, whole=whole)
+
+
 def insert_parts(
-    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]]
+    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
 ) -> list[int]:
     """Inserts parts, by the numbers of their topics; returns their ids."""
-    return [_insert_part(connection, topic, part) for topic, some in parts.items() for part in some]
+    return [
+        _insert_part(connection, topic, part, whole=whole)
+        for topic, some in parts.items()
+        for part in some
+    ]
 
 
-def _insert_part(connection: sqlite3.Connection, topic: int, part: PackedPart) -> int:
+def _insert_part(
+    connection: sqlite3.Connection, topic: int, part: PackedPart, *, whole: bool
+) -> int:
     cursor = connection.execute(
-        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?)",
-        (topic, part.first, part.last, part.messages, json.dumps(part.bags), "", part.size),
+        "INSERT INTO part (topic, first_ns, last_ns, messages, bags, dropped, bytes, whole)"
+        " VALUES (?, ?, ?, ?, ?, '', ?, ?)",
+        (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, whole),
     )
     number = int(cursor.lastrowid or 0)
     connection.executemany(
@@ -307,7 +354,6 @@ def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     if not numbers:
         return
     connection.executemany("DELETE FROM bag WHERE id = ?", [(number,) for number in numbers])
-    connection.executemany("DELETE FROM split WHERE bag = ?", [(number,) for number in numbers])
     # A part goes with the last of its bags.
     gone = connection.execute(
         "SELECT id, topic FROM part WHERE NOT EXISTS"

@@ -32,7 +32,7 @@ from ros2_memory.things.seen import Watching
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.fill import Filling
+    from ros2_memory.columns.fill import Batch, Filling
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
@@ -97,13 +97,20 @@ class Backfill:
             return []
         return self.filling.waiting(snapshot.timeline)
 
-    def store(self, bag: BagFile) -> bool:
-        """Stores the columns of one bag; as `Filling.fill`."""
-        timeline = self._memory.index.snapshot().timeline
-        return self.filling is not None and self.filling.fill(bag, timeline)
+    def batches(self) -> list[Batch]:
+        """Returns the bags to be stored, as `Filling.batches`."""
+        snapshot = self._memory.index.snapshot()
+        if self.filling is None or snapshot.problem is not None:
+            return []
+        return self.filling.batches(snapshot.timeline)
 
-    def merge(self) -> bool:
-        """Makes parts of what is stored and over, and keeps the store within what it may take.
+    def store(self, batch: Batch) -> int:
+        """Stores the columns of some bags; as `Filling.fill`."""
+        timeline = self._memory.index.snapshot().timeline
+        return 0 if self.filling is None else self.filling.fill(batch, timeline)
+
+    def follow(self) -> bool:
+        """Makes what follows from whole parts, and keeps the store within what it may take.
 
         Then makes again, a few at a time, the newest first, what followed from parts under other
         settings.
@@ -114,7 +121,7 @@ class Backfill:
         snapshot = self._memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
             return False
-        make_fragments(self._memory, self.filling.merge(snapshot.timeline))
+        make_fragments(self._memory, self.filling.whole_since())
         self.filling.thin()
         self.filling.trim()
         if self._of_others is None:
@@ -168,7 +175,7 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         memory.columns.write_fragments()
-        memory.large.pass_on()
+        memory.large.release()
     memory.columns.write_fragments()
 
 
@@ -248,12 +255,15 @@ class Filler:
             waiting = await in_thread(backfill.waiting)
         if not waiting:
             await in_thread(backfill.write_again)
-        done = 0
-        for bag in waiting[: BACKLOG if self._helper else _BACKLOG_ALONE]:
-            done += await in_thread(partial(backfill.store, bag))
+        done = tried = 0
+        for batch in await in_thread(backfill.batches):
+            if tried >= (BACKLOG if self._helper else _BACKLOG_ALONE):
+                break
+            tried += len(batch.bags)
+            done += await in_thread(partial(backfill.store, batch))
             if store is not None and store.is_failing:
                 break
-        await in_thread(backfill.merge)
+        await in_thread(backfill.follow)
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
             await in_thread(backfill.precompute)
             self._is_precomputed = True

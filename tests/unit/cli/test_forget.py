@@ -237,9 +237,8 @@ def test_a_dry_run_leaves_the_columns(bag_dir: Path, forget: Forget) -> None:
 def unpacked(store: Path) -> bytes:
     """All that is packed in a store of columns."""
     with closing(sqlite3.connect(store)) as base:
-        splits = base.execute("SELECT tables FROM split").fetchall()
         columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    return b"".join(decompressed(blob) for (blob,) in [*splits, *columns])
+    return b"".join(decompressed(blob) for (blob,) in columns)
 
 
 def all_bytes(folder: Path) -> bytes:

@@ -165,9 +165,8 @@ def traces(root: Path, needle: str) -> list[str]:
 def columns_in(store: Path) -> Iterator[bytes]:
     """All that a store of columns packs, unpacked."""
     with closing(sqlite3.connect(store)) as base:
-        splits = base.execute("SELECT tables FROM split").fetchall()
         columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    yield from (decompressed(blob) for (blob,) in [*splits, *columns])
+    yield from (decompressed(blob) for (blob,) in columns)
 
 
 def indexed() -> None:

@@ -81,7 +81,7 @@ def test_the_newest_bag_comes_first_and_parts_are_made_of_ten_minutes(tmp_path: 
     assert [bag.path for bag in world.filling.waiting(timeline)] == paths[::-1]
     assert world.fill() == 13
     assert world.filling.waiting(timeline) == []
-    assert (count(world, "split"), count(world, "part")) == (0, 4)
+    assert (count(world, "part"), count(world, "part", "NOT whole")) == (4, 0)
     assert check_all(world) == 13 * 21
 
 
@@ -312,7 +312,7 @@ def test_a_bag_of_several_groups_becomes_parts_at_once(tmp_path: Path) -> None:
     write_long_bag(tmp_path)
     world = World.of(tmp_path)
     assert world.fill() == 1
-    assert count(world, "split") == 0
+    assert count(world, "part", "NOT whole") == 0
     assert count(world, "part") >= 12
     assert check_all(world) == 120
     assert check_all(World.of(tmp_path)) == 120
@@ -455,7 +455,7 @@ def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
             os.utime(folder / HANDOVER_FILE, ns=(T0, T0 + number * S))
         names.clear()
         world = World.of(tmp_path)
-        world.fill(merge=False)
+        world.fill_alone()
         assert names == [paths[nth].name for nth in stored]
         assert len(world.stored()) == 4
         assert check_all(world) > 0

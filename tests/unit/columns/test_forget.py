@@ -49,9 +49,8 @@ def secrets(number: int) -> list[bytes]:
 def packed(file: Path) -> list[bytes]:
     """All that is packed."""
     with closing(sqlite3.connect(file)) as base:
-        splits = base.execute("SELECT tables FROM split").fetchall()
         columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    return [bytes(blob) for (blob,) in [*splits, *columns]]
+    return [bytes(blob) for (blob,) in columns]
 
 
 def values(file: Path) -> dict[str, list[bytes]]:
@@ -91,7 +90,10 @@ def unpacked(file: Path) -> bytes:
     return b"".join(map(decompressed, packed(file)))
 
 
-DERIVED = {True: {"part", "part_column", "fragment", "zone"}, False: {"split"}}
+DERIVED = {
+    True: {"part", "part_column", "fragment", "zone"},
+    False: {"part", "part_column", "zone"},
+}
 
 
 @pytest.mark.parametrize("merged", DERIVED)
@@ -99,7 +101,7 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     for number in range(14):
         write_bag(tmp_path, number)
     world = World.of(tmp_path)
-    world.fill(merge=merged)
+    world.fill() if merged else world.fill_alone()
     file = store_file(tmp_path)
     before = {table: slices_of(some) for table, some in values(file).items()}
     there = bytes_of(file.parent) + unpacked(file)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import sqlite3
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.units import GoneError
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
@@ -19,7 +21,7 @@ from tests.support.bags import odom, text, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, check_rows
 
 if TYPE_CHECKING:
-    pass
+    from ros2_memory.columns.store import PartHead
 
 S = 10**9
 T0 = 1_700_000_000 * S
@@ -57,25 +59,26 @@ def test_parts_that_another_process_makes_meanwhile_hide_no_row(
 ) -> None:
     cut(tmp_path, [10, 30, 31, 60])
     world, other = World.of(tmp_path), World.of(tmp_path)
-    world.fill(merge=False)
+    world.fill_alone()
     assert check_rows(world, "/odom") == 40
-    splits = world.store.splits
+    parts = world.store.parts
 
-    def after_a_merge() -> frozenset[int]:
-        other.filling.merge(other.memory.index.snapshot().timeline)
-        return splits()
+    def after_a_merge(topic: str, after: int = 0) -> list[PartHead]:
+        other.fill()
+        return parts(topic, after)
 
-    monkeypatch.setattr(world.store, "splits", after_a_merge)
+    world = replace(world, memory=replace(world.memory, columns=Scanner(world.store, tmp_path)))
+    monkeypatch.setattr(world.store, "parts", after_a_merge)
     assert check_rows(world, "/odom") == 40
-    assert splits() == frozenset()
+    assert world.store.unmerged() == frozenset()
 
 
-@pytest.mark.parametrize("name", ["parts", "splits", "topics", "split_data", "state", "bags"])
+@pytest.mark.parametrize("name", ["parts", "topics", "part_data", "state", "bags"])
 def test_a_store_that_fails_while_it_is_asked_hides_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     cut(tmp_path, [10, 30, 31, 60])
-    World.of(tmp_path).fill(merge=name != "split_data")
+    World.of(tmp_path).fill()
     world = World.of(tmp_path)
     whole = getattr(world.store, name)
     read = world.store.read

@@ -21,8 +21,8 @@ from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_columns
 from ros2_memory.cli.maintenance.index import describe_progress, fill_store
-from ros2_memory.columns import fill, store
-from ros2_memory.columns.fill import Filling, Progress, StoreLimits
+from ros2_memory.columns import fill, writing
+from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.errors import BagError
@@ -87,10 +87,9 @@ def test_what_another_server_stored_as_well_does_not_wait(tmp_path: Path) -> Non
     for number in range(3):
         bag(tmp_path, number)
     (_, one), (_, other) = storing(tmp_path), storing(tmp_path)
-    both = other.waiting()
+    [batch] = other.batches()
     assert fill_store(one) == Progress(3, 3)
-    for each in both:
-        assert other.store(each)
+    assert other.store(batch) == 3
     assert one.waiting() == []
     assert other.waiting() == []
 
@@ -131,7 +130,7 @@ def test_what_the_database_refuses_is_told_of_and_not_tried_for_ever(
         raise OverflowError("too large")
 
     with monkeypatch.context() as patched:
-        patched.setattr(store, "pack_tables", too_large)
+        patched.setattr(writing, "packed_part", too_large)
         assert fill_store(backfill) == Progress(1, 0, 0, 1)
     (finding,) = check_columns(memory)
     assert "1 bag could not be stored (too large)" in finding.seen
@@ -146,9 +145,9 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     memory, backfill = storing(tmp_path, reading="after")
     assert memory.columns is not None
     before = len(memory.columns.fragments_of_others())
-    assert backfill.merge()
+    assert backfill.follow()
     assert 0 < len(memory.columns.fragments_of_others()) < before
-    while backfill.merge():
+    while backfill.follow():
         pass
     assert memory.columns.fragments_of_others() == []
     known = storing(tmp_path, reading="before")[0].columns
@@ -232,7 +231,7 @@ async def test_health_tells_how_much_is_stored(tmp_path: Path) -> None:
     for number in range(3):
         bag(tmp_path, number)
     memory, backfill = storing(tmp_path)
-    backfill.store(backfill.waiting()[0])
+    backfill.store(Batch(backfill.waiting()[:1], whole=False))
     reply = await Health(memory, "1.2.3", backfill)()
     assert reply["store"] == {"bags": 1, "waiting": 2, "refused": 0, "state": "filling"}
     assert backfill.filling is not None

@@ -143,14 +143,17 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
     A bag that changed a few seconds ago is left for a later run.
     """
     with _garbage_collected_rarely():
-        done = True
-        while done:
+        goes_on = True
+        while goes_on:
             progress = backfill.progress()
-            done = False
-            for number, bag in enumerate(backfill.waiting()[:_BATCH]):
-                show(replace(progress, stored=progress.stored + number))
-                done |= backfill.store(bag)
-            done |= backfill.merge()
+            done = tried = 0
+            for batch in backfill.batches():
+                if tried >= _BATCH:
+                    break
+                show(replace(progress, stored=min(progress.stored + done, progress.closed)))
+                tried += len(batch.bags)
+                done += backfill.store(batch)
+            goes_on = backfill.follow() or done > 0
     backfill.prune()
     backfill.precompute()
     return backfill.progress()

@@ -1,19 +1,16 @@
-"""All tables of a bag in one blob, and parts, whose columns are unpacked when asked for."""
+"""Parts, whose columns are unpacked when they are asked for."""
 
 from __future__ import annotations
 
-import hashlib
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
 
-from ros2_memory.columns.blob import Entry, pack_tables, unpack_tables
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.pack import FORMAT, compressed, decompressed, folded, unpack
+from ros2_memory.columns.pack import decompressed, folded, unpack
 from ros2_memory.columns.parts import packed_part, part_table
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Elements, Table, Texts, joined
@@ -67,16 +64,6 @@ def table(rows: int = 40, first: int = 0) -> Table:
     )
 
 
-def split(given: Table) -> Table:
-    """The table as it comes back from a blob."""
-    layout = Layout.of(given, None)
-    blob = pack_tables([Entry(3, layout, given)])
-    topics = {3: Topic(CHANNEL, Layout.from_json(layout.to_json()))}
-    ((number, back),) = unpack_tables(blob, topics)
-    assert number == 3
-    return back
-
-
 def part(*given: Table) -> StoredTable:
     """The tables as they come back from a part."""
     layout = Layout.of(given[0], None)
@@ -115,23 +102,6 @@ def leaves(rows: Table | Elements, around: str = "") -> Iterator[tuple[str, Colu
         yield from leaves(elements, f"{around}{path}.")
 
 
-def check(given: Table, back: Table) -> None:
-    """A table that comes back from a blob has the same times and values."""
-    assert back.log_times.tolist() == given.log_times.tolist()
-    published = given.log_times if given.payload_hashes is None else given.publish_times
-    assert back.publish_times.tolist() == published.tolist()
-    hashes, expected = (
-        None if some.payload_hashes is None else some.payload_hashes.tolist()
-        for some in (back, given)
-    )
-    assert hashes == expected
-    others = dict(leaves(back))
-    assert others.keys() == dict(leaves(given)).keys()
-    assert [differences(column, others[path]) for path, column in leaves(given)] == [0.0] * len(
-        others
-    )
-
-
 def check_part(given: Table, back: StoredTable) -> None:
     """All columns are within the stated errors, and zones are those of the given ones."""
     others = dict(leaves(back))
@@ -151,17 +121,6 @@ def check_part(given: Table, back: StoredTable) -> None:
         assert zone.nulls == len(numbers) - len(there)
         assert zone.least == (there.min() if len(there) else None)
         assert zone.greatest == (there.max() if len(there) else None)
-
-
-def test_a_table_comes_back_with_all_it_has() -> None:
-    given = table()
-    back = split(given)
-    check(given, back)
-    assert back.channel == given.channel
-    assert back.left_out == given.left_out
-    assert back.places.tolist() == [*range(len(given))]
-    hashed = replace(given, payload_hashes=np.arange(len(given)) + 2**32 - 9)
-    check(hashed, split(hashed))
 
 
 def test_a_part_states_its_zones_and_the_errors_of_what_was_rounded_alone() -> None:
@@ -185,28 +144,14 @@ def test_a_part_of_several_tables_is_that_of_all_their_rows() -> None:
     check_part(joined(given), part(*given))
 
 
-def test_a_table_without_rows_comes_back() -> None:
-    check(table(0), split(table(0)))
-    check(table(1), split(table(1)))
+def test_a_part_of_one_row_comes_back() -> None:
     check_part(table(1), part(table(1)))
-
-
-def test_a_blob_without_tables_is_one() -> None:
-    assert [*unpack_tables(pack_tables([]), {})] == []
 
 
 def test_a_table_of_another_layout_is_refused() -> None:
     layout = Layout.of(table(), None)
     with pytest.raises(ValueError, match="other columns"):
-        pack_tables([Entry(1, Layout({}), table())])
-    with pytest.raises(ValueError, match="other columns"):
         packed_part(Layout(layout.columns, layout.sequences), [(1, table())])
-
-
-def test_a_blob_of_another_format_is_refused() -> None:
-    raw = decompressed(pack_tables([]))
-    with pytest.raises(ValueError, match="format"):
-        [*unpack_tables(compressed(bytes([FORMAT + 1]) + raw[1:]), {})]
 
 
 def test_layouts_read_what_they_write() -> None:
@@ -232,7 +177,7 @@ def test_columns_are_unpacked_once_by_whoever_asks_first() -> None:
 )
 def test_tables_of_shared_bags_come_back(path: Path) -> None:
     reader = McapReader()
-    groups = decoded(reader, path, hashed=lambda channel: len(channel.topic) % 2 == 0)
+    groups = decoded(reader, path)
     while True:
         try:
             tables = next(groups, None)
@@ -240,23 +185,6 @@ def test_tables_of_shared_bags_come_back(path: Path) -> None:
             continue
         if tables is None:
             return
-        entries = [
-            Entry(nth, Layout.of(some, reader.definition(some.channel)), some)
-            for nth, some in enumerate(tables)
-        ]
-        topics = {nth: Topic(some.channel, layout) for nth, layout, some in entries}
-        back = unpack_tables(pack_tables(entries), topics)
-        for some, (_, other) in zip(tables, back, strict=True):
-            check(some, other)
+        for some in tables:
             if len(some):
                 check_part(some, part(some))
-
-
-def test_blobs_of_this_format_do_not_change() -> None:
-    layout = Layout.of(table(), None)
-    hashed = replace(table(), payload_hashes=np.arange(len(table())) * 7919)
-    raw = decompressed(pack_tables([Entry(1, layout, table()), Entry(2, layout, hashed)]))
-    assert (FORMAT, hashlib.sha256(raw).hexdigest()[:16]) == (7, "abf22cc3c24410d5"), (
-        "blobs are other bytes than before: raise FORMAT in columns/pack.py, so that stores are "
-        "filled anew, and pin the new number and hash here"
-    )

@@ -1,0 +1,50 @@
+"""The value of each row of a table as JSON text, so that rows can be told apart by it."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ros2_memory.columns.scores import is_object
+from ros2_memory.columns.shown import Shape, UnknownShapeError, children
+from ros2_memory.columns.table import Texts
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+
+if TYPE_CHECKING:
+    from ros2_memory.columns.table import Table
+    from ros2_memory.extract import SchemaExtractor
+
+
+def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
+    """Returns what `exact_at` of an extractor gives of a field of each row, without one `exact`.
+
+    None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
+    number: then the messages have to be read.
+    """
+    if table.definition is None or "" in table.left_out:
+        return None
+    name: str | None = None
+    try:
+        shape = Shape(table.definition, table.channel.type, extractor)
+        node = shape.value if field is None else shape.find(field)
+        if field is None and node is not None and is_object(node):
+            [(name, node)] = children(node)
+    except (UnknownShapeError, ValueError):  # more than one part
+        return None
+    if not isinstance(node, Leaf) or node.level is not ROWS or node.made is not Made.STORED:
+        return None
+    values = Values(table)
+    if node.kind is Kind.TEXT:
+        found = values.texts(node)
+    elif node.kind in {Kind.BOOLEAN, Kind.INTEGER} and (column := values.numbers(node)) is not None:
+        known, codes = np.unique(column.values, return_inverse=True)
+        whole = [json.dumps(each if name is None else {name: each}) for each in known.tolist()]
+        return Texts(codes.astype(np.uint32), tuple(whole))
+    else:
+        found = None
+    if found is None:
+        return None
+    words = tuple(json.dumps(each if name is None else {name: each}) for each in found.words)
+    return Texts(found.codes, words)
