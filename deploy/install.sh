@@ -14,10 +14,11 @@ umask 022
 
 usage() {
   cat <<'END'
-usage: deploy/install.sh [--query-only] [--no-package] [--root DIR]
+usage: deploy/install.sh [--query-only] [--no-package] [--topics FILE] [--root DIR]
 
   --query-only   the query server alone, for bags that something else records
   --no-package   leave /opt/ros2-memory/.venv as it is
+  --topics FILE  the list of topics to install, instead of config/topics.yaml
   --root DIR     install the files below DIR, for an image or a test: no package, no systemctl
 END
 }
@@ -30,11 +31,17 @@ die() {
 root=
 package=yes
 query_only=no
+topics=
 while [ $# -gt 0 ]; do
   case $1 in
     --root)
       [ $# -ge 2 ] && [ -n "$2" ] || die '--root needs a folder'
       root=$2
+      shift
+      ;;
+    --topics)
+      [ $# -ge 2 ] && [ -f "$2" ] || die '--topics needs a file'
+      topics=$2
       shift
       ;;
     --query-only) query_only=yes ;;
@@ -98,6 +105,7 @@ put() {
 # is as an earlier run installed it, or `configuration`, which is never replaced.
 place() {
   from=$here/../$1
+  [ "$1" != config/topics.yaml ] || from=${topics:-$from}
   to=$root$2
   before=$root$installed/${2##*/}
   if [ -e "$to" ] && cmp -s "$from" "$to"; then

@@ -100,7 +100,8 @@ def test_what_a_recorder_of_another_user_receives(
             "docs/how-to/systemd.md",
         ),
         ({"ROS_LOCALHOST_ONLY": "1"}, "docs/how-to/systemd.md"),
-        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, "RMW_IMPLEMENTATION"),
+        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, "CYCLONEDDS_URI"),
+        ({"RMW_IMPLEMENTATION": "rmw_connextdds"}, "RMW_IMPLEMENTATION"),
     ],
 )
 def test_the_advice_is_never_what_is_set_already(env: dict[str, str], advice: str) -> None:

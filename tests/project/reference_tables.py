@@ -156,6 +156,8 @@ def _kind(schema: Mapping[str, Any]) -> str:
         return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
     if schema.get("type") == [*TIME_KINDS]:
         return "time"
+    if isinstance(schema.get("type"), list):
+        return " or ".join(_kind({**schema, "type": each}) for each in schema["type"])
     kind = {
         "array": "list of times" if schema.get("items") == {"type": [*TIME_KINDS]} else "list",
         "boolean": "`true`, `false`",

@@ -48,6 +48,7 @@ ELSEWHERE: Final = {
 """Where blocks of a page, or of a section of it, are held by another test."""
 NOT_RUN: Final = {
     r"ros2-memory serve ": "tests/integration/test_server_process.py runs it",
+    r"ros2-memory up ": "tests/integration/test_up.py runs it",
     r"sudo |journalctl ": "changes the machine: systemd, for root",
     r"docker |.* docker compose ": "needs Docker",
     r"pip install |python3 -m venv |~/uv/bin/uv |\. ~/ros2-memory/bin/activate": (

@@ -70,6 +70,22 @@ def test_a_clean_root_has_all_that_the_units_need(tmp_path: Path) -> None:
     assert (tmp_path / "etc/ros2-memory").stat().st_mode & 0o777 == 0o755
 
 
+def test_a_list_of_topics_that_is_given_is_installed_and_replaces_none(tmp_path: Path) -> None:
+    mine, root = tmp_path / "mine.yaml", tmp_path / "root"
+    mine.write_text("topics: [/odom]\n")
+    installed(root, "--topics", str(mine))
+    listed = root / "etc/ros2-memory/topics.yaml"
+    assert listed.read_text() == "topics: [/odom]\n"
+    assert (root / ENVIRONMENT).read_bytes() == (DEPLOY / "environment").read_bytes()
+    mine.write_text("topics: [/tf]\n")
+    installed(root, "--topics", str(mine))
+    assert listed.read_text() == "topics: [/odom]\n"
+    assert listed.with_name("topics.yaml.new").read_text() == "topics: [/tf]\n"
+    refused = install(tmp_path / "other", "--topics", str(tmp_path / "missing"))
+    assert (refused.returncode, refused.stderr) == (1, "install.sh: --topics needs a file\n")
+    assert not (tmp_path / "other").exists()
+
+
 def test_every_folder_that_the_units_name_is_made(tmp_path: Path) -> None:
     installed(tmp_path)
     for unit in (RECORDER, SERVER):

@@ -32,6 +32,7 @@ import math
 import signal
 import time
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -57,7 +58,11 @@ TYPES: Final = {
     "/bumper": "std_msgs/msg/Bool",
     "/battery_state": "sensor_msgs/msg/BatteryState",
     "/vision/scene/scene_objects": "ros2_vision_interfaces/msg/VisionDetectionArray",
+    "/camera/image_raw": "sensor_msgs/msg/Image",
+    "/speech": "std_msgs/msg/String",
 }
+UNASKED: Final = {"/clock", "/px4/position", "/camera/image_raw", "/speech"}
+"""Topics that it publishes only where they are named."""
 # What a subscriber on a busy machine has not taken yet: seconds of the quickest topic.
 DEPTH: Final = 1000
 _PER_SECOND: Final = {"/bumper": 2.0, "/battery_state": 1.0, "/vision/scene/scene_objects": 1.0}
@@ -94,7 +99,7 @@ class Messages:
 
     def payload(self, topic: str, t: float) -> bytes:
         """The message published on `topic` t seconds after T0, as CDR."""
-        bodies = {
+        bodies: dict[str, Callable[[float], Any]] = {
             "/clock": lambda t: _of("rosgraph_msgs/msg/Clock", clock=_time(round(t * 1e9))),
             "/px4/position": self._local_position,
             "/odom": self._odometry,
@@ -104,6 +109,8 @@ class Messages:
             "/bumper": lambda t: _of("std_msgs/msg/Bool", data=0.0 <= t - self.bumps_s < 1.0),
             "/battery_state": self._battery,
             "/vision/scene/scene_objects": self._detections,
+            "/camera/image_raw": self._image,
+            "/speech": lambda t: _of("std_msgs/msg/String", data=f"what people say at {t:.0f} s"),
         }
         return bytes(typestore().serialize_cdr(bodies[topic](t), TYPES[topic]))
 
@@ -157,6 +164,18 @@ class Messages:
         forward = _of("geometry_msgs/msg/Vector3", x=RADIUS * TURN_RATE, y=0.0, z=0.0)
         turning = _of("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=TURN_RATE)
         return _of("geometry_msgs/msg/Twist", linear=forward, angular=turning)
+
+    def _image(self, t: float) -> Any:
+        return _of(
+            "sensor_msgs/msg/Image",
+            header=self._header(t, "camera"),
+            height=48,
+            width=64,
+            encoding="mono8",
+            is_bigendian=0,
+            step=64,
+            data=np.zeros(48 * 64, np.uint8),
+        )
 
     def _battery(self, t: float) -> Any:
         return _of(
@@ -298,7 +317,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--duration", type=float, default=math.inf, help="s")
     parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
-    default = [topic for topic in TYPES if topic not in {"/clock", "/px4/position"}]
+    default = [topic for topic in TYPES if topic not in UNASKED]
     parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
     parser.add_argument("--best-effort", action="store_true")
     parser.add_argument("--subscribers", type=int, default=0, help="to wait for, on each topic")

@@ -116,6 +116,15 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "answer questions over MCP, like ros2-memory-server",
         {0: "the server was stopped", 1: "it cannot listen on the address"},
     ),
+    "up": CommandEntry(
+        "up.up",
+        "on a robot: propose what to record, and record and serve it",
+        {
+            0: "stopped by Ctrl-C, and both programs have ended",
+            1: "the recorder or the server ended by itself (stderr has its last error), or you "
+            "answered no",
+        },
+    ),
     "index": CommandEntry(
         "maintenance.index.index",
         "store the columns of every bag now, so that answers take milliseconds",

@@ -57,6 +57,7 @@ from ros2_memory.insights.status import (
     unrecorded,
 )
 from ros2_memory.queries import data_time_range
+from ros2_memory.recorder.process.environment import advice_on_rmw, rmw_of, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.retention.inventory import state_bytes_in
 from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
@@ -494,6 +495,9 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
     else:
         files = ", ".join(map(str, setup_files))
         yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")
+        env = robot_environment(setup_files, settings.recording.bag_dir)
+        if advice := advice_on_rmw(env):
+            yield Finding(Level.OK, "", f"RMW_IMPLEMENTATION={rmw_of(env)}", advice)
 
 
 def check_topics(robot: Examined) -> Iterator[Finding]:

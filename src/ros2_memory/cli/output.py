@@ -48,7 +48,7 @@ _COMMANDS: Final = {
 """What a person runs in place of a tool that a sentence names."""
 _LISTS_TOOLS: Final = "the tools are: "
 """In a sentence that lists the tools, each by its name."""
-_WITH_TOOLS: Final = frozenset({"problems", "trust"})
+_WITH_TOOLS: Final = frozenset({"problems", "doubts"})
 """Keys of sentences that may name tools."""
 _TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 

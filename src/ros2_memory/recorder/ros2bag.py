@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -19,19 +18,10 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Housekeeper, Recorder
-from ros2_memory.recorder.process.child import Child, run_bounded
-from ros2_memory.recorder.process.command import (
-    HELP_ARGV,
-    SERVICES,
-    options_in_help,
-    record_argv,
-    storage_config,
-)
-from ros2_memory.recorder.process.environment import (
-    advice_on_silence,
-    find_ros2,
-    robot_environment,
-)
+from ros2_memory.recorder.process.child import Child
+from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
+from ros2_memory.recorder.process.environment import advice_on_silence
+from ros2_memory.recorder.process.installation import Installation, find_installation
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_splits
 from ros2_memory.recorder.sessions import Orders
@@ -48,7 +38,6 @@ if TYPE_CHECKING:
 __all__ = ["Ros2BagRecorder", "record_argv"]
 
 ROSOUT: Final = "/rosout"
-HELP_TIMEOUT_S: Final = 60.0
 LOGS_KEPT: Final = 20
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -116,9 +105,7 @@ class Ros2BagRecorder(Recorder):
             if "*" not in str(each["topic"])
         }
         self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
-        self._env: dict[str, str] = {}
-        self._ros2 = "ros2"
-        self._options: frozenset[str] = frozenset()
+        self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
         self._min_free_bytes = round(min_free_gb * GB)
         self._reception = Reception(
@@ -136,7 +123,7 @@ class Ros2BagRecorder(Recorder):
                 session_duration_s=session_duration_s,
                 min_free_bytes=self._min_free_bytes,
                 simulated=use_sim_time,
-                advice=lambda: advice_on_silence(self._env),
+                advice=lambda: advice_on_silence(self._ros.env),
             ),
             self._start_child,
             reader,
@@ -151,11 +138,9 @@ class Ros2BagRecorder(Recorder):
     def check(self) -> None:
         """Makes the environment of `ros2` and reads its options from its help."""
         self._topics.load()
-        self._env = robot_environment(self._setup_files, self._bag_dir / ROS_LOG_DIR)
-        self._ros2 = find_ros2(self._env, sourced=bool(self._setup_files))
-        self._options = self._known_options()
+        self._ros = find_installation(self._setup_files, self._bag_dir / ROS_LOG_DIR)
         services = self._topics.selection.services
-        if services and SERVICES not in self._options:
+        if services and SERVICES not in self._ros.options:
             _log.warning(
                 "services_not_recorded",
                 topics=list(services),
@@ -185,21 +170,6 @@ class Ros2BagRecorder(Recorder):
         """Whether a child runs and has reported that it records."""
         return self._supervisor.is_recording
 
-    def _known_options(self) -> frozenset[str]:
-        # Nothing is recorded yet, or never (`ros2-memory doctor`): no log goes beside the bags.
-        with TemporaryDirectory() as elsewhere:
-            env = {**self._env, "ROS_LOG_DIR": elsewhere}
-            finished = run_bounded([self._ros2, *HELP_ARGV], env, HELP_TIMEOUT_S)
-        if finished.returncode != 0:
-            printed = " ".join(finished.stderr.decode(errors="replace").split())[-300:]
-            raise RecorderError(
-                f"{self._ros2} bag record --help fails with status {finished.returncode} "
-                f"({printed}); "
-                "install the packages ros-$ROS_DISTRO-ros2bag and -rosbag2-storage-mcap, and "
-                "correct recorder.setup_files"
-            )
-        return options_in_help(finished.stdout.decode(errors="replace"))
-
     def _start_child(self, name: str, directory: Path) -> Child:
         qos_file, storage_file = self._bag_dir / QOS_FILE, self._bag_dir / STORAGE_FILE
         try:
@@ -212,7 +182,7 @@ class Ros2BagRecorder(Recorder):
             ) from error
         _prune(self._bag_dir / ROS_LOG_DIR)
         argv = record_argv(
-            ros2=self._ros2,
+            ros2=self._ros.ros2,
             directory=directory,
             topics=self._topics.selection,
             split_duration_s=self._split_duration_s,
@@ -225,9 +195,9 @@ class Ros2BagRecorder(Recorder):
             use_sim_time=self._use_sim_time,
             repeat_latched=self._repeat_latched,
             bag_dir_id=self._own.bag_dir_id,
-            known_options=self._options,
+            known_options=self._ros.options,
         )
-        return Child.start(argv, self._env, keep_open=self._keep_open)
+        return Child.start(argv, self._ros.env, keep_open=self._keep_open)
 
 
 def _prune(log_dir: Path) -> None:

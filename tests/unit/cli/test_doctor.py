@@ -125,6 +125,17 @@ def test_people_read_a_line_for_each_concern(robot: Path, exits: Program) -> Non
     assert output == [["ok", each] for each in [*about, "server"]]
 
 
+def test_what_an_rmw_needs_is_said_where_it_is_used(
+    robot: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "RMW_IMPLEMENTATION" not in exits(0, "doctor").out
+    for rmw, needs in (("rmw_zenoh_cpp", "rmw_zenohd"), ("rmw_cyclonedds_cpp", "CYCLONEDDS_URI")):
+        monkeypatch.setenv("RMW_IMPLEMENTATION", rmw)
+        shown = exits(0, "doctor").out
+        assert f"RMW_IMPLEMENTATION={rmw}\n" in shown
+        assert needs in shown
+
+
 def test_topics_of_which_columns_were_dropped_are_named(robot: Path, exits: Program) -> None:
     draw, begin = random.Random(3), time.time_ns() - 3000 * NS_PER_S
     messages = [

@@ -66,7 +66,7 @@ def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Pro
 def test_where_another_program_made_all_recordings_it_is_said_once(
     folder: Path, exits: Program
 ) -> None:
-    assert exits(0, "recordings", folder).out.count("another program") == 1
+    assert exits(0, "recordings", folder).out.count("another recorder") == 1
 
 
 class TestPaths:
@@ -228,7 +228,7 @@ class TestRecordings:
         (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
         os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
         rows = {row["recording"]: row for row in exits(0, "recordings", folder, "--json").json}
-        assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another program")
+        assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another recorder")
         assert rows["c"]["not_read"] == 1
         assert "1 damaged bag file; see below" in " ".join(exits(0, "info", folder).out.split())
 

@@ -25,7 +25,7 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 
 _OWN = "this recorder"
-_OTHERS = "another program"
+_OTHERS = "another recorder"
 _MOMENT = "saved moment"
 _EMPTY = "no message was recorded"
 

@@ -105,13 +105,37 @@ def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
     return env
 
 
+def rmw_of(env: Mapping[str, str]) -> str:
+    """Returns the RMW that nodes in an environment use; `rmw_fastrtps_cpp` unless it is set."""
+    return env.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"
+
+
+def advice_on_rmw(env: Mapping[str, str]) -> str | None:
+    """Returns what a recorder needs with an RMW that is not Fast DDS; None with Fast DDS."""
+    rmw = rmw_of(env)
+    if "zenoh" in rmw:
+        return (
+            "over Zenoh nodes find each other through a router (`ros2 run rmw_zenoh_cpp "
+            "rmw_zenohd`): does it run, and has the recorder the nodes' ROS_DOMAIN_ID, "
+            "ZENOH_SESSION_CONFIG_URI and ZENOH_CONFIG_OVERRIDE? see docs/how-to/robot.md"
+        )
+    if "cyclonedds" in rmw:
+        return (
+            "has the recorder the nodes' ROS_DOMAIN_ID and CYCLONEDDS_URI, which names the "
+            "network interfaces? see docs/how-to/robot.md"
+        )
+    return None
+
+
 def advice_on_silence(env: Mapping[str, str]) -> str:
     """Returns advice for subscriptions that receive nothing, by the environment.
 
     rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
     FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
     """
-    if "fastrtps" not in env.get("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp"):
+    if advice := advice_on_rmw(env):
+        return advice
+    if "fastrtps" not in rmw_of(env):
         return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
     local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if local or env.get("ROS_LOCALHOST_ONLY") == "1":

@@ -1,0 +1,266 @@
+"""`ros2-memory up`: proposes what to record on a robot, and records and serves it."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Final, NamedTuple
+
+import typer
+
+from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.layout import ROS_LOG_DIR
+from ros2_memory.bootstrap import build_reader
+from ros2_memory.cli.options import (
+    MB,
+    BagDir,
+    Overrides,
+    load_with_sources,
+    print_line,
+    spinner,
+)
+from ros2_memory.cli.output import escape
+from ros2_memory.cli.programs import run_programs
+from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
+from ros2_memory.config_sources import given_variables, quoted
+from ros2_memory.core.errors import ConfigError, RecorderError
+from ros2_memory.core.text import counted, listed
+from ros2_memory.recorder.process.environment import advice_on_rmw, advice_on_silence, rmw_of
+from ros2_memory.recorder.process.installation import (
+    Installation,
+    find_installation,
+    setup_files_here,
+)
+from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.recorder.proposal import (
+    Choice,
+    Disk,
+    Offered,
+    Proposal,
+    chosen,
+    judge,
+    propose,
+    topics_yaml,
+)
+from ros2_memory.recorder.supervisor import make_bag_dir
+from ros2_memory.recorder.survey import LOOK_S, Survey, survey
+from ros2_memory.retention.policy import GB
+
+SECONDS: Final = 5.0
+"""How long topics are measured."""
+
+
+class _Robot(NamedTuple):
+    """What was found on this machine; `words` are the settings for the recorder and the server."""
+
+    ros: Installation
+    bag_dir: Path
+    list_file: Path
+    words: list[str]
+
+    @property
+    def where(self) -> str:
+        """Where topics are looked for."""
+        return f"ROS_DOMAIN_ID={self.ros.env.get('ROS_DOMAIN_ID') or 0} over {rmw_of(self.ros.env)}"
+
+
+def up(
+    words: Overrides = None,
+    *,
+    bag_dir: BagDir = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Record what is proposed, unasked.")] = False,
+    install: Annotated[
+        bool, typer.Option("--install", help="Install as services, instead of starting here.")
+    ] = False,
+) -> None:
+    """Record this robot and answer questions about it, in one line, until Ctrl-C.
+
+    Finds ROS 2, measures what its topics bring, proposes a topics.yaml beside the bags, and asks.
+    A topics.yaml that is there is used, and never changed.
+    """
+    script = _install_script() if install else None
+    words = [*([] if is_deployment_chosen(words or []) else ["deployment=robot"]), *(words or [])]
+    settings, sources = load_with_sources(bag_dir, words)
+    if isinstance(settings.recorder, NullRecorderNode) or settings.server.transport == "stdio":
+        raise ConfigError(
+            "`up` records, and serves over HTTP: choose deployment=robot, or recorder=ros2bag and "
+            "server.transport=sse"
+        )
+    bags = settings.recording.bag_dir.absolute()
+    list_file = settings.recording.topics_file.absolute()
+    shipped = config_dir({}) / "topics.yaml"
+    is_chosen = not sources("recording.topics_file").startswith("in ")
+    if not is_chosen and list_file.read_bytes() == shipped.read_bytes():
+        list_file = bags / shipped.name
+    robot = _find_robot(settings.recorder.setup_files, bags, list_file, words)
+    print_line(f"{robot.ros.ros2}, {robot.where}, bags in {robot.bag_dir}")
+    with spinner("looking which topics there are, and measuring them"):
+        found = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes, SECONDS)
+    disk = Disk(
+        ratio=found.ratio,
+        fixed_bytes=found.fixed_bytes,
+        split_s=settings.recording.split_duration_s,
+        session_s=settings.recording.session_duration_s,
+        columns_share=settings.store.max_share if settings.store.enabled else 0.0,
+        budget_bytes=settings.retention.max_total_gb * GB,
+        keep_days=settings.retention.max_age_h / 24,
+    )
+    if robot.list_file.exists():
+        _show_list(robot, found, disk)
+    else:
+        _require_messages(robot, found)
+        _propose(robot, found, disk, yes=yes)
+    if script is not None:
+        _hand_over(script, robot)
+    raise typer.Exit(run_programs(robot.words, robot.bag_dir))
+
+
+def _find_robot(
+    setup_files: Sequence[Path], bags: Path, list_file: Path, words: list[str]
+) -> _Robot:
+    """Finds ROS 2, and makes the folder of the bags.
+
+    Raises:
+        ConfigError: the environment is refused.
+        RecorderError: there is no ROS 2, or nothing can be recorded there.
+    """
+    setup_files = setup_files_here(setup_files, os.environ)
+    ros = find_installation(setup_files, bags / ROS_LOG_DIR)
+    given_variables(ros.env)  # A setup file may set ROS_DOMAIN_ID.
+    make_bag_dir(bags)
+    if not os.access(bags, os.W_OK | os.X_OK):
+        raise RecorderError(
+            f"{bags} cannot be written by this user; name another folder with --bag-dir DIR, or "
+            "run as the user who owns it"
+        )
+    files = ",".join(quoted(str(each.absolute())) for each in setup_files)
+    more = [
+        f"recording.bag_dir={quoted(str(bags))}",
+        f"recording.topics_file={quoted(str(list_file))}",
+        f"recorder.setup_files=[{files}]",
+    ]
+    return _Robot(ros, bags, list_file, [*words, *more])
+
+
+def _require_messages(robot: _Robot, found: Survey) -> None:
+    """Checks that there is something to propose, and that it can be received.
+
+    Raises:
+        RecorderError: there is not; the sentence says what to do.
+    """
+    light = chosen(judge(found.topics), Choice.RECORD)
+    if not found.topics and not found.unknown_types:
+        advice = advice_on_rmw(robot.ros.env)
+        raise RecorderError(
+            f"no topic is offered in {robot.where} (waited {LOOK_S:g} s); start the robot's nodes, "
+            "and give this command their ROS_DOMAIN_ID, RMW_IMPLEMENTATION and "
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE{f'; {advice}' if advice else ''}"
+        )
+    if light and not any(each.messages for each in light):
+        segments = Path("/dev/shm").glob("fastrtps_*")  # noqa: S108 - Fast DDS has them there
+        owners = {each.stat().st_uid for each in segments} - {os.getuid()}
+        users = f" (nodes of user {', '.join(map(str, sorted(owners)))} run here)" if owners else ""
+        raise RecorderError(
+            f"{counted(len(light), 'topic is', 'topics are')} offered in {robot.where}, and no "
+            f"message came to user {os.getuid()} in {SECONDS:g} s{users}; "
+            f"{advice_on_silence(robot.ros.env)}"
+        )
+
+
+def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:
+    """Shows the proposal, asks, and writes it.
+
+    Raises:
+        RecorderError: nothing is proposed, or the list cannot be written.
+    """
+    proposal = propose(found.topics, disk)
+    recorded = chosen(proposal, Choice.RECORD)
+    takes = _print_topics(proposal, disk, recorded, found)
+    if not recorded:
+        raise RecorderError(
+            "nothing of this is proposed; write a list of topics, and name it with "
+            "recording.topics_file=FILE"
+        )
+    if not yes:
+        question = f"Write {counted(len(recorded), 'topic')} to {robot.list_file}, and record?"
+        typer.confirm(question, default=True, abort=True)
+    try:
+        write_durably(robot.list_file, topics_yaml(proposal, takes))
+    except OSError as error:
+        raise RecorderError(
+            f"{robot.list_file} cannot be written: {error.strerror or error}; name another file "
+            "with recording.topics_file=FILE"
+        ) from error
+    print_line(f"wrote {robot.list_file}")
+
+
+def _show_list(robot: _Robot, found: Survey, disk: Disk) -> None:
+    """Shows what a list that is there selects, and what it lacks.
+
+    Raises:
+        ConfigError: it is refused.
+    """
+    selection = load_topics(robot.list_file)
+    proposal = propose(found.topics, disk)
+    recorded = [each for each in found.topics if selection.matches(each.topic)]
+    _print_topics(proposal, disk, recorded, found)
+    print_line(f"{robot.list_file} is used as it is")
+    missing = [each.topic for each in chosen(proposal, Choice.RECORD) if each not in recorded]
+    if missing:
+        print_line(f"it lacks, of what would be proposed: {', '.join(missing)}")
+    unoffered = [*{*selection.exact}.difference(each.topic for each in found.topics)]
+    if unoffered:
+        print_line(f"it lists, and nobody offers: {', '.join(sorted(unoffered))}")
+
+
+def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], found: Survey) -> str:
+    """Prints a line for each topic, and returns the estimate, as a sentence, after printing it."""
+    width = max((len(each.topic) for each in proposal), default=0)
+    for each, (choice, reason) in proposal.items():
+        sign = "record" if each in recorded else choice.replace("record", "-")
+        rate = f"{each.hz:8.3g} Hz {each.payload_bytes:7.0f} B" if each.messages else ""
+        daily = f"{_amount(disk.bytes_per_day([each]))} a day" if each.messages else ""
+        told = f"{each.type}{f': {reason}' if reason and each not in recorded else ''}"
+        print_line(escape(f"  {sign:<7}{each.topic:<{width}}{rate:<21}{daily:>17}  {told}"))
+    files = disk.files_per_day
+    silent = [each.topic for each in recorded if not each.messages]
+    takes = (
+        f"about {_amount(disk.bytes_per_day(recorded) + files)} a day"
+        f"{f' without {listed(silent)}' if silent else ''}, {_amount(files)} of it for files of "
+        f"{disk.split_s:g} s: the budget of {disk.budget_bytes / GB:g} GB (retention.max_total_gb) "
+        f"holds {disk.days(recorded):.3g} days; bags are deleted after {disk.keep_days:g} days "
+        "(retention.max_age_h)"
+    )
+    print_line(takes)
+    if found.unknown_types:
+        print_line(
+            f"ros2 bag record does not know the types of {listed(found.unknown_types)}; name the "
+            "setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
+        )
+    return takes
+
+
+def _amount(size_bytes: float) -> str:
+    return f"{size_bytes / GB:.2f} GB" if size_bytes >= GB else f"{size_bytes / MB:.1f} MB"
+
+
+def _install_script() -> Path:
+    """Returns the path of deploy/install.sh.
+
+    Raises:
+        ConfigError: it is not here.
+    """
+    for folder in (Path(__file__).resolve().parents[3], Path.cwd()):
+        script = folder / "deploy/install.sh"
+        if script.is_file():
+            return script
+    raise ConfigError("deploy/install.sh is not here; run `up --install` in a clone of ros2-memory")
+
+
+def _hand_over(script: Path, robot: _Robot) -> None:
+    """Becomes deploy/install.sh, which installs the services with this list of topics."""
+    print_line(f"to be set in /etc/ros2-memory/environment: {robot.words[-1]}")
+    program = "sudo" if os.geteuid() else "env"
+    argv = [program, f"PYTHON={sys.executable}", str(script), "--topics", str(robot.list_file)]
+    print_line(" ".join(argv))
+    os.execvp(program, argv)  # noqa: S606 - there is nothing for a shell to do

@@ -1,0 +1,113 @@
+"""What `ros2-memory up` refuses before it starts anything."""
+
+from __future__ import annotations
+
+import io
+import os
+import sys
+from typing import TYPE_CHECKING
+
+import pytest
+
+from ros2_memory.recorder.process.topics import load_topics
+from tests.support import stub_ros2
+from tests.support.memories import ROOT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.program import Program
+
+
+@pytest.fixture(autouse=True)
+def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A `ros2` that offers /odom, /tf and /tf_static, and no ROS installation."""
+    (tmp_path / "bin").mkdir()
+    stub_ros2.install(tmp_path / "bin" / "ros2")
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("STUB_OPTIONS", "--start-paused --include-hidden-topics --node-name")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ros2_memory.cli.up.SECONDS", 0.3)
+    monkeypatch.setattr("ros2_memory.recorder.survey.QUIET_S", 0.1)
+
+
+def test_a_deployment_that_does_not_record_is_refused(exits: Program, tmp_path: Path) -> None:
+    for word in ("recorder=none", "storage=mcap", "deployment=replay"):
+        said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags", word).err
+        assert "`up` records, and serves over HTTP: choose deployment=robot" in said
+    assert not (tmp_path / "bags").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_named(exits: Program, tmp_path: Path) -> None:
+    (tmp_path / "bags").touch()
+    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
+    assert f"{tmp_path / 'bags'} is a file, or lies below one, and not a directory" in said
+
+
+def test_a_folder_that_cannot_be_written_is_named(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bags, access = tmp_path / "bags", os.access
+    # Root, as which tests may run, may write everywhere.
+    monkeypatch.setattr(os, "access", lambda path, mode: path != bags and access(path, mode))
+    said = exits(2, "up", "--yes", "--bag-dir", bags).err
+    assert f"{bags} cannot be written by this user; name another folder" in said
+
+
+def test_a_domain_that_does_not_exist_is_named(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
+    assert "ROS_DOMAIN_ID: '233' is not allowed" in said
+
+
+def test_a_domain_of_a_setup_file_is_checked_too(exits: Program, tmp_path: Path) -> None:
+    setup = tmp_path / "setup.bash"
+    setup.write_text("export ROS_DOMAIN_ID=kitchen\n")
+    words = ["--bag-dir", tmp_path / "bags", f"recorder.setup_files=[{setup}]"]
+    assert "ROS_DOMAIN_ID: 'kitchen' is not allowed" in exits(2, "up", "--yes", *words).err
+
+
+def test_a_recorder_that_fails_is_named_with_its_last_words(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("STUB_OPTIONS", "--include-hidden-topics")
+    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
+    assert "ros2 bag record ended by itself (status 2)" in said
+    assert "unrecognized arguments: --start-paused" in said
+    assert "`ros2-memory doctor` checks the installation" in said
+
+
+def test_who_answers_no_has_nothing_written(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("n\n"))
+    shown = exits(1, "up", "--bag-dir", tmp_path / "bags").out
+    assert "record /odom" in shown
+    assert not (tmp_path / "bags" / "topics.yaml").exists()
+
+
+def test_a_list_that_cannot_be_written_is_named(exits: Program, tmp_path: Path) -> None:
+    file = tmp_path / "nowhere" / "topics.yaml"
+    words = ["--bag-dir", tmp_path / "bags", f"recording.topics_file={file}"]
+    assert f"{file} cannot be written: No such file" in exits(2, "up", "--yes", *words).err
+
+
+def test_install_hands_the_list_over_to_the_script(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    became: list[list[str]] = []
+
+    def become(program: str, argv: list[str]) -> None:
+        became.append(argv)
+        raise SystemExit(0)
+
+    monkeypatch.setattr(os, "execvp", become)
+    file = tmp_path / "bags" / "topics.yaml"
+    shown = exits(0, "up", "--yes", "--install", "--bag-dir", tmp_path / "bags").out
+    script = str(ROOT / "deploy" / "install.sh")
+    assert became[0][1:] == [f"PYTHON={sys.executable}", script, "--topics", str(file)]
+    assert became[0][0] == ("sudo" if os.geteuid() else "env")
+    assert "to be set in /etc/ros2-memory/environment: recorder.setup_files=[]" in shown
+    assert load_topics(file).entries == ("/odom", "/tf", "/tf_static")

@@ -1,0 +1,185 @@
+"""Which topics are proposed, why, and what they are estimated to take."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import pytest
+import yaml
+
+from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.recorder.proposal import (
+    Choice,
+    Disk,
+    Offered,
+    chosen,
+    judge,
+    propose,
+    topics_yaml,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+DISK = Disk(
+    ratio=0.5,
+    fixed_bytes=20_000,
+    split_s=10,
+    session_s=600,
+    columns_share=0.0,
+    budget_bytes=5e9,
+    keep_days=7,
+)
+ODOM = Offered("/odom", "nav_msgs/msg/Odometry", messages=250, hz=50.0, payload_bytes=700.0)
+SCAN = Offered("/scan", "sensor_msgs/msg/LaserScan", messages=50, hz=10.0, payload_bytes=9000.0)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind", "reason"),
+    [
+        ("/camera/image_raw", "sensor_msgs/msg/Image", "images"),
+        ("/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", "images"),
+        ("/camera/image_raw/ffmpeg", "ffmpeg_image_transport_msgs/msg/FFMPEGPacket", "images"),
+        ("/camera/image_raw/theora", "theora_image_transport/msg/Packet", "images"),
+        ("/video", "foxglove_msgs/msg/CompressedVideo", "images"),
+        ("/disparity", "stereo_msgs/msg/DisparityImage", "images"),
+        ("/points", "sensor_msgs/msg/PointCloud2", "clouds"),
+        ("/octomap_full", "octomap_msgs/msg/Octomap", "clouds"),
+        ("/lidar", "livox_ros_driver2/msg/CustomMsg", "clouds"),
+        ("/local_costmap/costmap_raw", "nav2_msgs/msg/Costmap", "costmaps"),
+        ("/global_costmap/costmap", "nav_msgs/msg/OccupancyGrid", "costmaps"),
+        ("/local_costmap/costmap_updates", "map_msgs/msg/OccupancyGridUpdate", "costmaps"),
+        ("/elevation", "grid_map_msgs/msg/GridMap", "costmaps"),
+        ("/mic", "audio_common_msgs/msg/AudioData", "audio"),
+        ("/speech/audio", "audio_common_msgs/msg/AudioStamped", "audio"),
+        ("/robot/audio/raw", "std_msgs/msg/UInt8MultiArray", "audio"),
+        ("/vision/masks", "my_msgs/msg/InstanceMasks", "segmentation masks"),
+        ("/camera/camera_info", "sensor_msgs/msg/CameraInfo", "the same calibration"),
+        ("/markers", "visualization_msgs/msg/MarkerArray", "drawings"),
+        ("/bond", "bond/msg/Status", "beats"),
+        ("/clock", "rosgraph_msgs/msg/Clock", "beats"),
+    ],
+)
+def test_what_is_never_proposed(topic: str, kind: str, reason: str) -> None:
+    offered = Offered(topic, kind, latched=True)
+    choice, why = judge([offered])[offered]
+    assert choice is Choice.LEAVE
+    assert why.startswith(reason)
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind"),
+    [
+        ("/speech", "std_msgs/msg/String"),
+        ("/head/speech_to_text", "std_msgs/msg/String"),
+        ("/asr/result", "std_msgs/msg/String"),
+        ("/audio/transcript", "std_msgs/msg/String"),
+        ("/humans/voices/v1", "hri_msgs/msg/LiveSpeech"),
+        ("/utterances", "my_msgs/msg/Utterance"),
+    ],
+)
+def test_what_people_said_is_left_to_a_person(topic: str, kind: str) -> None:
+    offered = Offered(topic, kind)
+    assert judge([offered])[offered] == (Choice.ASK, "what people said")
+
+
+@pytest.mark.parametrize(
+    ("topic", "kind"),
+    [
+        ("/odom", "nav_msgs/msg/Odometry"),
+        ("/tf_static", "tf2_msgs/msg/TFMessage"),
+        ("/vision/find_object/detections_meta", "ros2_vision_interfaces/msg/VisionDetectionArray"),
+        ("/vision/find_object/detections", "ros2_vision_interfaces/msg/VisionDetectionArray"),
+        ("/navigate_to_pose/_action/status", "action_msgs/msg/GoalStatusArray"),
+        ("/chatter", "std_msgs/msg/String"),
+        ("/imagery_count", "std_msgs/msg/Int32"),
+        ("/battery_state", "sensor_msgs/msg/BatteryState"),
+    ],
+)
+def test_what_the_robot_concluded_is_proposed(topic: str, kind: str) -> None:
+    offered = Offered(topic, kind)
+    assert judge([offered])[offered] == (Choice.RECORD, "")
+
+
+def test_detections_with_masks_are_left_beside_those_with_metadata() -> None:
+    kind = "ros2_vision_interfaces/msg/VisionDetectionArray"
+    masks = Offered("/vision/find_object/detections", kind)
+    meta = replace(masks, topic=f"{masks.topic}_meta")
+    verdicts = judge([masks, meta])
+    assert verdicts[masks].choice is Choice.LEAVE
+    assert verdicts[masks].reason == f"masks: {meta.topic} has the same without"
+    assert verdicts[meta].choice is Choice.RECORD
+
+
+def test_a_map_is_proposed_where_it_is_latched_and_came_once() -> None:
+    once = Offered("/map", "nav_msgs/msg/OccupancyGrid", latched=True, messages=1)
+    for offered, choice in (
+        (once, Choice.RECORD),
+        (replace(once, messages=3), Choice.LEAVE),
+        (replace(once, latched=False), Choice.LEAVE),
+    ):
+        assert judge([offered])[offered].choice is choice
+
+
+def test_the_inside_of_actions_and_services_is_left_to_a_person() -> None:
+    for topic in ("/drive/_action/feedback", "/set_mode/_service_event"):
+        offered = Offered(topic, "a/msg/B")
+        assert judge([offered])[offered].choice is Choice.ASK
+
+
+def test_a_message_takes_its_payload_and_what_mcap_adds() -> None:
+    one = Offered("/a", "a/msg/A", messages=5, hz=1.0, payload_bytes=69.0)
+    # (69 + 31) / 2 compressed, and 16 of an index, in each of 86,400 s.
+    assert DISK.bytes_per_day([one]) == pytest.approx(86_400 * 66)
+    assert DISK.bytes_per_day([one, one]) == pytest.approx(2 * 86_400 * 66)
+    assert replace(DISK, columns_share=0.5).bytes_per_day([one]) == pytest.approx(86_400 * 99)
+
+
+def test_files_take_their_definitions_and_a_list_of_those_before() -> None:
+    # 8,640 files of 20,000 bytes; a recording has 60, each of which lists 30 others on average.
+    assert DISK.files_per_day == pytest.approx(8640 * (20_000 + 30 * 342))
+    assert replace(DISK, split_s=20).files_per_day < DISK.files_per_day / 2
+
+
+def test_a_latched_message_is_in_each_recording_once() -> None:
+    latched = Offered("/map", "a/msg/A", latched=True, messages=1, hz=0.2, payload_bytes=69.0)
+    assert DISK.bytes_per_day([latched]) == pytest.approx(144 * 66)
+
+
+def test_the_budget_holds_so_many_days() -> None:
+    assert DISK.days([]) == pytest.approx(5e9 / DISK.files_per_day)
+    daily = DISK.files_per_day + DISK.bytes_per_day([ODOM])
+    assert DISK.days([ODOM]) == pytest.approx(5e9 / daily)
+
+
+def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> None:
+    large = replace(DISK, budget_bytes=100e9)
+    assert propose([ODOM, SCAN], large)[SCAN].choice is Choice.RECORD
+    left = propose([ODOM, SCAN], DISK)
+    assert chosen(left, Choice.RECORD) == [ODOM]
+    assert left[SCAN].choice is Choice.LEAVE
+    assert left[SCAN].reason == "70% of a list of which the budget would hold 0.9 days"
+
+
+def test_a_small_scan_stays_though_the_list_does_not_fit() -> None:
+    small = replace(SCAN, hz=0.3)
+    assert propose([ODOM, small], replace(DISK, budget_bytes=1e9))[small].choice is Choice.RECORD
+
+
+def test_no_other_topic_is_left_out_for_its_size() -> None:
+    assert propose([ODOM], replace(DISK, budget_bytes=1.0))[ODOM].choice is Choice.RECORD
+
+
+def test_the_file_lists_what_is_proposed_and_has_the_rest_to_tick(tmp_path: Path) -> None:
+    speech, camera = Offered("/speech", "std_msgs/msg/String"), Offered("/c", "a/msg/Image")
+    text = topics_yaml(propose([camera, ODOM, speech], DISK), "about 1 MB a day")
+    assert text.splitlines() == [
+        "# Proposed by `ros2-memory up`, and yours to change: about 1 MB a day",
+        "topics:",
+        "  - /odom  # nav_msgs/msg/Odometry",
+        "  # - /speech  # std_msgs/msg/String: what people said",
+    ]
+    assert yaml.safe_load(text) == {"topics": ["/odom"]}
+    (tmp_path / "topics.yaml").write_text(text)
+    assert load_topics(tmp_path / "topics.yaml").entries == ("/odom",)
