@@ -11,6 +11,7 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
@@ -67,6 +68,7 @@ def lake_robots(
             if stores is None
             else ColumnStore([stores / name / FILE], decoder.definition),
             refresh_s=0,
+            large=LargeReads(),
         )
         for name in names
     }
@@ -84,9 +86,9 @@ def store_columns(robot: LakeRobot) -> Filling:
         are_files=False,
     )
     timeline = memory.index.snapshot().timeline
-    for bag in filling.waiting(timeline):
-        assert filling.fill(bag, timeline)
-    make_fragments(memory, filling.merge(timeline))
+    for batch in filling.batches(timeline):
+        assert filling.fill(batch, timeline) == len(batch.bags)
+    make_fragments(memory, filling.whole_since())
     filling.thin()
     assert filling.progress(timeline).stored == len(timeline.bags)
     return filling

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.errors import EpisodicError
@@ -107,9 +107,14 @@ def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scann
     timeline = memory.index.snapshot().timeline
     waiting = filling.waiting(timeline)[::-1]
     # The newest first, as the server does: numbers of bags are in no order of time.
-    for bag in waiting[: round(part * len(waiting))][::-1]:
-        filling.fill(bag, timeline)
-    make_fragments(replace(memory, columns=scanner), filling.merge(timeline))
+    stop = round(part * len(waiting))
+    left_out = waiting[stop:]
+    for bag in waiting[:stop][::-1]:
+        filling.fill(Batch([bag], whole=False), timeline)
+    for batch in filling.batches(timeline):
+        if not {*batch.bags} & {*left_out}:
+            filling.fill(batch, timeline)
+    make_fragments(replace(memory, columns=scanner), filling.whole_since())
     filling.thin()
     return scanner
 

@@ -444,7 +444,7 @@ def trusted(replies: Replies, asked: CallContext) -> None:
     reply = replies[-1]
     # The newest split, which no recorder names here.
     young = "1 file has no end yet: being written, or left by a crash"
-    same("trust", text(reply, "trust"), young)
+    same("doubts", text(reply, "doubts"), young)
     near("age", number(reply, "newest_age_s"), _ago(asked.known[-1]), SAME_S)
     same("silent topics", items(reply, "fell_silent"), [])
     same("damaged", number(reply, "damaged"), 0)

@@ -1,4 +1,6 @@
-"""Conditions on one extracted value: `contains`, `equals`, `above`, `below`, `near_position`.
+"""Conditions on one extracted value.
+
+They are `contains`, `contains_word`, `equals`, `above`, `below` and `near_position`.
 
 They are tested on the whole value, before anything in it is downsampled or rounded. NaN and null
 match nothing. `refusal_for` says where no value of a shape can match: a search for a field that
@@ -36,6 +38,7 @@ _LISTED_PATHS: Final = 16
 _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
+    "contains_word": 'condition_type "contains_word", value "pot", which is not in "potato"',
     "equals": 'condition_type "equals", value true',
     "above": 'condition_type "above", value 0.5, field "linear_velocity.x"',
     "below": 'condition_type "below", value 0.2, field "percentage"',
@@ -56,22 +59,34 @@ class Contains:
     only where a field leads (`has_element`): in a whole message every size, level and coordinate
     would match. Elsewhere its digits are searched as a string.
 
+    With `whole` it must stand there as whole words: `pot` is in "the pot", not in "potato". Words
+    behind it that begin with a minus must not stand there: `knife -butter`.
+
     Attributes:
         equal: what an element is compared with.
         folded: the needle as casefolded text; None where no text can contain it.
+        others: the casefolded words that must not be there.
         boolean: the boolean that matches; None where none does.
     """
 
     needle: Scalar
+    whole: bool = False
     equal: Equals = field(init=False, repr=False)
     folded: str | None = field(init=False, repr=False)
+    others: tuple[str, ...] = field(init=False, repr=False)
     boolean: bool | None = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         meant = _meaning(self.needle)
         text = _text_of(self.needle)
+        folded = None if text is None else text.casefold()
+        words = folded.split() if self.whole and folded else []
+        others = tuple(word[1:] for word in words if word[0] == "-" and len(word) > 1)
+        if others:
+            folded = " ".join(word for word in words if word[0] != "-")
         object.__setattr__(self, "equal", Equals(self.needle))
-        object.__setattr__(self, "folded", None if text is None else text.casefold())
+        object.__setattr__(self, "folded", folded)
+        object.__setattr__(self, "others", others)
         object.__setattr__(self, "boolean", meant if isinstance(meant, bool) else None)
 
     @property
@@ -89,11 +104,18 @@ class Contains:
         """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):
             if isinstance(leaf, str):
-                if self.folded is not None and self.folded in leaf.casefold():
+                if self._is_in(leaf.casefold()):
                     return True
             elif isinstance(leaf, bool) and leaf is self.boolean:
                 return True
         return False
+
+    def _is_in(self, text: str) -> bool:
+        if not self.whole:
+            return self.folded is not None and self.folded in text
+        if not self.folded or not _has_words(text, self.folded):
+            return False
+        return not any(_has_words(text, other) for other in self.others)
 
     def has_element(self, target: JsonValue) -> bool:
         """Returns whether the target of a field is equal, or is a list with such an element.
@@ -101,6 +123,10 @@ class Contains:
         Elements of nested lists count too, fields of objects in them do not.
         """
         return any(self.equal.is_leaf(each) for each in leaves(target, in_objects=False))
+
+
+def _has_words(text: str, words: str) -> bool:
+    return re.search(rf"(?<!\w){re.escape(words)}(?!\w)", text) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -274,7 +300,7 @@ def parse_condition(
     """Returns the condition that a planner's arguments describe.
 
     Args:
-        condition_type: `contains`, `equals`, `above`, `below` or `near_position`.
+        condition_type: `contains`, `contains_word`, `equals`, `above`, `below` or `near_position`.
         value: a string, number or boolean; for `above` and `below` a number; for `near_position`
             an object with x, y and perhaps z.
         tolerance_m: how near `near_position` is.
@@ -357,9 +383,10 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
         raise InvalidArgumentsError(f"the value is NaN, which nothing is equal to; {example}")
     if condition_type == "equals":
         return Equals(value)
-    if isinstance(value, str) and not value.strip():
-        raise InvalidArgumentsError(f"'contains' takes a text that is not blank; {example}")
-    return Contains(value)
+    test = Contains(value, whole=condition_type == "contains_word")
+    if isinstance(value, str) and not (test.folded or "").strip():
+        raise InvalidArgumentsError(f"'{condition_type}' takes a text that is not blank; {example}")
+    return test
 
 
 def _parse_near(value: JsonValue, tolerance_m: float) -> NearPosition:

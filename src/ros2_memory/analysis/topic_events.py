@@ -156,10 +156,6 @@ def _beyond(at_most: int, *kinds: Sequence[object]) -> int:
     return sum(max(0, len(kind) - at_most) for kind in kinds)
 
 
-NO_EVENTS: Final = TopicEvents(0, 0)
-"""The events of messages that have none."""
-
-
 def has_events(type_name: str) -> bool:
     """Returns whether messages of a type can contain events."""
     return type_name in _MEASURED_WITH_EVENTS or not type_name.startswith(_MEASUREMENT_PACKAGES)

@@ -41,7 +41,7 @@ class LargeReads:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._first_has_it: deque[_Block] = deque()
+        self._queue: deque[_Block] = deque()
         self._own = threading.local()
 
     @contextmanager
@@ -76,27 +76,27 @@ class LargeReads:
         finally:
             self._own.block = before
 
-    def take(self) -> None:
+    def acquire(self) -> None:
         """Waits until this thread may hold more than `LARGE_BYTES`. Raises what `check` does."""
         block = self._block
         if block is None or block.has_turn:
             return
         begun = time.perf_counter_ns()
         with self._changed:
-            has_to_wait = bool(self._first_has_it)
-            self._first_has_it.append(block)
+            has_to_wait = bool(self._queue)
+            self._queue.append(block)
             try:
-                while self._first_has_it[0] is not block:
+                while self._queue[0] is not block:
                     block.check()
                     self._changed.wait(_LOOKED_S)
             except BaseException:
-                self._first_has_it.remove(block)
+                self._queue.remove(block)
                 raise
             block.has_turn = True
         if has_to_wait:
             block.waited(time.perf_counter_ns() - begun)
 
-    def pass_on(self) -> None:
+    def release(self) -> None:
         """Ends the turn of this thread, which holds nothing large at the moment, if it has it."""
         block = self._block
         if block is not None:
@@ -114,7 +114,7 @@ class LargeReads:
         return_free_memory()
         with self._changed:
             block.has_turn = False
-            self._first_has_it.popleft()
+            self._queue.popleft()
             self._changed.notify_all()
 
 

@@ -154,7 +154,38 @@ class Polygon:
         return Parts(step, table[which, step], stop)
 
 
-Region: TypeAlias = "Circle | Rectangle | Polygon"
+@dataclass(frozen=True, slots=True)
+class AnyOf:
+    """All points of several regions."""
+
+    regions: tuple[Region, ...]
+
+    def contains(self, x: float, y: float) -> bool:
+        """Returns whether a point is inside one of them."""
+        return any(each.contains(x, y) for each in self.regions)
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """The least and greatest x, and the least and greatest y."""
+        low_x, high_x, low_y, high_y = zip(*(each.bounds for each in self.regions), strict=True)
+        return min(low_x), max(high_x), min(low_y), max(high_y)
+
+    def crossings(self, steps: Steps) -> Parts:
+        """Returns the parts of steps inside; what lies in two regions is one part."""
+        every = [parts_inside(each, steps) for each in self.regions]
+        step, start, stop = (np.concatenate(some) for some in zip(*every, strict=True))
+        if not len(step):
+            return Parts(step, start, stop)
+        order = np.lexsort((start, step))
+        step, start, stop = step[order], start[order], stop[order]
+        # Steps are whole numbers: so far along the path.
+        reached = np.maximum.accumulate(step + stop)
+        new = (step[1:] != step[:-1]) | (step[1:] + start[1:] > reached[:-1])
+        begins = np.flatnonzero(np.append([True], new))
+        return Parts(step[begins], start[begins], np.maximum.reduceat(stop, begins))
+
+
+Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf"
 
 
 def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> NDArray[np.bool_]:
@@ -176,7 +207,7 @@ def parts_inside(region: Region, steps: Steps) -> Parts:
         & (np.maximum(steps.y, steps.to_y) >= low_y)
     )
     some = Steps(*(each[near] for each in steps))
-    if isinstance(region, Polygon):
+    if isinstance(region, Polygon | AnyOf):
         found = region.crossings(some)
         return Parts(near[found.step], found.start, found.stop)
     start, stop = region.parts(some)

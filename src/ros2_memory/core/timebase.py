@@ -136,6 +136,22 @@ def rest_of_text_s(text: str) -> float:
     return max(10.0 ** -len(found[1] or "") - 1e-6, 0.0)
 
 
+def named_span_s(text: str) -> float:
+    """Returns how long the minute or the local day that a text names goes on after its begin (s).
+
+    Up to its last microsecond; 0 for a text with seconds, or Unix seconds.
+    """
+    _, written = _without_weekday(text.strip())
+    if _DIGITS.fullmatch(written) or _SECONDS.search(written):
+        return 0.0
+    if ":" in written:
+        return 60 - 1e-6
+    read = datetime.fromisoformat(written)
+    if (read.hour, read.minute) != (0, 0) or "T" in written.upper():
+        return 0.0
+    return (read + timedelta(days=1)).timestamp() - read.timestamp() - 1e-6
+
+
 def _without_weekday(text: str) -> tuple[str | None, str]:
     first, _, rest = text.partition(" ")
     weekday = first.rstrip(",").title()

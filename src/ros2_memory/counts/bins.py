@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.time_bins import TimeBins, TrueIntervals
     from ros2_memory.history.view import View
+    from ros2_memory.places.where import Where
     from ros2_memory.results import BinColumn
 
 By: TypeAlias = Literal["day", "hour", "weekday", "place"]
@@ -46,6 +47,8 @@ MOST_CELLS: Final = 124
 
 class BinnedWindow:
     """A window of the memory, cut into bins, to which columns of values are added.
+
+    `where` are the places of bins of places; None for all named ones.
 
     Attributes:
         asked: the whole window.
@@ -63,7 +66,14 @@ class BinnedWindow:
         NoDataError: nothing of the window was recorded, or no poses for bins of places.
     """
 
-    def __init__(self, view: View, asked: TimeWindow, by: By, topics: Sequence[str]) -> None:
+    def __init__(
+        self,
+        view: View,
+        asked: TimeWindow,
+        by: By,
+        topics: Sequence[str],
+        where: Where | None = None,
+    ) -> None:
         self.view = view
         self.asked = asked
         self._by = by
@@ -80,7 +90,7 @@ class BinnedWindow:
         # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
         self.bins: TimeBins = (
-            place_bins(view, self.window) if by == "place" else time_bins(self.window, by)
+            place_bins(view, self.window, where) if by == "place" else time_bins(self.window, by)
         )
         self._columns: list[tuple[str, BinColumn]] = []
         self._values: list[Values] = []

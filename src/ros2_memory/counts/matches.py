@@ -14,23 +14,27 @@ What counts as once:
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
 from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events
 from ros2_memory.columns.truth import ColumnCondition
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.text import listed
 from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.counts.labels import ANY_LABEL, BY_LABEL, count_labels
 from ros2_memory.counts.time_bins import TrueIntervals
+from ros2_memory.counts.values import count_values
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.scope import Scope
+from ros2_memory.places.where import parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -43,6 +47,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
     from ros2_memory.places.scope import WhileCondition
+    from ros2_memory.places.where import Where
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}
@@ -55,18 +60,21 @@ def count_matches(
     condition_type: str,
     value: JsonValue,
     *,
-    by: By,
+    by: By | Literal["label", "value"],
     field: str | None = None,
     start_s: float | None = None,
     end_s: float | None = None,
     last_s: float | None = None,
     min_score: float | None = None,
     where: JsonValue = None,
-    during: WhileCondition | None = None,
+    during: Sequence[WhileCondition] = (),
 ) -> Bins:
     """Returns how often and how long a condition held in each bin, and how long was recorded.
 
-    With `where` or `during` only while the robot was there, or another topic met a condition.
+    `by` label a row for each label of detections that meets it, `""` for all; see `count_labels`.
+
+    With `where` or `during` only while the robot was there, or other topics met conditions; `by`
+    place, the places of `where` have the rows, and what was elsewhere counts there.
 
     Raises:
         InvalidArgumentsError: nothing can meet the condition, the bounds make no window, or there
@@ -77,15 +85,24 @@ def count_matches(
     span = TimeRange(start_s, end_s, last_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
+    sought = "any" if by == BY_LABEL and value == ANY_LABEL else value
+    condition = condition_of(view, topic, condition_type, sought, field=field, min_score=min_score)
     asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest, call)))
+    if by == BY_LABEL:
+        require_recorded(view, asked)
+        return count_labels(view, topic, condition, value, Scope(view, asked, where, during))
     topics = matching_topics(view, topic)
-    binned = BinnedWindow(view, asked, by, topics)
+    if by == "value":
+        return _by_value(view, topics, asked, condition, is_bounded=bool(where or during))
+    places: Where | None = None
+    if by == "place" and where is not None:
+        places, where = parse_where(memory.limits, where), None
+    binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
     held, since, unknown = None, None, []
     # Events have labels without scores.
     by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
-    alone = where is None and during is None and len(topics) == 1
+    alone = where is None and not during and len(topics) == 1
     if alone and by_events:
         held, since = _by_events(binned, topics[0], condition, value)
     if held is None:
@@ -98,6 +115,28 @@ def count_matches(
     binned.add_unknown(unknown)
     binned.add_held(held)
     return binned.answer()
+
+
+def _by_value(
+    view: View,
+    topics: Sequence[str],
+    asked: TimeWindow,
+    condition: Condition,
+    *,
+    is_bounded: bool,
+) -> Bins:
+    """Returns how often and how long a topic held each value that meets a condition.
+
+    Raises:
+        InvalidArgumentsError: it is not one topic, or only some of its values would count.
+    """
+    if len(topics) > 1:
+        raise InvalidArgumentsError(f"by value counts one topic: name one of {listed(topics)}")
+    if is_bounded:
+        raise InvalidArgumentsError("where, while cannot be combined with by value")
+    fields = () if condition.field is None else (condition.field,)
+    wanted = replace(condition, field=None)
+    return count_values(view, topics[0], asked, fields=fields, condition=wanted)
 
 
 def _by_events(

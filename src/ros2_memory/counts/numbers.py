@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
+from ros2_memory.counts.values import count_values
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.robots import note_robots
@@ -40,11 +41,13 @@ def count_range(
     call: Call,
     topic: str,
     span: TimeRange,
-    by: By,
+    by: By | Literal["value"],
     *,
     fields: Sequence[str] = (),
 ) -> Bins:
     """Returns how many messages of a topic each bin holds, and the numbers of fields in them.
+
+    By value how often and how long it held each (`counts.values`).
 
     Raises:
         InvalidArgumentsError: there are too many bins, or too many fields for them.
@@ -53,6 +56,8 @@ def count_range(
     """
     view, asked = open_span(memory, call, span)
     name = resolve_topic(view, topic)
+    if by == "value":
+        return count_values(view, name, asked, fields=fields)
     binned = BinnedWindow(view, asked, by, (name,))
     names = tuple(dict.fromkeys(fields))
     size = len(binned.bins.names)

@@ -1,4 +1,6 @@
-"""Bins of where the robot was: the named places, elsewhere, and where that is not known.
+"""Bins of where the robot was: places, elsewhere, and where that is not known.
+
+The places are the named ones, or those of a question.
 
 A place that lies in another one counts to both, so the bins may add up to more than the window.
 """
@@ -26,22 +28,26 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
+    from ros2_memory.places.where import Where
 
 ELSEWHERE: Final = "(elsewhere)"
 UNKNOWN: Final = "(unknown)"
 
 
-def place_bins(view: View, window: TimeWindow) -> TimeBins:
-    """Returns the named places as bins: when the robot was in each; notes list unknown times.
+def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> TimeBins:
+    """Returns places as bins: when the robot was in each; notes list unknown times.
 
     Raises:
-        InvalidArgumentsError: no place is named in the frame of places.
+        InvalidArgumentsError: no place is named in the frame of places, or those of the question
+            are in a frame that no transforms lead to.
         NoDataError: there are no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
     topic = resolve_path_topic(view)
-    placement = map_placement(view, pose_frame(view, topic), topic, None)
-    places = places_in(view, view.memory.limits.places, placement, window)
+    asked_frame = None if where is None else where.frame_id
+    placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
+    named = view.memory.limits.places if where is None else where.places(placement.frame_id)
+    places = places_in(view, named, placement, window)
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(

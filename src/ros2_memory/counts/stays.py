@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,17 +44,21 @@ def count_visits(
 ) -> Bins:
     """Returns entries, exits and minutes in a place for each bin; of no place, of all named ones.
 
+    `by` place each of the places of `where` has a row. Of several places any counts otherwise.
+
     `placed_s` is for how long it was known where the robot was, `unknown_s` for how long not.
 
     Raises:
         InvalidArgumentsError: the place is invalid, the frame is another one, there are too many
-            bins, or a place is given besides `by` place.
+            bins, or x and y are given besides `by` place.
         NoDataError: nothing is recorded in the window, or no poses.
         QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
-    if by == "place" and place is not None:
-        raise InvalidArgumentsError("by place counts all named places: give no other one")
+    if by == "place" and x is not None:
+        raise InvalidArgumentsError(
+            "by place counts the places of where, or all named ones: give where in place of x and y"
+        )
     wall = memory.clock.now()
     window = search_window(TimeRange(start_s, end_s), wall)
     view = open_view(memory, call, min(window.stop, wall))
@@ -63,19 +68,22 @@ def count_visits(
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame
     placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
-    binned = BinnedWindow(view, asked, by, (topic,))
+    if place is not None:
+        place = replace(place, frame_id=asked_frame)
+    binned = BinnedWindow(view, asked, by, (topic,), place)
     track = track_in(view, placement.frame_id, binned.window)
     known = placed_times(track, mixed)
     binned.add_lengths("placed_s", "duration", known)
     binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
-    if place is not None:
+    if place is not None and by != "place":
         stayed = robot_inside(track, place.region, binned.window)
         if not stayed and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
         _add_visits(binned, stayed)
         return binned.answer()
-    places = places_in(view, memory.limits.places, placement, binned.window)
+    named = memory.limits.places if place is None else place.places(placement.frame_id)
+    places = places_in(view, named, placement, binned.window)
     inside = [robot_inside(own, each.region, binned.window) for each, own in places]
     if by == "place":
         _add_each_place(binned, inside)

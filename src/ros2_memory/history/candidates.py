@@ -47,7 +47,8 @@ class CandidateRows:
         self.condition = condition
         self.ruled_out = False
         self.has_looked = False
-        self._left: dict[str, Ns] = dict.fromkeys(topics, until)
+        newest = max((part.latest for part in view.snapshot.timeline.segments), default=MIN_NS)
+        self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
         self._ready: list[tuple[Ns, int]] = []
         self._view = view
         self._topics = topics

@@ -69,12 +69,19 @@ _EDGE_NS: Final = 20 * NS_PER_S
 
 
 def note_unread(
-    view: View, window: TimeWindow, *, nothing: bool = False, search: bool = False, of: str = ""
+    view: View,
+    window: TimeWindow,
+    *,
+    nothing: bool = False,
+    search: bool = False,
+    of: str = "",
+    gaps: bool = True,
 ) -> None:
     """Adds notes on data of a window that could not be read.
 
     With `nothing` the answer is that there is nothing. Then, and after a `search`, splits that are
     listed and missing count too. `of` says which window it is, for sentences without a time.
+    Without `gaps` none is on times in which nothing was recorded: what is returned shows them.
     """
     if window.empty:
         return
@@ -85,7 +92,7 @@ def note_unread(
         # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
-    for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS):
+    for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ():
         view.notes.add(sentence)
     bag_dir = view.memory.index.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():

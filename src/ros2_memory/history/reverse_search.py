@@ -316,9 +316,9 @@ class ReverseSearch:
             raise with_notes(self._view, window, undecodable(failure))
         self.note_undecodable()
         if not found:
-            self._require_testable()
+            self.require_testable()
 
-    def _require_testable(self) -> None:
+    def require_testable(self) -> None:
         """Checks that some value of the topics can meet the condition: else "never" is no answer.
 
         Raises:

@@ -24,7 +24,7 @@ from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import place_visits, places_in, track_in
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
-from ros2_memory.places.where import parse_where, times_inside
+from ros2_memory.places.where import parse_where, places_asked, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things
@@ -135,7 +135,8 @@ def _things(
         )
     for note in vague_notes(known, windows):
         view.notes.add(note)
-    return frame, ThingsBetween(known, first, second, where, limits.places).compared()
+    places = places_asked(limits, where, known.frames)
+    return frame, ThingsBetween(known, first, second, where, places).compared()
 
 
 def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
@@ -190,7 +191,8 @@ def _paths_apart(
             "start, and no transforms lead to a map"
         )
         return _WaysApart()
-    region, places = None if where is None else where.region, view.memory.limits.places
+    region = None if where is None else where.region
+    places = places_asked(view.memory.limits, where, (frame,))
     tracks = [track_in(view, frame, each) for each in windows]
     stands = [
         [
@@ -249,9 +251,13 @@ def _places(
             visited = place_visits(view, placed, window, passed)
             durations = {each.place: each.duration for each in visited}
         else:
-            inside = times_inside(view, where, placement.frame_id, window)
-            there = sum(passed.between(each.start, each.stop) for each in inside)
-            durations = {where.name or "where": there}
+            durations = {
+                place.title: passed.among(
+                    (one.start, one.stop)
+                    for one in times_inside(view, place, placement.frame_id, window)
+                )
+                for place in where.each
+            }
         found.append({name: unix_from_ns(each) / 60 for name, each in durations.items()})
     return found
 

@@ -12,7 +12,7 @@ import math
 from collections import OrderedDict, deque
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.analysis.conditions import NearPosition, matched_texts
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -32,7 +32,6 @@ from ros2_memory.core.timebase import (
 from ros2_memory.counts.tested import tested
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
-from ros2_memory.history.driven_path import body_by_transforms, resolve_path_topic
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -43,18 +42,26 @@ from ros2_memory.history.reverse_search import (
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects, transform_at
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.insights.episodes import (
+    SaidMeanwhile,
+    episode_times,
+    find_episodes,
+    says_episodes,
+    with_robot,
+)
 from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import newest_pose, placed, with_place
+from ros2_memory.places.pose_frames import robot_at
 from ros2_memory.places.scope import Scope
-from ros2_memory.results import LabelledPlace, Sighting, Sightings
+from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
     from ros2_memory.counts.tested import Tested
@@ -67,8 +74,7 @@ if TYPE_CHECKING:
     from ros2_memory.messages.detections import Detection
     from ros2_memory.places.scope import WhileCondition
 
-NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
-"""The robot may have moved since an older pose."""
+_Row = TypeVar("_Row", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
@@ -116,10 +122,14 @@ def find_matches(
     oldest_first: bool = False,
     min_score: float | None = None,
     where: JsonValue = None,
-    during: WhileCondition | None = None,
+    during: Sequence[WhileCondition] = (),
     frame_id: str | None = None,
+    beside: str | None = None,
 ) -> Sightings:
     """Returns the newest `limit` sightings on a topic, or on all topics of a glob, newest first.
+
+    Of texts that hold until the next one they are episodes (`insights.episodes`). With `beside`
+    each has what that topic said meanwhile.
 
     `start_s` and `end_s` (Unix seconds, inclusive), or `last_s` (before now), bound what is
     searched. With `oldest_first` all of it is searched, and the oldest sightings are returned. A
@@ -142,72 +152,137 @@ def find_matches(
     require_recorded(view, asked)
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     window = clamped(view, asked)
-    collected = _Sightings(limit, view.snapshot.timeline.is_log, oldest_first=oldest_first)
     scope = Scope(view, window, where, during)
-    goals = goals_asked(view, matching_topics(view, topic), condition, scope)
-    if goals is None:
-        search = ReverseSearch(view, topic, condition)
-        if scope.is_bounded:
-            _collect(view, search, scope, collected)
-        else:
-            enough = None if oldest_first else limit
-            is_log = view.snapshot.timeline.is_log
-            collected.take(find_runs(view, search, window, is_log, enough=enough), view)
-    searched = window
-    if collected.cut and collected.selected:
-        searched = TimeWindow(collected.selected[-1].first, window.stop)
-    view.notes.retract_before(searched.start)
-    elapsed = elapsed_in(view, searched)
-    # To say where the robot was takes longest.
-    wanted = [
-        (matches, newest)
-        for matches in collected.selected
-        if call.wants(matches.last) and (newest := _newest(view, matches)) is not None
-    ]
-    found = tuple(
-        _sighting(view, condition, matches, newest, scope=scope, frame_id=frame_id)
-        for matches, newest in wanted
-    )
-    total = None if collected.cut else collected.count
+    other = None if beside is None else SaidMeanwhile(view, beside)
+    topics, shown = matching_topics(view, topic), _Shown(limit, oldest_first, frame_id)
+    goals = goals_asked(view, topics, condition, scope)
+    is_spoken = goals is None and says_episodes(view, topics)
     if goals is not None:
-        total = len(goals)
-        found = tuple(
-            _goal_sighting(view, each, frame_id)
-            for each in (goals[::-1] if oldest_first else goals)[:limit]
-            if call.wants(each.last)
-        )
-    elif fields:
-        found = _with_fields(view, found, [newest for _, newest in wanted], fields)
-    found = tuple(
-        replace(each, skipped=elapsed.skipped_between(each.first, each.until)) for each in found
+        rows = _of_goals(view, goals, window, shown)
+    elif is_spoken:
+        rows = _of_texts(view, topics[0], condition, scope, shown)
+    else:
+        rows = _of_matches(view, ReverseSearch(view, topic, condition), scope, shown, fields)
+    elapsed = elapsed_in(view, rows.searched)
+    sightings = tuple(_finished(each, elapsed, other) for each in rows.sightings)
+    episodes = tuple(_finished(each, elapsed, other) for each in rows.episodes)
+    shown_rows = len(sightings) + len(episodes)
+    note_robots_on(view, topics, rows.searched)
+    note_unread(
+        view,
+        rows.searched,
+        nothing=rows.is_nothing,
+        search=True,
+        gaps=rows.is_nothing or not is_spoken,
     )
-    is_nothing = not (collected.selected or goals)
-    note_robots_on(view, matching_topics(view, topic), searched)
-    note_unread(view, searched, nothing=is_nothing, search=True)
-    if is_nothing:
-        topics = matching_topics(view, topic)
-        silences = describe_silences(view, topics, searched)
+    if rows.is_nothing:
+        silences = describe_silences(view, topics, rows.searched)
         for sentence in (*silences, *unasked_limit(condition, min_score)):
             view.notes.add(sentence)
-    for sentence in (
-        *compared_frames(view, matching_topics(view, topic), condition),
-        *scope.compared_frames,
-    ):
+    for sentence in (*compared_frames(view, topics, condition), *scope.compared_frames):
         view.notes.add(sentence)
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
     start = min(max(start, first), end)
     end = max(min(end, last), start)
     return Sightings(
-        found,
-        more=total is None or total > len(found),
-        total=total,
+        sightings,
+        more=rows.total is None or rows.total > shown_rows,
+        total=rows.total,
         start=start,
         end=end,
         now=now,
         unknown=elapsed.among(scope.unknown),
+        topic=topics[0] if is_spoken else "",
+        episodes=episodes,
         notes=view.notes.sentences(),
     )
+
+
+class _Shown(NamedTuple):
+    """How many rows are shown, which of them, and the frame of the robot's positions."""
+
+    limit: int
+    oldest_first: bool
+    frame_id: str | None
+
+
+class _Rows(NamedTuple):
+    """The rows of a reply; `total` is None where the search ended before it had counted all.
+
+    `searched` is the part of the window in which all matches are known.
+    """
+
+    total: int | None
+    searched: TimeWindow
+    is_nothing: bool
+    sightings: tuple[Sighting, ...] = ()
+    episodes: tuple[Episode, ...] = ()
+
+
+def _finished(row: _Row, elapsed: Elapsed, other: SaidMeanwhile | None) -> _Row:
+    """Returns a row with how much of its time the clock skipped, and what was said meanwhile."""
+    return replace(
+        row,
+        skipped=elapsed.skipped_between(row.first, row.until),
+        said=None if other is None else other.during(row.first, row.until),
+    )
+
+
+def _of_goals(view: View, goals: list[GoalRun], window: TimeWindow, shown: _Shown) -> _Rows:
+    view.notes.retract_before(window.start)
+    found = tuple(
+        _goal_sighting(view, each, shown.frame_id)
+        for each in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
+        if view.call.wants(each.last)
+    )
+    return _Rows(len(goals), window, not goals, sightings=found)
+
+
+def _of_texts(view: View, topic: str, condition: Condition, scope: Scope, shown: _Shown) -> _Rows:
+    texts = find_episodes(
+        view, topic, condition, scope, limit=shown.limit, oldest_first=shown.oldest_first
+    )
+    searched = scope.window
+    if texts.since is not None:
+        searched = TimeWindow(texts.since, searched.stop)
+    view.notes.retract_before(searched.start)
+    found = tuple(
+        with_robot(view, topic, each, shown.frame_id)
+        for each in texts.episodes
+        if view.call.wants(each.until)
+    )
+    return _Rows(texts.total, searched, not texts.episodes, episodes=found)
+
+
+def _of_matches(
+    view: View, search: ReverseSearch, scope: Scope, shown: _Shown, fields: Sequence[str]
+) -> _Rows:
+    is_log, window = view.snapshot.timeline.is_log, scope.window
+    collected = _Sightings(shown.limit, is_log, oldest_first=shown.oldest_first)
+    if scope.is_bounded:
+        _collect(view, search, scope, collected)
+    else:
+        enough = None if shown.oldest_first else shown.limit
+        collected.take(find_runs(view, search, window, is_log, enough=enough), view)
+    searched = window
+    if collected.cut and collected.selected:
+        searched = TimeWindow(collected.selected[-1].first, window.stop)
+    view.notes.retract_before(searched.start)
+    # To say where the robot was takes longest.
+    wanted = [
+        (matches, newest)
+        for matches in collected.selected
+        if view.call.wants(matches.last) and (newest := _newest(view, matches)) is not None
+    ]
+    found = tuple(
+        _sighting(view, search.condition, matches, newest, scope=scope, frame_id=shown.frame_id)
+        for matches, newest in wanted
+    )
+    if fields:
+        found = _with_fields(view, found, [newest for _, newest in wanted], fields)
+    total = None if collected.cut else collected.count
+    return _Rows(total, searched, not collected.selected, sightings=found)
 
 
 def read_sightings(
@@ -225,6 +300,9 @@ def read_sightings(
     goals = goals_asked(view, matching_topics(view, pattern), condition, scope)
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
+    topics = matching_topics(view, pattern)
+    if says_episodes(view, topics):
+        return episode_times(view, topics[0], condition, scope)
     is_log = view.snapshot.timeline.is_log
     if not scope.is_bounded:
         search = ReverseSearch(view, pattern, condition)
@@ -472,7 +550,7 @@ def _sighting(
     thing, labels = _matching(seen, condition), {each.label for each in seen}
     robot_at_first = thing is None and matches.begun
     at = matches.first if robot_at_first else newest.time
-    robot = _robot(view, at, _recording_at(view, newest, at), frame_id)
+    robot = robot_at(view, at, _recording_at(view, newest, at), frame_id)
     return Sighting(
         topic=matches.topic,
         first=matches.first,
@@ -503,7 +581,9 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
         until=goal.last,
         messages=0,
         begun=goal.accepted is not None,
-        robot=None if newest is None else _robot(view, newest.time, newest.bag.recording, frame_id),
+        robot=None
+        if newest is None
+        else robot_at(view, newest.time, newest.bag.recording, frame_id),
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )
@@ -537,21 +617,6 @@ def _with_fields(
     if refused and len(refused) == len(extended):
         raise refused[0]
     return tuple(extended)
-
-
-def _robot(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
-    """Returns the robot's newest pose at or before a match; None where it is not known.
-
-    In the map where transforms lead there, or in `frame_id`. Where the session of the match, which
-    is in this recording, has poses, it is one of these.
-    """
-    window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
-    topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
-    found, pose = newest_pose(view, topic, window, recording) or (None, None)
-    if found is None or pose is None or not all(map(math.isfinite, pose.position)):
-        return None
-    there = placed(view, pose, found.time, found.bag.recording, frame_id)
-    return with_place(view, there, found.time, found.bag.recording)
 
 
 def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:

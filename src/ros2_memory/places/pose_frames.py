@@ -9,15 +9,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.frames import HOLD_NS
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import abbreviate, counted
-from ros2_memory.history.driven_path import newest_of_body, robot_body
+from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.history.driven_path import (
+    body_by_transforms,
+    newest_of_body,
+    resolve_path_topic,
+    robot_body,
+)
 from ros2_memory.history.transforms import connects, newest_in_session, transform_at
 
 if TYPE_CHECKING:
@@ -25,9 +32,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
+
+NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
+"""The robot may have moved since an older pose."""
 
 
 def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
@@ -67,6 +76,21 @@ def newest_pose(
     if found is None or message is None:
         return None
     return found, view.memory.extractor.pose(message, found.record.channel.type)
+
+
+def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
+    """Returns the robot's newest pose at or before a moment; None where it is not known.
+
+    In the map where transforms lead there, or in `frame_id`. Where the session of this recording
+    has poses, it is one of these.
+    """
+    window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
+    topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
+    found, pose = newest_pose(view, topic, window, recording) or (None, None)
+    if found is None or pose is None or not all(map(math.isfinite, pose.position)):
+        return None
+    there = placed(view, pose, found.time, found.bag.recording, frame_id)
+    return with_place(view, there, found.time, found.bag.recording)
 
 
 def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:

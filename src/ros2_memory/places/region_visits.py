@@ -7,6 +7,7 @@ shown begin and end at poses.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -28,7 +29,7 @@ from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_ins
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -223,12 +224,29 @@ def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside | None
     if one.entered:
         poses = _poses_around(found, one.start)
         inside = [time for time, x, y in poses if time <= one.stop and region.contains(x, y)]
+        others = [back for left, back in _absences(poses, inside) if left < one.start]
+        inside = [time for time in inside if time >= max(others, default=MIN_NS)]
         start = min((*inside[:1], *within[:1]), default=MAX_NS)
     if one.left:
         poses = _poses_around(found, one.stop)
         inside = [time for time, x, y in poses if time >= one.start and region.contains(x, y)]
+        others = [left for left, back in _absences(poses, inside) if back > one.stop]
+        inside = [time for time in inside if time <= min(others, default=MAX_NS)]
         stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
     return one._replace(start=start, stop=stop) if start <= stop else None
+
+
+def _absences(
+    poses: Sequence[tuple[Ns, float, float]], inside: Sequence[Ns]
+) -> Iterator[tuple[Ns, Ns]]:
+    """Yields the last pose inside, and the next one, around each absence as long as leaving takes.
+
+    On a straight way from one part of a region to another one there are poses of both.
+    """
+    times = [time for time, _, _ in poses]
+    for left, back in pairwise(inside):
+        if back - left >= FLICKER_NS and bisect_right(times, left) < bisect_left(times, back):
+            yield left, back
 
 
 def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> list[Ns]:

@@ -1,9 +1,10 @@
-"""Bounds of a search besides its window: the robot's place, and a condition on another topic."""
+"""Bounds of a search besides its window: the robot's place, and conditions on other topics."""
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,6 +15,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.held_values import holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
@@ -44,15 +46,15 @@ class WhileCondition:
 
 
 class Scope:
-    """The times in which matches count.
+    """The times in which matches count: in a place, and while all of some conditions hold.
 
     Attributes:
         window: that is searched.
         unknown: the recorded times of it in which it is not known whether matches count.
 
     Raises:
-        InvalidArgumentsError: `where` is no place, or nothing can meet the other condition.
-        NoDataError: the other topic is not recorded, or no pose is.
+        InvalidArgumentsError: `where` is no place, or nothing can meet one of the other conditions.
+        NoDataError: one of the other topics is not recorded, or no pose is.
     """
 
     def __init__(
@@ -60,7 +62,7 @@ class Scope:
         view: View,
         window: TimeWindow,
         where: JsonValue = None,
-        during: WhileCondition | None = None,
+        during: Sequence[WhileCondition] = (),
     ) -> None:
         self.window = window
         self.unknown: Spans = []
@@ -70,22 +72,21 @@ class Scope:
             self._inside = [(each.start, each.stop) for each in inside]
             known = placed_times(track, note_robots(view, resolve_path_topic(view), window))
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
-        self._states: _States | None = None
-        if during is not None:
-            self._states = _States(view, during)
-            known = self._states.known_in(window)
-            unknown = unknown_times(view, window, known, f"what {during.topic} said")
+        self._states = [_States(view, each) for each in during]
+        for state, each in zip(self._states, during, strict=True):
+            known = state.known_in(window)
+            unknown = unknown_times(view, window, known, f"what {each.topic} said")
             self.unknown = united([*self.unknown, *unknown])
 
     @property
     def compared_frames(self) -> tuple[str, ...]:
-        """The note on the frames in which the other condition compared positions, if it did."""
-        return () if self._states is None else self._states.compared_frames
+        """The notes on the frames in which the other conditions compared positions, if any did."""
+        return tuple(dict.fromkeys(chain(*(state.compared_frames for state in self._states))))
 
     @property
     def is_bounded(self) -> bool:
         """Whether messages in the window may not count."""
-        return self._inside is not None or self._states is not None
+        return self._inside is not None or bool(self._states)
 
     def narrowed(
         self, parts: Iterable[tuple[TimeWindow, Sequence[str]]]
@@ -110,7 +111,7 @@ class Scope:
             number = bisect_right(self._inside, time, key=lambda each: each[0])
             if not number or time > self._inside[number - 1][1]:
                 return False
-        return self._states is None or self._states.holds_at(time)
+        return all(state.holds_at(time) for state in self._states)
 
 
 def times_in_region(view: View, where: Where, window: TimeWindow) -> Sequence[Inside]:
@@ -153,15 +154,7 @@ class _States:
             min_score=0.0,
         )
         self._search = ReverseSearch(view, during.topic, self._condition)
-        latching = view.memory.limits.latching
-        self._holds_on = all(
-            latching.is_latched(view.snapshot, topic)
-            or all(
-                view.snapshot.timeline.pace(topic, recording).is_rare
-                for recording in view.snapshot.timeline.recordings(topic)
-            )
-            for topic in self._search.topics
-        )
+        self._holds_on = holds_on(view, self._search.topics)
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []

@@ -1,19 +1,25 @@
-"""The argument `where`: a named place, a circle or a rectangle, and when the robot was there."""
+"""The argument `where`: a named place, a circle or a rectangle, and when the robot was there.
+
+Of several places any counts: a thing, or the robot, is there where it is in one of them.
+"""
 
 from __future__ import annotations
 
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.regions import Circle, Rectangle
+from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle
 from ros2_memory.core.text import abbreviate
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import robot_inside
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Region
     from ros2_memory.history.context import QuerySettings
@@ -25,8 +31,13 @@ PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
 _EXPECTED: Final = (
     "give the name of a place, "
-    '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m)'
+    '{"x": 1.0, "y": 2.0, "radius_m": 0.5}, or {"x": [0, 5], "y": [5, 9]} (m); '
+    'several as "kitchen, hall", or by name: {"kitchen": {"x": [0, 5], "y": [5, 9]}, "hall": ...}'
 )
+_OF_REGION: Final = frozenset({"x", "y", "radius_m"})
+_MOST_PLACES: Final = 30
+_UNNAMED: Final = "where"
+"""What a region without a name is called in tables."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +46,33 @@ class Where:
 
     Attributes:
         frame_id: None for the frame that places are in by default.
-        name: of a named place; None for any other region.
+        name: of a named place, or of several; None for any other region.
+        several: these, each with a name, where the region is that of several places.
     """
 
     region: Region
     frame_id: str | None = None
     name: str | None = None
+    several: tuple[Where, ...] = ()
 
     def contains(self, frame_id: str, x: float, y: float) -> bool:
         """Whether a point (m) of a frame lies in the region."""
         return self.frame_id in {None, frame_id} and self.region.contains(x, y)
+
+    @property
+    def each(self) -> tuple[Where, ...]:
+        """The places that it is made of: itself, where it is one."""
+        return self.several or (self,)
+
+    @property
+    def title(self) -> str:
+        """What a row about it is called."""
+        return self.name or _UNNAMED
+
+    def places(self, frame_id: str) -> tuple[Place, ...]:
+        """Returns each of its places by name; `frame_id` is the frame of those that name none."""
+        frame = self.frame_id or frame_id
+        return tuple(Place(one.title, one.frame_id or frame, one.region) for one in self.each)
 
     @property
     def shown(self) -> JsonValue:
@@ -66,30 +94,92 @@ def parse_where(
 
     Args:
         limits: have the named places.
-        value: as the client gave it.
+        value: as the client gave it: a place, or several.
         default_radius_m: of a circle without a radius; None where it must have one.
 
     Raises:
         InvalidArgumentsError: it is no region, or no place has that name.
     """
+    several = _several(limits, value)
+    if several is None:
+        return _one(limits, value, default_radius_m)
+    if len(several) > _MOST_PLACES:
+        raise InvalidArgumentsError(
+            f"where has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
+        )
+    found = tuple(
+        _called(name, _one(limits, each, default_radius_m, f"where: {abbreviate(name)}"))
+        for name, each in several.items()
+    )
+    if len(found) == 1:
+        return found[0]
+    region = AnyOf(tuple(each.region for each in found))
+    names = ", ".join(each.title for each in found)
+    return Where(region, _frame_of(found), names, found)
+
+
+def _called(name: str, place: Where) -> Where:
+    return place if place.name is not None else replace(place, name=name)
+
+
+def _several(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
+    """Returns places by name; None of a value that is to be one place."""
+    if isinstance(value, str):
+        names = [name.strip() for name in value.split(",")]
+        if len(names) == 1 or _place_named(limits, value) is not None:
+            return None
+        return {name: name for name in names if name} or None
+    if isinstance(value, list) and value and all(isinstance(each, str) for each in value):
+        return {str(each): each for each in value}
+    if not isinstance(value, dict):
+        return None
+    is_one = any(not isinstance(value.get(name, {}), dict) for name in _OF_REGION)
+    are_places = any(isinstance(each, str | dict) for each in value.values())
+    return value if are_places and not is_one else None
+
+
+def _frame_of(several: Sequence[Where]) -> str | None:
+    """Returns the frame that several places share; coordinates are in that of the named ones.
+
+    Raises:
+        InvalidArgumentsError: they are in several frames.
+    """
+    known = {each.frame_id: each.title for each in several if each.frame_id is not None}
+    if len(known) > 1:
+        listed = ", ".join(f"{name} is in {frame}" for frame, name in known.items())
+        raise InvalidArgumentsError(f"where: {listed}: ask about places of one frame")
+    return next(iter(known), None)
+
+
+def _one(
+    limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str = "where"
+) -> Where:
     if isinstance(value, str):
         return _named(limits, value)
     if not isinstance(value, dict):
-        raise InvalidArgumentsError(f"where was {abbreviate(value)}; {_EXPECTED}")
-    unknown = value.keys() - {"x", "y", "radius_m"}
+        raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
+    unknown = value.keys() - _OF_REGION
     if unknown:
-        raise InvalidArgumentsError(f"where has no {abbreviate(min(unknown))}; {_EXPECTED}")
+        raise InvalidArgumentsError(f"{what} has no {abbreviate(min(unknown))}; {_EXPECTED}")
     x, y = value.get("x"), value.get("y")
     if isinstance(x, list) or isinstance(y, list):
         if "radius_m" in value:
-            raise InvalidArgumentsError(f"where has a radius_m and a range; {_EXPECTED}")
-        return Where(Rectangle(*_bounds("x", x), *_bounds("y", y)))
+            raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
+        return Where(Rectangle(*_bounds(f"{what}: x", x), *_bounds(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
     numbers = [_number(each) for each in (x, y, radius)]
     if None in numbers or not (numbers[2] or 0) > 0:
-        raise InvalidArgumentsError(f"where was {abbreviate(value)}; {_EXPECTED}")
+        raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     at_x, at_y, size = (each or 0.0 for each in numbers)
     return Where(Circle(at_x, at_y, size))
+
+
+def places_asked(
+    limits: QuerySettings, where: Where | None, frames: Iterable[str]
+) -> tuple[Place, ...]:
+    """Returns the named places, and those that a question names in any of some frames."""
+    asked = [] if where is None or where.name is None else [where.places(one) for one in frames]
+    return tuple(dict.fromkeys(chain(limits.places, *asked)))
 
 
 def places_setting(limits: QuerySettings) -> str:
@@ -97,11 +187,16 @@ def places_setting(limits: QuerySettings) -> str:
     return f"{PLACES_SETTING}, here {limits.places_file}" if limits.places_file else PLACES_SETTING
 
 
-def _named(limits: QuerySettings, name: str) -> Where:
+def _place_named(limits: QuerySettings, name: str) -> Place | None:
     asked = " ".join(name.split()).casefold()
-    for place in limits.places:
-        if " ".join(place.name.split()).casefold() == asked:
-            return Where(place.region, place.frame_id, place.name)
+    same = (one for one in limits.places if " ".join(one.name.split()).casefold() == asked)
+    return next(same, None)
+
+
+def _named(limits: QuerySettings, name: str) -> Where:
+    place = _place_named(limits, name)
+    if place is not None:
+        return Where(place.region, place.frame_id, place.name)
     known = ", ".join(sorted(each.name for each in limits.places))
     none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
     listed = f"there are: {known}" if known else none
@@ -112,7 +207,7 @@ def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
     ends = [_number(each) for each in value] if isinstance(value, list) else []
     if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
         raise InvalidArgumentsError(
-            f"where: {axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
+            f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
         )
     return ends[0], ends[1]
 
@@ -147,7 +242,7 @@ def note_other_frame(
     As replies of get_position_* give them. `ask` says how to ask for what is there.
     """
     own = placement.pose_frame
-    if where.name is not None or own == placement.frame_id:
+    if where.frame_id is not None or own == placement.frame_id:
         return
     with suppress(QueryTimeoutError):
         if times_inside(view, replace(where, frame_id=own), own, window):

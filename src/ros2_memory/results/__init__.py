@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeAlias
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.reply import PLAIN, TIME, result
 from ros2_memory.results.base import AnswerWithNotes
+from ros2_memory.results.episodes import Changes, Episode, Spell
 from ros2_memory.results.memory import (
     ANOTHER,
     Budget,
@@ -82,12 +83,14 @@ __all__ = [
     "BinColumn",
     "Bins",
     "Budget",
+    "Changes",
     "ComparedMover",
     "ComparedThing",
     "ComparedThings",
     "Comparison",
     "DataTimeRange",
     "DrivenInside",
+    "Episode",
     "Event",
     "Extremes",
     "FarFromOther",
@@ -108,6 +111,7 @@ __all__ = [
     "Sighting",
     "Sightings",
     "SilentTopic",
+    "Spell",
     "StandstillPlace",
     "Status",
     "StillThere",

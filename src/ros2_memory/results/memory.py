@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import SetAside
     from ros2_memory.core.timebase import Ns
 
-ANOTHER: Final = "another program"
+ANOTHER: Final = "another recorder"
 """The recorder of a status where this program has none, and files are being written."""
 _MAX_LISTED: Final = 20
 _MAX_TOPICS: Final = 10
@@ -293,7 +293,7 @@ _BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS
 
 
 @result(
-    PLAIN("trust").in_short,
+    PLAIN("doubts").in_short,
     PLAIN("recorder").in_short,
     "recorder_alive",
     "restarts",
@@ -373,9 +373,9 @@ class Status(AnswerWithNotes):
     lost: Mapping[str, int] = field(default_factory=dict)
 
     @property
-    def trust(self) -> str:
+    def doubts(self) -> str:
         """Why answers may be missing something, or be wrong, in short."""
-        return "; ".join(self._doubts()) or "nothing is known to be missing"
+        return "; ".join(self._reasons()) or "no loss or fault was found"
 
     @property
     def recorder_alive(self) -> bool | None:
@@ -388,7 +388,7 @@ class Status(AnswerWithNotes):
         """How old the newest data is."""
         return None if self.heard is None else max(self.now - self.heard, 0)
 
-    def _doubts(self) -> Iterator[str]:
+    def _reasons(self) -> Iterator[str]:
         yield from self.problems
         topics = {silence.topic for silence in self.silences}
         if len(self.silences) == 1:

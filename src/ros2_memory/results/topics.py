@@ -35,11 +35,13 @@ from ros2_memory.core.reply import (
 from ros2_memory.core.text import named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
+from ros2_memory.results.episodes import SAID
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
+    from ros2_memory.results.episodes import Episode, Spell
 
 _MINUTE_S: Final = 60
 _MOST_MATCHED: Final = 5
@@ -260,6 +262,7 @@ class LabelledPlace:
     OBJECT("place", "thing").if_known,
     digits(3)("score").if_known,
     PLAIN("began_earlier").if_any,
+    SAID,
 )
 class Sighting:
     """Consecutive messages of one topic that met a condition.
@@ -280,6 +283,7 @@ class Sighting:
         score: of the detection, if the message has that; the best of several.
         skipped: how much of the time from the first to `until` the clock skipped.
         robot_at_first: whether `robot` is of the first message.
+        said: what another topic said meanwhile, if that was asked.
     """
 
     topic: str
@@ -295,6 +299,7 @@ class Sighting:
     score: float | None = None
     skipped: Ns = 0
     robot_at_first: bool = False
+    said: tuple[Spell, ...] | None = None
 
     @property
     def robot_at(self) -> str:
@@ -307,18 +312,34 @@ class Sighting:
         return not self.begun
 
 
-@result(
-    OBJECTS("sightings").along("last_seen"),
+_SEARCHED: Final = (
     TOTAL("total", "counted").merged("added"),
     SECONDS("unknown_s").if_any.merged("added"),
     TIME("searched_from", "start").merged("earliest"),
     TIME("searched_to", "end").merged("newest"),
     LOCAL("local", "start", "end"),
     PLAIN("more").if_any,
+)
+
+
+@result(
+    OBJECTS("sightings").along("last_seen"),
+    *_SEARCHED,
     span=("oldest", "now"),
+    where=(
+        "topic",
+        keys(
+            "topic",
+            OBJECTS("episodes").along("end"),
+            *_SEARCHED,
+            span=("oldest", "now"),
+        ),
+    ),
 )
 class Sightings(AnswerWithNotes):
     """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
+
+    With a `topic` there are `episodes` in their place: of its texts, which hold until the next.
 
     `total` is how many there are; None if the search ended before it had counted all. `unknown` is
     for how long something was recorded, and it is not known whether matches count.
@@ -331,16 +352,20 @@ class Sightings(AnswerWithNotes):
     end: Ns | None
     now: Ns
     unknown: Ns = 0
+    topic: str = ""
+    episodes: tuple[Episode, ...] = ()
 
     @property
     def oldest(self) -> Ns | None:
         """The oldest time of the reply."""
-        return min((found.first for found in self.sightings), default=self.start)
+        firsts = [*(one.first for one in self.sightings), *(one.first for one in self.episodes)]
+        return min(firsts, default=self.start)
 
     @property
     def counted(self) -> tuple[int, bool]:
         """How many there are, and whether these are all."""
-        return (len(self.sightings), False) if self.total is None else (self.total, True)
+        shown = len(self.sightings) + len(self.episodes)
+        return (shown, False) if self.total is None else (self.total, True)
 
 
 BinColumn: TypeAlias = Literal["count", "duration", "minutes", "metres", "number", "time"]

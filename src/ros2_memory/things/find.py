@@ -18,7 +18,7 @@ from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, ThingStay
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
@@ -83,7 +83,8 @@ def find_things(
     note_robots(view, view.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
     asked = {known.labels.key(each): each for each in labels}
-    finder = _Finder(known, window, region, limits.places)
+    places = places_asked(limits, region, known.frames)
+    finder = _Finder(known, window, region, places)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
     things = tuple(each.described() for each in found[:limit])
     totals: Counter[str] = Counter()

@@ -450,8 +450,8 @@ class _Parts(NamedTuple):
         scanner = view.memory.columns
         if scanner.store is None:
             return None
-        # Before the parts: what becomes a part meanwhile is in none of those that are known.
-        splits = scanner.store.splits()
+        # Before the parts: what is merged meanwhile is in none of those that are known.
+        unmerged = scanner.store.unmerged()
         coverage = scanner.coverage(view.snapshot.timeline)
         if coverage is None:
             return None
@@ -460,9 +460,14 @@ class _Parts(NamedTuple):
             for part in coverage.segments
             if window.overlaps(part.segment.bags[0].start, part.segment.latest)
             for bag, number in zip(part.segment.bags, part.numbers.tolist(), strict=True)
-            if number >= 0 and number not in splits
+            if number >= 0 and number not in unmerged
         }
-        heads = [head for topic in {*topics} for head in scanner.parts(topic, window, coverage)]
+        heads = [
+            head
+            for topic in {*topics}
+            for head in scanner.parts(topic, window, coverage)
+            if head.is_whole
+        ]
         heads.sort(key=lambda head: head.first)
         firsts = np.array([head.first for head in heads], np.int64)
         lasts = np.array([head.last for head in heads], np.int64)

@@ -29,7 +29,7 @@ from pydantic import (
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import rest_of_text_s, unix_from_text
+from ros2_memory.core.timebase import named_span_s, rest_of_text_s, unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.places.scope import WhileCondition
 
@@ -40,9 +40,12 @@ LONGEST_NAME: Final = 500
 LONGEST_VALUE: Final = 2_000
 CONDITION_KEYS: Final = ("topic", "condition_type", "value", "field")
 MOST_FIELDS: Final = 100
+MOST_CONDITIONS: Final = 8
+"""Conditions on other topics that one call takes."""
 MOST_TIMES: Final = 20
 """Moments that one call asks about."""
 MOST_WAYPOINTS: Final = 200
+FORMS_OF_TIME: Final = "Unix s or 2026-11-20T14:05."
 TIME_KINDS: Final = ("number", "string")
 """The JSON types of a time: Unix seconds, or ISO 8601 text."""
 REGION_KINDS: Final = ("string", "object")
@@ -95,12 +98,16 @@ def _read_time(value: object) -> object:
     return seconds
 
 
-def _read_until(value: object) -> object:
-    """Returns a time as `_read_time` does; of a text the end of its last decimal."""
+def _read_until(value: object, info: ValidationInfo[object]) -> object:
+    """Returns a time as `_read_time` does; of a text the end of its last decimal.
+
+    Of a window whose start is the same the end of the minute or the day that the text names.
+    """
     seconds = _read_time(value)
     if not isinstance(value, str) or not isinstance(seconds, float):
         return seconds
-    return seconds + rest_of_text_s(value)
+    start = info.data.get((info.field_name or "").replace("end", "start"))
+    return seconds + (named_span_s(value) if start == seconds else 0.0) + rest_of_text_s(value)
 
 
 def _as_times(value: object) -> object:
@@ -123,16 +130,25 @@ def _parse_json(text: str) -> object:
 
 
 def _as_region(value: object) -> object:
-    """Returns a region, which planners also send as JSON text."""
+    """Returns a region, or several, which planners also send as JSON text."""
     if not isinstance(value, str):
         return value
     parsed = _parse_json(_check_text(value, LONGEST_VALUE))
-    return parsed if isinstance(parsed, dict) else value
+    return parsed if isinstance(parsed, dict | list) else value
 
 
 def _as_while(value: object) -> object:
-    """Returns the condition on another topic, which planners also send as JSON text."""
+    """Returns the conditions on other topics, which planners also send as JSON text."""
     parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
+    every = parsed if isinstance(parsed, list) else [parsed]
+    if not every:
+        raise ValueError("is an empty list: leave it out, or give a condition")
+    if len(every) > MOST_CONDITIONS:
+        raise ValueError(f"has {len(every)} conditions, more than {MOST_CONDITIONS}")
+    return tuple(map(_while_condition, every))
+
+
+def _while_condition(parsed: object) -> WhileCondition:
     if not isinstance(parsed, dict):
         raise ValueError("is not an object")  # noqa: TRY004 - pydantic reports ValueError alone
     unknown = sorted(str(name) for name in parsed.keys() - CONDITION_KEYS)
@@ -205,6 +221,10 @@ def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> Js
 _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
 _AtLeast0: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+_Tolerance: TypeAlias = Annotated[
+    _AtLeast0, Field(description="Oldest age, s, e.g. 2 for a topic of 1 Hz.")
+]
+_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score of detections.")]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _Time: TypeAlias = Annotated[
     float,
@@ -221,7 +241,7 @@ _Until: TypeAlias = Annotated[
     BeforeValidator(_read_until),
     WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
-_Start: TypeAlias = Annotated[_Time | None, Field(alias="start")]
+_Start: TypeAlias = Annotated[_Time | None, Field(alias="start", description=FORMS_OF_TIME)]
 _End: TypeAlias = Annotated[_Until | None, Field(alias="end")]
 _Before: TypeAlias = Annotated[_Until | None, Field(alias="before", description="Up to this time.")]
 _Times: TypeAlias = Annotated[tuple[_Until, ...], BeforeValidator(_as_times)]
@@ -249,23 +269,44 @@ _Labels: TypeAlias = Annotated[
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")
 ]
+_Region: TypeAlias = Annotated[JsonValue, BeforeValidator(_as_region)]
+_REGION_SCHEMA: Final[dict[str, JsonValue]] = {
+    "type": [*REGION_KINDS],
+    "examples": ["kitchen", "kitchen, hall", {"den": {"x": [0, 5], "y": [0, 9]}}],
+}
 _Where: TypeAlias = Annotated[
-    JsonValue,
-    BeforeValidator(_as_region),
+    _Region,
+    WithJsonSchema(
+        {**_REGION_SCHEMA, "description": "Of the robot, not a thing; forms: trajectory_summary."}
+    ),
+]
+_WhereInFull: TypeAlias = Annotated[
+    _Region,
     WithJsonSchema(
         {
-            "anyOf": [{"type": kind} for kind in REGION_KINDS],
-            "examples": ["kitchen"],
+            **_REGION_SCHEMA,
+            "description": "Where the robot was: kitchen | {x, y, radius_m} | "
+            "{x: [0, 5], y: [0, 9]}; in any of several: kitchen, hall | {den: {x: [0, 5], ...}}.",
         }
     ),
-    Field(description="A place."),
+]
+_WhereOfThings: TypeAlias = Annotated[
+    _Region,
+    WithJsonSchema({**_REGION_SCHEMA, "description": "Of the things; forms: trajectory_summary."}),
+]
+_WhereOfBoth: TypeAlias = Annotated[
+    _Region,
+    WithJsonSchema(
+        {**_REGION_SCHEMA, "description": "Of robot and things; forms: trajectory_summary."}
+    ),
 ]
 _FrameId: TypeAlias = Annotated[_Name, Field(description="Frame of the reply.")]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
 ]
 _ConditionType: TypeAlias = Annotated[
-    Literal["contains", "equals", "above", "below", "near_position"], Field(examples=["contains"])
+    Literal["contains", "contains_word", "equals", "above", "below", "near_position"],
+    Field(examples=["contains"]),
 ]
 _ConditionValue: TypeAlias = Annotated[
     JsonValue,
@@ -282,7 +323,23 @@ _SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path to test."
 
 _By: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place"],
-    Field(description="One row per local day, hour, weekday, or place."),
+    Field(description="One row per local day, hour, weekday, or place (of where, else named)."),
+]
+
+
+_ByValue: TypeAlias = Annotated[
+    Literal["day", "hour", "weekday", "place", "value"],
+    Field(
+        description="One row per local day, hour, weekday, place (of where, else named), or value "
+        "that held."
+    ),
+]
+_ByInMatches: TypeAlias = Annotated[
+    Literal["day", "hour", "weekday", "place", "label", "value"],
+    Field(
+        description="One row per local day, hour, weekday, place (of where, else named), value "
+        'that held, or label seen (value "" for all).'
+    ),
 ]
 
 
@@ -338,7 +395,9 @@ class Between(TimeArgument):
 
     replaces = "span"
     text = "between two times"
-    start_s: Annotated[_Time, Field(examples=[1784023200], alias="start")]
+    start_s: Annotated[
+        _Time, Field(examples=[1784023200], alias="start", description=FORMS_OF_TIME)
+    ]
     end_s: Annotated[_Until, Field(examples=[1784023260], alias="end")]
 
 
@@ -349,7 +408,9 @@ class RecapTime(TimeArgument):
     text = "in the last_s seconds, between two times, or around a moment"
     either = ("last_s", "start", "around")
     last_s: Annotated[_Positive, Field(examples=[60])] | None = None
-    start_s: _Time | None = Field(default=None, alias="start", examples=[1784023200])
+    start_s: _Time | None = Field(
+        default=None, alias="start", description=FORMS_OF_TIME, examples=[1784023200]
+    )
     end_s: _Until | None = Field(default=None, alias="end", examples=[1784023260])
     around_s: _Until | None = Field(
         default=None,
@@ -390,7 +451,7 @@ class TopicAtArguments(Arguments):
 
     topic: _Topic
     moment: AtTime
-    tolerance_s: _AtLeast0 | None = None
+    tolerance_s: _Tolerance | None = None
     fields: _Fields = ()
 
 
@@ -403,7 +464,10 @@ class TopicRangeArguments(Arguments):
         Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_as_integer)
     ] = 100
     fields: _Fields = ()
-    by: _By | None = None
+    changes: (
+        Annotated[bool, Field(strict=True, description="One row per change of value.")] | None
+    ) = None
+    by: _ByValue | None = None
 
 
 class MotionArguments(Arguments):
@@ -411,7 +475,7 @@ class MotionArguments(Arguments):
 
     moment: AtTime
     topic: _PoseTopic | None = None
-    tolerance_s: _AtLeast0 | None = None
+    tolerance_s: _Tolerance | None = None
 
 
 class PositionArguments(MotionArguments):
@@ -435,7 +499,7 @@ class ConditionArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
-    min_score: _AtLeast0 | None = None
+    min_score: _MinScore | None = None
 
 
 class LastMatchArguments(ConditionArguments):
@@ -455,7 +519,7 @@ class ValueWhenArguments(Arguments):
     condition_type: _ConditionType
     value: _ConditionValue
     field: _SearchField | None = None
-    min_score: _AtLeast0 | None = None
+    min_score: _MinScore | None = None
     fields: _Fields = ()
     before_s: _Before = None
 
@@ -465,7 +529,7 @@ class TrajectoryArguments(Arguments):
 
     span: TimeRange
     topic: _PoseTopic | None = None
-    where: _Where | None = None
+    where: _WhereInFull | None = None
     frame_id: _FrameId | None = None
     max_waypoints: Annotated[
         Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
@@ -479,7 +543,7 @@ class RecapArguments(Arguments):
     span: TimeRange
     where: _Where | None = None
     frame_id: _FrameId | None = None
-    min_score: _AtLeast0 | None = None
+    min_score: _MinScore | None = None
 
 
 class SaveMomentArguments(Arguments):
@@ -523,15 +587,16 @@ class VisitsArguments(Arguments):
 
 
 _While: TypeAlias = Annotated[
-    InstanceOf[WhileCondition],
+    tuple[InstanceOf[WhileCondition], ...],
     BeforeValidator(_as_while),
     WithJsonSchema(
         {
-            "type": "object",
+            "anyOf": [{"type": "object"}, {"items": {"type": "object"}, "type": "array"}],
+            "description": "Counts only while another topic meets this, e.g. "
+            '{"topic": "/is_docked", "condition_type": "equals", "value": false}; of a list, all.',
             "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],
         }
     ),
-    Field(description="{topic, condition_type, value, field?} of another topic."),
 ]
 
 
@@ -548,9 +613,12 @@ class MatchesArguments(ConditionArguments):
         bool, Field(strict=True, description="Oldest sightings first, with total.")
     ] = False
     limit: _Limit = 5
-    by: _By | None = None
+    by: _ByInMatches | None = None
+    beside: Annotated[_Name, Field(description="Also what this topic said during each.")] | None = (
+        Field(default=None, alias="with", examples=["/action"])
+    )
     where: _Where | None = None
-    during: _While | None = Field(default=None, alias="while")
+    during: _While = Field(default=(), alias="while")
     frame_id: _FrameId | None = None
 
 
@@ -558,18 +626,20 @@ class ThingsArguments(Arguments):
     """Which things, where, and when."""
 
     labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
-    where: _Where | None = None
+    where: _WhereOfThings | None = None
     start_s: _Start = None
     end_s: _End = None
-    min_score: _AtLeast0 | None = None
+    min_score: _MinScore | None = None
     limit: _Limit = 12
 
 
 class CompareArguments(Arguments):
     """Two windows to compare."""
 
-    start_s: Annotated[_Time, Field(alias="start", examples=[1784023200])]
+    start_s: Annotated[
+        _Time, Field(alias="start", description=FORMS_OF_TIME, examples=[1784023200])
+    ]
     end_s: Annotated[_Until, Field(alias="end", examples=[1784023260])]
     with_start_s: Annotated[_Time, Field(alias="with_start", examples=[1783936800])]
     with_end_s: Annotated[_Until, Field(alias="with_end", examples=[1783936860])]
-    where: _Where | None = None
+    where: _WhereOfBoth | None = None

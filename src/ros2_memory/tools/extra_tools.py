@@ -31,8 +31,10 @@ _SIGHTINGS = ToolDeclaration(
     "When, where, how often and how long a condition was true, newest first. "
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
-    'succeeded. while: {{"topic": "/is_docked", "condition_type": '
-    '"equals", "value": false}} counts only while another topic meets that. '
+    "succeeded. contains_word: whole "
+    "words (pot, not potato; knife -butter: knife without butter). Texts such as /task hold until "
+    "the next, an empty one ends them: {{topic, episodes: [{{start, end, seconds, value, previous, "
+    "next: {{value, start}}, with, robot}}]}}. "
     "Reply: {{sightings: [{{topic, first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
     "position (at when), place: of the thing, score}}], total, unknown_s}}.",

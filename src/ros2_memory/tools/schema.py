@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.tools.arguments import REGION_KINDS, TIME_KINDS
+from ros2_memory.tools.arguments import FORMS_OF_TIME, REGION_KINDS, TIME_KINDS
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -180,11 +180,11 @@ def _flat(schema: JsonObject) -> JsonObject:
 
 def _with_plain_times(schema: JsonObject) -> JsonObject:
     plain = dict(schema)
-    if plain.get("anyOf") == [{"type": kind} for kind in REGION_KINDS]:
-        del plain["anyOf"]
-        plain["type"] = REGION_KINDS[0]
-    if plain.get("type") == [*TIME_KINDS]:
-        plain["type"] = TIME_KINDS[0]
+    for kinds in (REGION_KINDS, TIME_KINDS):
+        if plain.get("type") == [*kinds]:
+            plain["type"] = kinds[0]
+    if plain.get("description") == FORMS_OF_TIME:
+        del plain["description"]
     items = plain.get("items")
     if isinstance(items, dict):
         plain["items"] = _with_plain_times(items)
@@ -220,7 +220,10 @@ def _kind(schema: JsonObject) -> str:
     items = schema.get("items")
     if isinstance(items, dict) and items.get("type") == [*TIME_KINDS]:
         return f"a list of {_TIME}"
-    return _KINDS[str(schema.get("type"))]
+    kinds = schema.get("type")
+    if isinstance(kinds, list):
+        return " or ".join(_KINDS[str(kind)] for kind in kinds)
+    return _KINDS[str(kinds)]
 
 
 def _example(schema: JsonObject) -> JsonValue:

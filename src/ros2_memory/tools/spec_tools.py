@@ -15,6 +15,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.insights.at_each import at_each
+from ros2_memory.insights.episodes import topic_changes
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
@@ -36,6 +37,8 @@ from ros2_memory.tools.arguments import (
 from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import TimeRange
@@ -87,6 +90,21 @@ def _list_topics(
             "a glob such as */scene_objects matches anywhere, no pattern at all lists every topic",
         )
     return named
+
+
+def _topic_range(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    span: TimeRange,
+    *,
+    max_samples: int,
+    fields: Sequence[str],
+    changes: bool | None,
+) -> results.TopicRange | results.Changes:
+    """Returns samples of a topic, or each value that it held once."""
+    query = topic_changes if changes else queries.topic_range
+    return query(memory, call, topic, span, max_samples=max_samples, fields=fields)
 
 
 def _trajectory(
@@ -141,12 +159,14 @@ _DECLARATIONS = (
             ToolName("get_topic_in_range", "A topic over a window", Between),
             ToolName("get_topic_in_last", "A topic over the last seconds", Last),
         ),
-        "A topic's messages {when}: up to max_samples, evenly spaced over the window, "
-        "first and last included. Reply: {{topic, type, total, samples: [{{timestamp, value}}]}}; "
+        "A topic's messages {when}: all if total is at most max_samples, else so many, evenly "
+        "spaced, first and last included. start and end alike: that minute or day. changes: what "
+        "held, [{{start, seconds, value}}]. Reply: {{topic, type, total, samples: [{{timestamp, "
+        "value}}]}}; "
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
         "max, max_at}}}} of all messages}}.",
         TopicRangeArguments,
-        queries.topic_range,
+        _topic_range,
         count=count_range,
     ),
     ToolDeclaration(

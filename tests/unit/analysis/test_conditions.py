@@ -398,7 +398,7 @@ def test_a_limit_may_stand_in_quotes(asked: JsonValue) -> None:
         (
             "near",
             {"x": 1, "y": 2},
-            "'near' is not one of contains, equals, above, below, near_position",
+            "'near' is not one of contains, contains_word, equals, above, below, near_position",
         ),
         ("contains", None, "not null"),
         ("contains", ["a", "b"], "not a list"),

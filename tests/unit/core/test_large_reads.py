@@ -27,14 +27,14 @@ class Reader(threading.Thread):
     def run(self) -> None:
         with self._large.during():
             self.began.set()
-            self._large.take()
-            self._large.take()
+            self._large.acquire()
+            self._large.acquire()
             self._had.append(self.name)
             assert self.go_on.wait(PATIENCE_S)
 
 
 def waiting(large: LargeReads) -> int:
-    return len(large._first_has_it)
+    return len(large._queue)
 
 
 def test_threads_have_the_turn_one_after_the_other_in_the_order_they_came() -> None:
@@ -60,12 +60,12 @@ def test_who_waits_is_told_when_its_time_is_over_and_leaves_the_queue() -> None:
         raise QueryTimeoutError("too late")
 
     with pytest.raises(QueryTimeoutError), large.during(over):
-        large.take()
+        large.acquire()
     assert waiting(large) == 1
     holder.go_on.set()
     holder.join()
     with large.during(over):
-        large.take()  # it need not wait, so its time is not looked at
+        large.acquire()  # it need not wait, so its time is not looked at
     assert not waiting(large)
 
 
@@ -76,9 +76,9 @@ def test_nobody_waits_outside_of_a_block_or_where_it_is_set_aside(is_set_aside: 
     until(lambda: had)
     with large.during() if is_set_aside else nullcontext():
         with large.set_aside():
-            large.take()
+            large.acquire()
         if not is_set_aside:
-            large.take()
+            large.acquire()
     holder.go_on.set()
     holder.join()
     assert not waiting(large)
@@ -87,14 +87,14 @@ def test_nobody_waits_outside_of_a_block_or_where_it_is_set_aside(is_set_aside: 
 def test_a_turn_that_is_passed_on_is_taken_again_behind_who_waited() -> None:
     large, had = LargeReads(), list[str]()
     with large.during():
-        large.take()
+        large.acquire()
         other = Reader(large, had, "other")
         until(lambda: waiting(large) == 2)
         assert not had
-        large.pass_on()
+        large.release()
         until(lambda: had)
         other.go_on.set()
-        large.take()
+        large.acquire()
         other.join()
     assert not waiting(large)
 
@@ -103,7 +103,7 @@ def test_a_block_in_a_block_is_part_of_it() -> None:
     large, waits = LargeReads(), list[int]()
     with large.during(waited=waits.append):
         with large.during():
-            large.take()
+            large.acquire()
         assert waiting(large) == 1
     assert not waiting(large)
     assert not waits  # it was free
@@ -114,7 +114,7 @@ def test_how_long_a_thread_waited_is_told() -> None:
     holder = Reader(large, had, "holder")
     until(lambda: had)
     with large.during(check=holder.go_on.set, waited=waits.append):
-        large.take()
+        large.acquire()
     holder.join()
     [waited_ns] = waits
     assert waited_ns > 0

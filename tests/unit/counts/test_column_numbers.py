@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.core.errors import QueryTimeoutError
@@ -46,9 +46,12 @@ def storing(memory: Memory, folder: Path, draw: Random, *, part: float = 1.0) ->
     timeline = memory.index.snapshot().timeline
     bags = filling.waiting(timeline)
     draw.shuffle(bags)
-    for bag in bags[: round(part * len(bags))]:
-        filling.fill(bag, timeline)
-    filling.merge(timeline)
+    stop = round(part * len(bags))
+    for bag in bags[:stop]:
+        filling.fill(Batch([bag], whole=False), timeline)
+    for batch in filling.batches(timeline):
+        if not {*batch.bags} & {*bags[stop:]}:
+            filling.fill(batch, timeline)
     return replace(memory, columns=scanner)
 
 

@@ -134,8 +134,8 @@ def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
 def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path) -> None:
     unnamed = asked(in_places(memory), world, "trajectory_summary", by="place", **DOOR)
     assert "needs named places" in unnamed["detail"]
-    two = asked(memory, world, "visits", by="place", where="start")
-    assert "give no other one" in two["detail"]
+    two = asked(memory, world, "visits", by="place", x=0.0, y=0.0)
+    assert "give where in place of x and y" in two["detail"]
     none = asked(in_places(memory), world, "visits", by="day")
     assert "no place is named" in none["detail"]
 

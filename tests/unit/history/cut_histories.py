@@ -132,9 +132,12 @@ def fill_some(world: World, draw: Random) -> None:
     waiting = world.filling.waiting(timeline)
     draw.shuffle(waiting)
     for bag in waiting[: draw.randint(0, len(waiting))]:
-        world.filling.fill(bag, timeline)
+        world.fill_alone([bag])
         if draw.random() < 0.3:
-            make_fragments(world.memory, world.filling.merge(timeline))
+            for batch in world.filling.batches(timeline):
+                if not {*batch.bags} & {*waiting} or draw.random() < 0.1:
+                    world.filling.fill(batch, timeline)
+            make_fragments(world.memory, world.filling.whole_since())
             if draw.random() < 0.5:
                 world.filling.thin()
     if draw.random() < 0.3:

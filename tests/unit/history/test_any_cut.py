@@ -321,7 +321,7 @@ def check_silences(known: Any, splits: Splits, plain: Mapping[str, list[Plain]])
 # However it is cut, whatever is stored
 
 
-UNLIKE: Final = {"bags", "budget", "clock_faults", "silences", "trust"}
+UNLIKE: Final = {"bags", "budget", "clock_faults", "silences", "doubts"}
 """How many bags, their bytes, and which no clock dated. Silences lie between bags."""
 
 

@@ -54,7 +54,7 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
     (note,) = warned(memory)
     assert "blue, red overlap in time" in note
     assert "/odom" in note
-    assert "robots are mixed (see notes)" in asked(memory, tmp_path, "memory_status")["trust"]
+    assert "robots are mixed (see notes)" in asked(memory, tmp_path, "memory_status")["doubts"]
 
 
 @pytest.mark.parametrize(

@@ -302,8 +302,8 @@ def test_a_step_back_is_named_and_changes_no_duration(tmp_path: Path) -> None:
 
 
 def test_trust_sums_up_the_steps_of_the_clock(tmp_path: Path) -> None:
-    trust = asked(set_ahead(tmp_path), tmp_path, "memory_status")["trust"]
-    assert trust.endswith("the clock was set 8 s ahead")
+    doubts = asked(set_ahead(tmp_path), tmp_path, "memory_status")["doubts"]
+    assert doubts.endswith("the clock was set 8 s ahead")
 
 
 def test_bins_have_their_times_in_unix_seconds_too(tmp_path: Path) -> None:

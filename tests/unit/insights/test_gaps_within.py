@@ -84,7 +84,7 @@ def test_gaps_within_bags_are_listed_wherever_gaps_are(stalled: Memory) -> None:
     assert gaps(stalled) == [(7.995, 11.0), (15.995, 16.7)]
     status = ask(stalled, "memory_status")
     assert [gap["duration_s"] for gap in status["gaps"]] == pytest.approx([0.705, 3.005], abs=0.001)
-    assert status["trust"] == "while the recorder ran, nothing was recorded 2 times (3.71 s)"
+    assert status["doubts"] == "while the recorder ran, nothing was recorded 2 times (3.71 s)"
 
 
 def test_a_moment_in_a_gap_within_a_bag_has_no_data(stalled: Memory) -> None:
@@ -130,7 +130,7 @@ def test_a_step_of_the_clock_within_a_bag_is_no_gap(tmp_path: Path) -> None:
     reply = ask(memory, "data_time_range")
     assert reply["gaps"] == []
     assert [step["step_s"] for step in reply["clock_steps"]] == pytest.approx([8.0], abs=0.1)
-    assert "gaps" not in ask(memory, "memory_status")["trust"]
+    assert "gaps" not in ask(memory, "memory_status")["doubts"]
     way = ask(memory, "trajectory_summary", start=BEGIN, end=BEGIN + 30)
     assert not [note for note in way["notes"] if "nothing was recorded" in note]
 

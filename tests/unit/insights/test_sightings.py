@@ -215,7 +215,7 @@ def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recall
     found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})
     assert (len(found.sightings), note in found.notes) == (1, True)
     during = WhileCondition("/odom", "near_position", place)
-    assert note in find_matches(*asked[:2], "/seen", "contains", "x", during=during).notes
+    assert note in find_matches(*asked[:2], "/seen", "contains", "x", during=(during,)).notes
     # By the specification its reply is null where nothing is in doubt.
     assert queries.find_last_match(*asked).notes == ()
     (tmp_path / "broken.mcap").write_bytes(b"no bag")
@@ -239,7 +239,7 @@ def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: 
     for ask in (
         lambda: find_matches(*asked, there),
         lambda: queries.find_last_match(*asked, there),
-        lambda: find_matches(memory, Call(), "/odom", "contains", "x", during=during),
+        lambda: find_matches(memory, Call(), "/odom", "contains", "x", during=(during,)),
     ):
         with pytest.raises(InvalidArgumentsError, match=r'is "map".* is odom on /odom.*visits'):
             ask()

@@ -73,8 +73,8 @@ def test_messages_deleted_by_request_are_no_silence(memory: Memory, tmp_path: Pa
     append_losses(tmp_path, [Loss(SEEN, start, stop, 90, "forgotten")])
     status = asked(memory, tmp_path, "memory_status")
     assert status["silences"] == []
-    assert "deleted by request" in status["trust"]
-    assert f"{SEEN} was silent" not in status["trust"]
+    assert "deleted by request" in status["doubts"]
+    assert f"{SEEN} was silent" not in status["doubts"]
     [note] = asked(memory, tmp_path, "find_last_match", **NEVER)["notes"]
     assert "deleted by request" in note
 

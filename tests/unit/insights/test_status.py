@@ -71,7 +71,7 @@ def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
     beating(tmp_path, RecorderState.RECORDING, 59)
     told = shown(memory, tmp_path)
-    assert told["trust"] == "nothing is known to be missing"
+    assert told["doubts"] == "no loss or fault was found"
     assert (told["recorder"], told["recorder_alive"]) == ("recording", True)
     assert told["newest_age_s"] == 11.0
     assert told["never_heard"] == ["/b"]
@@ -88,7 +88,7 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     beating(tmp_path, RecorderState.RECORDING, 59)
     told = shown(memory, tmp_path)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
-    assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["trust"]
+    assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
 
 
 def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> Non
         clock.at = BEGIN + (second + 1) * S
         status = shown(memory, tmp_path)
         # A file without an end that nobody was seen to write to may be left of a crash.
-        expected = "another program" if second == 62 else None
+        expected = "another recorder" if second == 62 else None
         assert status["recorder"] == expected
         assert not status["recorder_alive"]
     beating(tmp_path, RecorderState.RECORDING, 59.0)
@@ -127,7 +127,7 @@ def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole
     )
     told = shown(memory, tmp_path)
     assert told["lost_last_hour"] == {"/odom": 7}
-    assert told["trust"] == (
+    assert told["doubts"] == (
         "3 messages lost before they were recorded: /odom (3); 4 messages missing by the cadence "
         "of header stamps (never published, or lost): /odom (4)"
     )
@@ -140,9 +140,9 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
     memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 36 * S))
     beating(tmp_path, RecorderState.RECORDING, 35)
-    assert shown(memory, tmp_path)["trust"] == "nothing is known to be missing"
+    assert shown(memory, tmp_path)["doubts"] == "no loss or fault was found"
     append_losses(tmp_path, [Loss("*", BEGIN + 9 * S, BEGIN + 24 * S, 0, "hung")])
-    assert shown(memory, tmp_path)["trust"] == (
+    assert shown(memory, tmp_path)["doubts"] == (
         f"nothing was recorded from {BEGIN // S + 9}.500000 to {BEGIN // S + 18}.500000 (9 s), "
         "because ros2 bag record hung"
     )
@@ -184,7 +184,7 @@ def test_a_recorder_that_waits_says_for_what(tmp_path: Path) -> None:
     beating(tmp_path, RecorderState.WAITING, 59, waiting_for="no /clock")
     told = shown(memory, tmp_path)
     assert told["recorder"] == "waiting"
-    assert told["trust"] == "the recorder waits: no /clock"
+    assert told["doubts"] == "the recorder waits: no /clock"
 
 
 def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:
@@ -192,7 +192,7 @@ def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -
     beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
     told = shown(memory, tmp_path)
     assert told["notes"] == ["72 bags stay"]
-    assert told["trust"] == "nothing is known to be missing"
+    assert told["doubts"] == "no loss or fault was found"
     beating(tmp_path, RecorderState.RECORDING, 59, unshipped="2 bags were deleted unshipped")
     assert shown(memory, tmp_path)["notes"] == ["2 bags were deleted unshipped"]
     beating(tmp_path, RecorderState.STOPPED, -100, age_held="72 bags stay")
@@ -204,7 +204,7 @@ def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Pa
     beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
     SCREENED.write(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
     told = shown(memory, tmp_path)
-    assert told["trust"] == "1 split is not served"
+    assert told["doubts"] == "1 split is not served"
     [note] = told["notes"]
     assert note.startswith("excluded by privacy (recording.exclude_when)")
     assert note.endswith(": 0.000000 to 1.000000")
@@ -219,7 +219,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     beating(tmp_path, RecorderState.RECORDING, 1)
     reply = shown(memory, tmp_path)
     assert (reply["recorder"], reply["recorder_alive"]) == told
-    assert ("the recorder died" in reply["trust"]) == (now == "wall")
+    assert ("the recorder died" in reply["doubts"]) == (now == "wall")
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:
@@ -233,19 +233,19 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("state", "at", "trust"),
+    ("state", "at", "doubts"),
     [
         (RecorderState.RECORDING, -100, "the recorder died"),
         (RecorderState.PAUSED, 59, "the recorder is paused: it gives no reason"),
-        (RecorderState.STOPPED, 59, "nothing is known to be missing"),
+        (RecorderState.STOPPED, 59, "no loss or fault was found"),
     ],
 )
 def test_a_recorder_that_does_not_record_is_reported(
-    tmp_path: Path, state: RecorderState, at: float, trust: str
+    tmp_path: Path, state: RecorderState, at: float, doubts: str
 ) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
     beating(tmp_path, state, at)
-    assert shown(memory, tmp_path)["trust"] == trust
+    assert shown(memory, tmp_path)["doubts"] == doubts
 
 
 def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Path) -> None:
@@ -277,7 +277,7 @@ def test_damaged_files_are_counted_and_reported(tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
     told = shown(remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=9e6), tmp_path)
     assert told["damaged"] == 1
-    assert "1 damaged bag file" in told["trust"]
+    assert "1 damaged bag file" in told["doubts"]
 
 
 def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
@@ -338,7 +338,7 @@ def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path
     assert shown(replace(memory, limits=older), tmp_path)["budget"]["keeps_days"] == 1.0
 
 
-SOUND = "nothing is known to be missing"
+SOUND = "no loss or fault was found"
 
 
 @pytest.mark.parametrize(
@@ -365,10 +365,10 @@ def test_no_growth_is_predicted_of_bags_that_nobody_writes(
 
 
 class TestWhatIsMissingIsNamedAndCounted:
-    def trust(self, folder: Path, storage: str = "mcap") -> str:
-        trust = shown(memory_of(folder, storage=storage), folder)["trust"]
-        assert isinstance(trust, str)
-        return trust
+    def doubts(self, folder: Path, storage: str = "mcap") -> str:
+        doubts = shown(memory_of(folder, storage=storage), folder)["doubts"]
+        assert isinstance(doubts, str)
+        return doubts
 
     def recording(self, folder: Path, *listed: tuple[str, int]) -> None:
         """Two splits of five messages each, and a metadata.yaml that lists those given."""
@@ -384,12 +384,12 @@ class TestWhatIsMissingIsNamedAndCounted:
         )
 
     def test_an_empty_folder(self, tmp_path: Path) -> None:
-        assert self.trust(tmp_path).startswith("no bag is here")
+        assert self.doubts(tmp_path).startswith("no bag is here")
 
     def test_a_bag_that_a_crash_left_open(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)])
         path.write_bytes(path.read_bytes()[:-100])
-        assert self.trust(tmp_path).startswith("1 bag was left open by a crash")
+        assert self.doubts(tmp_path).startswith("1 bag was left open by a crash")
 
     def test_a_file_that_may_be_being_written_or_left_by_a_crash(self, tmp_path: Path) -> None:
         messages = [odom(BEGIN + t * S, 0.0, 0.0) for t in range(9)]
@@ -398,25 +398,25 @@ class TestWhatIsMissingIsNamedAndCounted:
         path.write_bytes(content)
         clock = SettableClock(path.stat().st_mtime_ns + S)
 
-        def trust(memory: Memory) -> str:
-            return str(shown(memory, tmp_path)["trust"])
+        def doubts(memory: Memory) -> str:
+            return str(shown(memory, tmp_path)["doubts"])
 
         memory, young = memory_of(tmp_path, clock=clock), "1 file has no end yet"
-        assert young in trust(memory)
+        assert young in doubts(memory)
         # Seen to grow, it is being written.
         path.write_bytes(content + b"x")
-        assert young not in trust(memory)
+        assert young not in doubts(memory)
         # So is one that a live recorder names.
-        assert young in trust(memory_of(tmp_path, clock=clock))
+        assert young in doubts(memory_of(tmp_path, clock=clock))
         named = {"updated": clock.now(), "recordings": ("rec",)}
         beating(tmp_path, RecorderState.RECORDING, 0, **named)
-        assert young not in trust(memory_of(tmp_path, clock=clock))
+        assert young not in doubts(memory_of(tmp_path, clock=clock))
 
     def test_files_that_are_not_read(self, tmp_path: Path) -> None:
         write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 0.0, 0.0)])
         for n in range(3):
             (tmp_path / f"old_{n}.db3").write_bytes(b"SQLite format 3\0")
-        assert self.trust(tmp_path) == "3 files are not read; data_time_range says why"
+        assert self.doubts(tmp_path) == "3 files are not read; data_time_range says why"
 
     def test_a_topic_that_cannot_be_decoded(self, tmp_path: Path) -> None:
         with (tmp_path / "bag.mcap").open("wb") as stream:
@@ -426,45 +426,45 @@ class TestWhatIsMissingIsNamedAndCounted:
             channel = writer.register_channel("/odd", "protobuf", schema)
             writer.add_message(channel, BEGIN, b"", BEGIN)
             writer.finish()
-        assert self.trust(tmp_path) == "1 topic cannot be decoded: /odd"
+        assert self.doubts(tmp_path) == "1 topic cannot be decoded: /odd"
 
     def test_splits_and_messages_that_metadata_lists(self, tmp_path: Path) -> None:
         there = [("rec_0.mcap", 5), ("rec_1.mcap", 5)]
         gone = [(f"rec_{n}.mcap", 20) for n in range(2, 14)]
         self.recording(tmp_path / "rec", *there, *gone)
-        assert self.trust(tmp_path) == (
+        assert self.doubts(tmp_path) == (
             "metadata.yaml of rec lists 12 missing files and 240 messages that no file "
             "here contains"
         )
 
     def test_messages_alone(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 255))
-        assert self.trust(tmp_path).endswith("lists 250 messages that no file here contains")
+        assert self.doubts(tmp_path).endswith("lists 250 messages that no file here contains")
 
     def test_a_recording_of_which_metadata_alone_is_left(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
         for each in (tmp_path / "rec").glob("*.mcap"):
             each.unlink()
-        trust = self.trust(tmp_path)
-        assert "lists 2 missing files and 10 messages" in trust
+        doubts = self.doubts(tmp_path)
+        assert "lists 2 missing files and 10 messages" in doubts
 
     def test_metadata_that_lists_what_is_there(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
-        assert self.trust(tmp_path) == SOUND
+        assert self.doubts(tmp_path) == SOUND
 
     def test_metadata_that_cannot_be_read_is_not_compared_and_reported(
         self, tmp_path: Path
     ) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5))
         (tmp_path / "rec" / "metadata.yaml").write_text("")
-        assert self.trust(tmp_path).startswith("metadata.yaml of rec cannot be read")
+        assert self.doubts(tmp_path).startswith("metadata.yaml of rec cannot be read")
 
     def test_the_oldest_splits_that_retention_deleted_are_not_missing(self, tmp_path: Path) -> None:
         listed = [(f"rec_{n}.mcap", 5) for n in range(-3, 3)]
         self.recording(tmp_path / "rec", *listed)
-        assert "lists 4 missing files" in self.trust(tmp_path)
+        assert "lists 4 missing files" in self.doubts(tmp_path)
         beating(tmp_path, RecorderState.STOPPED, 59)
-        assert "lists 1 missing file and 5 messages" in self.trust(tmp_path)
+        assert "lists 1 missing file and 5 messages" in self.doubts(tmp_path)
 
     def test_of_a_recording_that_is_not_its_own_retention_deletes_nothing(
         self, tmp_path: Path
@@ -475,10 +475,10 @@ class TestWhatIsMissingIsNamedAndCounted:
         own.parent.mkdir()
         inode = (tmp_path / "rec").stat().st_ino
         own.write_text('{"bag_dir_id": "5f0c"}\n')
-        assert "lists 4 missing files" in self.trust(tmp_path)
+        assert "lists 4 missing files" in self.doubts(tmp_path)
         with own.open("a") as stream:
             stream.write(json.dumps({"recording": "rec", "inode": inode}) + "\n")
-        assert "lists 1 missing file" in self.trust(tmp_path)
+        assert "lists 1 missing file" in self.doubts(tmp_path)
 
     def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "bags" / "rec", ("rec_0.mcap", 5), ("gone.mcap", 5))
@@ -492,11 +492,11 @@ class TestWhatIsMissingIsNamedAndCounted:
     def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 9), ("rec_1.mcap", 9))
         (tmp_path / "rec" / "handover.json").write_text("{}")
-        assert self.trust(tmp_path) == SOUND
+        assert self.doubts(tmp_path) == SOUND
 
     def test_a_recording_compressed_by_file(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap.zstd", 5), ("rec/rec_1.mcap", 5))
-        assert self.trust(tmp_path) == SOUND
+        assert self.doubts(tmp_path) == SOUND
 
     def test_it_is_no_longer_reported_when_the_file_is_back(self, tmp_path: Path) -> None:
         self.recording(tmp_path / "rec", ("rec_0.mcap", 5), ("rec_1.mcap", 5))
@@ -504,6 +504,6 @@ class TestWhatIsMissingIsNamedAndCounted:
         content = second.read_bytes()
         second.unlink()
         memory = memory_of(tmp_path)
-        assert "lists 1 missing file" in str(shown(memory, tmp_path)["trust"])
+        assert "lists 1 missing file" in str(shown(memory, tmp_path)["doubts"])
         second.write_bytes(content)
-        assert shown(memory, tmp_path)["trust"] == SOUND
+        assert shown(memory, tmp_path)["doubts"] == SOUND

@@ -67,12 +67,12 @@ def test_matches_count_while_another_topic_meets_a_condition(
     memory = with_store(memory, tmp_path) if recalls else memory
     undocked = WhileCondition("/is_docked", "equals", False)
     [found] = find_matches(
-        memory, Call(), "/chatter", "contains", "hello", during=undocked
+        memory, Call(), "/chatter", "contains", "hello", during=(undocked,)
     ).sightings
     assert ((found.first - BEGIN) / S, (found.last - BEGIN) / S) == (20.5, 39.5)
     docked = WhileCondition("/is_docked", "equals", True)
     later, earlier = find_matches(
-        memory, Call(), "/chatter", "contains", "hello", during=docked
+        memory, Call(), "/chatter", "contains", "hello", during=(docked,)
     ).sightings
     assert [(each.first - BEGIN) / S for each in (earlier, later)] == [0.5, 40.5]
 
@@ -81,7 +81,12 @@ def test_a_topic_that_was_never_recorded_bounds_nothing(tmp_path: Path) -> None:
     never = WhileCondition("/never", "equals", False)
     with pytest.raises(NoDataError, match="/never"):
         find_matches(
-            docking(tmp_path, changes=False), Call(), "/chatter", "contains", "hello", during=never
+            docking(tmp_path, changes=False),
+            Call(),
+            "/chatter",
+            "contains",
+            "hello",
+            during=(never,),
         )
 
 

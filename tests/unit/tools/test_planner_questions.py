@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 BY_WORDS = {question.words: question for question in QUESTIONS}
 MOST_CALLS_FOR_FORTY = 45
 MOST_CHARS_FOR_FORTY = 40_000
-MOST_CHARS_OF_TOOLS = 18_000
+MOST_CHARS_OF_TOOLS = 20_000
 OFF_BY = 4
 OF_NOTHING = {
     "Which moments were you told to keep?",
@@ -86,7 +86,7 @@ THAT_COUNT = {
         "extremes.percentage.min_at",
     },
     "How near was the nearest wall in the last 20 s?": {"extremes.ranges.min"},
-    "Can I trust what you remember just now?": {"trust", "newest_age_s", "damaged"},
+    "Can I trust what you remember just now?": {"doubts", "newest_age_s", "damaged"},
     "What did you last say you saw?": {"samples.0.timestamp", "samples.0.value.value"},
 }
 """Of some questions the values of the last reply that are the answer."""

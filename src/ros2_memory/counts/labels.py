@@ -1,0 +1,249 @@
+"""What was seen: for each label of detections how often, how long, when first and last.
+
+A thing is in view as in a recap: it may be missed for `FLICKER_NS`, and is gone after `SILENCE_NS`
+without a message of the topic.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import Counter, defaultdict
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.conditions import Contains, Equals
+from ros2_memory.analysis.intervals import IntervalPart, joined, united, visible_in
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.spans import united as united_spans
+from ros2_memory.core.text import named
+from ros2_memory.history.clock_steps import elapsed_in
+from ros2_memory.history.context import READING_S
+from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
+from ros2_memory.history.detections import DetectionRows, joined_detected
+from ros2_memory.history.no_data import matching_topics, seconds
+from ros2_memory.history.robots import note_robots_on
+from ros2_memory.history.scan import scan
+from ros2_memory.results import Bins
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Mapping, Sequence
+
+    from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval
+    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.history.detections import Detected
+    from ros2_memory.history.view import View
+    from ros2_memory.places.scope import Scope
+    from ros2_memory.results import BinColumn
+
+BY_LABEL: Final = "label"
+ANY_LABEL: Final = ""
+"""What `contains` takes for every label."""
+_MOST_LABELS: Final = 60
+_COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
+    ("count", "count"),
+    ("seconds", "duration"),
+    ("first", "time"),
+    ("last", "time"),
+    ("best_score", "number"),
+    ("most_at_once", "count"),
+)
+
+
+def count_labels(
+    view: View, topic: str, condition: Condition, value: JsonValue, scope: Scope
+) -> Bins:
+    """Returns a row for each label that meets a condition, those seen most often first.
+
+    Args:
+        view: what is searched.
+        topic: the detectors' topic, or a glob.
+        condition: on the labels; its least score holds for each detection.
+        value: of the condition; `ANY_LABEL` takes every label.
+        scope: when detections count.
+
+    Raises:
+        InvalidArgumentsError: the condition is not on texts, or names a field.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    test = condition.test
+    if not isinstance(test, Contains | Equals) or condition.field is not None:
+        raise InvalidArgumentsError(
+            "by label takes labels of detections: give condition_type contains or equals, the "
+            f'label as value ("{ANY_LABEL}" for all), and no field'
+        )
+    topics = matching_topics(view, topic)
+    seen = _Seen(view, scope, condition.least_score if condition.min_score > 0 else -np.inf)
+    seen.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
+    window = scope.window if seen.since is None else replace(scope.window, start=seen.since)
+    table, elapsed = united(seen.visible), elapsed_in(view, window)
+    rows = _rows(table, seen.most, elapsed)
+    note_robots_on(view, topics, window)
+    note_unread(view, window, nothing=not rows, search=True)
+    note_edges(view, window)
+    if unknown := elapsed.among(scope.unknown):
+        view.notes.add(
+            f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
+            "or without messages of the other topic"
+        )
+    if len(rows) > _MOST_LABELS:
+        view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
+    start, end = window.asked()
+    first, last = recorded_reach(view.snapshot, window) or (start, end)
+    return Bins(
+        by=BY_LABEL,
+        about=tuple(topics),
+        start=min(max(start, first), end),
+        end=max(min(end, last), start),
+        columns=_COLUMNS,
+        rows=tuple(rows[:_MOST_LABELS]),
+        all=_whole(seen, table, elapsed),
+        notes=view.notes.sentences(),
+    )
+
+
+class _Block(NamedTuple):
+    """Messages of a topic that no other ones of it lie between."""
+
+    topic: str
+    found: Detected
+
+    @property
+    def first(self) -> Ns:
+        return int(self.found.log_times[0])
+
+    @property
+    def last(self) -> Ns:
+        return int(self.found.log_times[-1])
+
+
+class _Seen:
+    """Reads what counts, the newest first.
+
+    Attributes:
+        visible: when labels were in view.
+        most: of each label, how many one message has at most; `most_of_all`: of all together.
+        since: back to when all was read, where the time was over before; else None.
+    """
+
+    def __init__(self, view: View, scope: Scope, least_score: float) -> None:
+        self.visible: list[IntervalTable] = []
+        self.most: Counter[str] = Counter()
+        self.most_of_all = 0
+        self.since: Ns | None = None
+        self._view = view
+        self._scope = scope
+        self._least_score = least_score
+
+    def read(self, topics: Sequence[str], wanted: Callable[[str], bool]) -> None:
+        """Reads the detections of topics whose labels are wanted."""
+        reading = self._view.call.partial_after(READING_S)
+        reached: Ns | None = None
+        parts: dict[str, list[IntervalPart]] = {}
+        try:
+            for window, some in self._scope.narrowed([(self._scope.window, topics)]):
+                parts = defaultdict(list)
+                sources = (_blocks(self._view, topic, window) for topic in some)
+                for block in heapq.merge(*sources, key=lambda block: -block.last):
+                    parts[block.topic].append(self._counted(block, wanted))
+                    reached = block.first if len(topics) == 1 else block.last
+                    _check(reading)
+                self._take(parts)
+        except QueryTimeoutError:
+            if reached is None:
+                raise
+            self._take(parts)
+            self.since = reached
+            self._view.notes.complete = False
+            self._view.notes.add(
+                f"not all before {unix_text(reached)} is counted: "
+                f"{self._view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
+            )
+
+    def _take(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
+        self.visible += [joined(some[::-1]).visible for some in parts.values()]
+
+    def _counted(self, block: _Block, wanted: Callable[[str], bool]) -> IntervalPart:
+        """Returns when labels that are wanted were in view, by messages that count."""
+        times, found = block.found.log_times, block.found.found
+        words = np.array([wanted(word) for word in found.labels.words], np.bool_)
+        counts = words[found.labels.codes] & ~(found.scores < self._least_score)
+        if self._scope.is_bounded:
+            # The newest first, as it reads what the other topic said.
+            holds = [self._scope.holds_at(time) for time in times[::-1].tolist()]
+            counts &= np.array(holds[::-1], np.bool_)[found.rows]
+        rows, codes = found.rows[counts], found.labels.codes[counts].astype(np.int64)
+        labels = found.labels.words
+        if rows.size:
+            pairs, times_each = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
+            for code, at_once in zip(pairs[1].tolist(), times_each.tolist(), strict=True):
+                self.most[labels[code]] = max(self.most[labels[code]], at_once)
+            self.most_of_all = max(self.most_of_all, int(np.bincount(rows).max()))
+        visible = visible_in(times, rows, codes, found.scores[counts], labels)
+        return IntervalPart(block.first, block.last, visible)
+
+
+def _check(reading: Deadline) -> None:
+    if reading.expired():
+        raise QueryTimeoutError("the rest is left out")
+
+
+def _blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Block]:
+    """Yields the messages of a topic in blocks that do not overlap, the newest first."""
+    reader = DetectionRows(view)
+    together: list[Detected] = []
+    left_out = 0
+    for rows in scan(view, topic, window, newest_first=True):
+        if together and rows.last < min(int(each.log_times[0]) for each in together):
+            yield _Block(topic, joined_detected(together))
+            together = []
+        found = reader.of(rows)
+        left_out += len(rows) - found.log_times.size
+        together += [found] if found.log_times.size else []
+    if together:
+        yield _Block(topic, joined_detected(together))
+    if left_out:
+        view.notes.complete = False
+        view.notes.add(f"messages of {topic} that could not be decoded: {left_out}")
+
+
+def _rows(
+    table: IntervalTable, most: Mapping[str, int], elapsed: Elapsed
+) -> list[tuple[str, tuple[float | None, ...]]]:
+    """Returns the values of each label, those seen most often first."""
+    intervals: defaultdict[str, list[VisibleInterval]] = defaultdict(list)
+    for each in table.intervals():
+        intervals[each.label].append(each)
+    found: list[tuple[str, tuple[float | None, ...]]] = [
+        (
+            named(label),
+            (
+                len(some),
+                elapsed.among((each.first, each.last) for each in some),
+                min(each.first for each in some),
+                max(each.last for each in some),
+                max((each.best for each in some if each.best is not None), default=None),
+                most[label],
+            ),
+        )
+        for label, some in intervals.items()
+    ]
+    return sorted(found, key=lambda row: (-(row[1][0] or 0), row[0]))
+
+
+def _whole(seen: _Seen, table: IntervalTable, elapsed: Elapsed) -> tuple[float | None, ...]:
+    """Returns the values of all labels together: for how long any of them was in view."""
+    every = table.intervals()
+    spans = united_spans((each.first, each.last) for each in every)
+    return (
+        len(every),
+        elapsed.among(spans),
+        min((first for first, _ in spans), default=None),
+        max((last for _, last in spans), default=None),
+        max((each.best for each in every if each.best is not None), default=None),
+        seen.most_of_all,
+    )

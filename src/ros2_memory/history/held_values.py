@@ -1,0 +1,273 @@
+"""What a topic said, and until when: a value holds until a message says another one.
+
+So do the texts that say what a robot does (`std_msgs/msg/String`): nothing of them is known to have
+ended only because a topic is silent. Where nothing was recorded, a value is known until then alone;
+of a topic that is usually heard often, also where it falls silent for `SILENCE_NS`.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_left
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.columns.table import Texts
+from ros2_memory.columns.words import words_of
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.context import READING_S
+from ros2_memory.history.scan import messages_of, scan
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
+
+TEXT: Final = "std_msgs/msg/String"
+
+
+class Held(NamedTuple):
+    """A value, and when it held.
+
+    Attributes:
+        word: the value as JSON text.
+        start: log time of the first message that says so.
+        stop: of the next one that says otherwise; where none is known to do so, until when it is
+            known to hold.
+        ended: whether a message says otherwise then.
+    """
+
+    word: str
+    start: Ns
+    stop: Ns
+    ended: bool
+
+    @property
+    def value(self) -> JsonValue:
+        """The value; of a message that has one part alone, that."""
+        value: JsonValue = json.loads(self.word)
+        return next(iter(value.values())) if isinstance(value, dict) and len(value) == 1 else value
+
+    @property
+    def is_blank(self) -> bool:
+        """Whether it is a text that says nothing: it only ends the one before."""
+        value = self.value
+        return isinstance(value, str) and not value.strip()
+
+
+class _Run(NamedTuple):
+    """Consecutive messages that say the same: log times of the first and the last."""
+
+    word: str
+    first: Ns
+    last: Ns
+
+
+class HeldValues:
+    """Reads the values that a topic held.
+
+    Args:
+        view: the call's.
+        topic: its name.
+        field: dot-path of the value in the messages; None for all that they have.
+        asked: the argument that asks for it, as errors name it.
+
+    Attributes:
+        reached: what began from then on was yielded by `back`.
+        known: what `during` found, newest first, also where time was over.
+
+    Raises:
+        InvalidArgumentsError: what the newest message has there is no single value.
+    """
+
+    def __init__(
+        self, view: View, topic: str, field: str | None = None, *, asked: str = ""
+    ) -> None:
+        self._view = view
+        self._topic = topic
+        self._field = field
+        self._holds_on = is_text(view, topic) or holds_on(view, [topic])
+        self._gaps = [gap[0] for gap in view.gaps(TimeWindow.everything())]
+        self._reading = view.call.partial_after(READING_S)
+        self.reached: Ns = MAX_NS
+        self.known: list[Held] = []
+        newest = view.stream.newest(topic, TimeWindow.everything())
+        message = None if newest is None else view.bags.decode(newest)
+        if newest is not None and message is not None:
+            found = Held(self._word(message, newest.record.channel.type), 0, 0, ended=True).value
+            if isinstance(found, list | dict | None):
+                of = "" if field is None else f"field {field} of "
+                raise InvalidArgumentsError(
+                    f"{asked}: {of}{topic} ({newest.record.channel.type}) is no text, number or "
+                    "boolean, which holds until the next one: ask about a topic that has one, such "
+                    "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
+                )
+
+    def back(self, until: Ns) -> Iterator[Held]:
+        """Yields the values that were said before a moment, newest first.
+
+        Raises:
+            QueryTimeoutError: while it is iterated, when the time for reading is over.
+        """
+        self.reached = until
+        later = self._runs(TimeWindow(until, MAX_NS), newest_first=False)
+        after = next(later, None)
+        for run in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
+            if after is not None and self._goes_on(run, after):
+                run = run._replace(last=after.last)  # noqa: PLW2901 - it goes on after `until`
+                after = next(later, None)
+            stop, ended = self._end_of(run, after)
+            self.reached = run.first
+            yield Held(run.word, run.first, stop, ended)
+            after = run
+
+    def during(self, start: Ns, stop: Ns) -> list[Held]:
+        """Returns the values that held at some time from `start` on and before `stop`, in order.
+
+        Raises:
+            QueryTimeoutError: the time for reading is over.
+        """
+        self.known = []
+        for held in self.back(stop):
+            if held.stop > start:
+                self.known.append(held)
+            if held.start <= start:
+                break
+        return self.known[::-1]
+
+    def named_after(self, moment: Ns) -> Held | None:
+        """Returns the first value said from a moment on that is no blank text; its end is not read.
+
+        Raises:
+            QueryTimeoutError: the time for reading is over.
+        """
+        for run in self._runs(TimeWindow(moment, MAX_NS), newest_first=False):
+            found = Held(run.word, run.first, run.last, ended=False)
+            if not found.is_blank:
+                return found
+        return None
+
+    def _runs(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
+        """Yields runs in order, or the newest first; those that go on in the next rows joined."""
+        waiting: _Run | None = None
+        for together in self._blocks(window, newest_first=newest_first):
+            runs = self._of_block(together)
+            for run in reversed(runs) if newest_first else runs:
+                older, newer = (run, waiting) if newest_first else (waiting, run)
+                if older is not None and newer is not None and self._goes_on(older, newer):
+                    waiting = _Run(run.word, older.first, newer.last)
+                    continue
+                if waiting is not None:
+                    yield waiting
+                waiting = run
+        if waiting is not None:
+            yield waiting
+
+    def _blocks(self, window: TimeWindow, *, newest_first: bool) -> Iterator[list[Rows]]:
+        """Yields rows that overlap in time together."""
+        together: list[Rows] = []
+        for rows in scan(
+            self._view, self._topic, window, newest_first=newest_first, reached=self._check
+        ):
+            is_apart = together and (
+                rows.last < min(each.first for each in together)
+                if newest_first
+                else rows.first > max(each.last for each in together)
+            )
+            if is_apart:
+                yield together
+                together = []
+            together.append(rows)
+        if together:
+            yield together
+
+    def _check(self, _: Ns) -> None:
+        if self._reading.expired():
+            raise QueryTimeoutError("the rest is left out")
+
+    def _of_block(self, together: Sequence[Rows]) -> list[_Run]:
+        parts = [self._said(rows) for rows in together]
+        times = np.concatenate([part[0] for part in parts])
+        known: dict[str, int] = {}
+        codes = np.concatenate(
+            [
+                np.array([known.setdefault(word, len(known)) for word in texts.words], np.int64)[
+                    texts.codes
+                ]
+                for _, texts in parts
+            ]
+        )
+        if not times.size:
+            return []
+        order = np.argsort(times, kind="stable")
+        times, codes = times[order], codes[order]
+        breaks = np.diff(codes) != 0
+        breaks |= np.diff(np.searchsorted(self._gaps, times)) > 0
+        if not self._holds_on:
+            breaks |= np.diff(times) > SILENCE_NS
+        firsts = np.append(0, np.flatnonzero(breaks) + 1)
+        lasts = np.append(firsts[1:], times.size) - 1
+        words = [*known]
+        return [
+            _Run(words[code], first, last)
+            for code, first, last in zip(
+                codes[firsts].tolist(), times[firsts].tolist(), times[lasts].tolist(), strict=True
+            )
+        ]
+
+    def _said(self, rows: Rows) -> tuple[IntArray, Texts]:
+        """Returns the log times of some rows, and what each says: by its columns, else as read."""
+        texts = words_of(rows.table, self._field, self._view.memory.extractor)
+        if texts is not None:
+            return rows.times, texts if rows.index is None else texts.rows(rows.index)
+        times: list[Ns] = []
+        words: list[str] = []
+        for found in messages_of(self._view, rows):
+            message = self._view.bags.decode(found)
+            if message is not None:
+                times.append(found.time)
+                words.append(self._word(message, found.record.channel.type))
+        return np.array(times, np.int64), Texts.of(words)
+
+    def _word(self, message: object, type_name: str) -> str:
+        extractor = self._view.memory.extractor
+        if self._field is None:
+            return json.dumps(extractor.exact(message, type_name))
+        return json.dumps(extractor.exact_at(message, type_name, self._field))
+
+    def _goes_on(self, older: _Run, newer: _Run) -> bool:
+        return older.word == newer.word and self._end_of(older, newer) == (newer.first, True)
+
+    def _end_of(self, run: _Run, after: _Run | None) -> tuple[Ns, bool]:
+        """Returns until when a run is known to hold, and whether the next run ends it then."""
+        following = MAX_NS if after is None else after.first
+        if not self._holds_on and following - run.last > SILENCE_NS:
+            return run.last, False
+        nth = bisect_left(self._gaps, run.last)
+        if nth < len(self._gaps) and self._gaps[nth] < following:
+            return self._gaps[nth], False
+        if after is None:
+            return max(run.last, self._view.snapshot.latest or run.last), False
+        return following, True
+
+
+def is_text(view: View, topic: str) -> bool:
+    """Returns whether all messages of a topic are plain texts."""
+    return set(view.snapshot.timeline.types_of(topic)) == {TEXT}
+
+
+def holds_on(view: View, topics: Iterable[str]) -> bool:
+    """Returns whether the newest messages of topics hold on: they are latched, or seldom."""
+    latching, timeline = view.memory.limits.latching, view.snapshot.timeline
+    return all(
+        latching.is_latched(view.snapshot, topic)
+        or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))
+        for topic in topics
+    )

@@ -1,0 +1,260 @@
+"""Episodes: what a robot did, as texts that hold until the next one; an empty text ends them.
+
+Any topic of plain texts counts (`std_msgs/msg/String`) among whose newest values is an empty one.
+An episode belongs to a window, or to a scope, by whether it held in it, or when it began.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from dataclasses import replace
+from itertools import islice
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import shortened
+from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.history.clock_steps import elapsed_in
+from ros2_memory.history.coverage import note_edges, note_unread, unix_text
+from ros2_memory.history.held_values import HeldValues, is_text
+from ros2_memory.history.no_data import no_data_between, resolve_topic
+from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
+from ros2_memory.history.robots import note_robots
+from ros2_memory.history.view import open_span
+from ros2_memory.places.pose_frames import robot_at
+from ros2_memory.results import Changes, Episode, Spell
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.held_values import Held
+    from ros2_memory.history.view import TimeRange, View
+    from ros2_memory.places.scope import Scope
+
+_LOOKED_AT: Final = 50
+"""Of the newest values of a topic so many are looked at for an empty text."""
+_LONGEST_TEXT: Final = 200
+MOST_COUNTED: Final = 20_000
+"""Episodes that are counted over time."""
+
+
+class Spoken(NamedTuple):
+    """The episodes that a search found, in the order that was asked for.
+
+    Attributes:
+        episodes: the newest or the oldest of them.
+        total: how many there are; None where the search ended before it had counted all.
+        since: what is before was not searched; None where all of the window was.
+    """
+
+    episodes: tuple[Episode, ...]
+    total: int | None
+    since: Ns | None
+
+
+def says_episodes(view: View, topics: Sequence[str]) -> bool:
+    """Returns whether these are one topic of texts that an empty one ends.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    if len(topics) != 1 or not is_text(view, topics[0]):
+        return False
+    newest = HeldValues(view, topics[0]).back(MAX_NS)
+    return any(held.is_blank for held in islice(newest, _LOOKED_AT))
+
+
+def find_episodes(
+    view: View, topic: str, condition: Condition, scope: Scope, *, limit: int, oldest_first: bool
+) -> Spoken:
+    """Returns the newest episodes whose text meets a condition, or the oldest with their total.
+
+    Raises:
+        InvalidArgumentsError: no text can meet the condition.
+        QueryTimeoutError: the call's time is over before one was found.
+    """
+    search = ReverseSearch(view, topic, condition)
+    values = HeldValues(view, topic)
+    kept: deque[Episode] = deque(maxlen=limit if oldest_first else limit + 1)
+    total, since = 0, None
+    try:
+        for episode in _met(values, condition, scope):
+            kept.append(episode)
+            total += 1
+            if total > limit and not oldest_first:
+                since = kept[-2].first
+                break
+    except QueryTimeoutError as error:
+        if values.reached >= scope.window.stop:
+            raise
+        if not kept:
+            raise out_of_time(view, values.reached) from error
+        since = values.reached
+        view.notes.complete = False
+        view.notes.add(
+            f"the search ran out of time at {unix_text(since)}: to continue, pass that time as end"
+        )
+    if not kept:
+        search.require_testable()
+    chosen = [*reversed(kept)] if oldest_first else [*kept][:limit]
+    return Spoken(tuple(chosen), total if since is None else None, since)
+
+
+def _met(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Episode]:
+    """Yields the episodes of a scope that meet a condition, newest first.
+
+    Each when the text before it is known, so one that yields nothing more has looked at all.
+    """
+    start, _ = scope.window.asked()
+    known: dict[str, bool] = {}
+    waiting: Episode | None = None
+    newer: Held | None = None
+    named = (held for held in values.back(scope.window.stop) if not held.is_blank)
+    while True:
+        try:
+            held = next(named, None)
+        except QueryTimeoutError:
+            if waiting is not None:
+                yield waiting
+            raise
+        if waiting is not None:
+            yield waiting if held is None else replace(waiting, previous=spell_of(held))
+            waiting = None
+        if held is None or held.stop <= start:
+            return
+        if held.word not in known:
+            known[held.word] = condition.matches(json.loads(held.word))
+        if known[held.word] and scope.holds_at(held.start):
+            following = newer or values.named_after(held.stop)
+            after = None if following is None else spell_of(following)
+            waiting = Episode(spell_of(held), None, after)
+        newer = held
+
+
+def episode_times(
+    view: View, topic: str, condition: Condition, scope: Scope
+) -> tuple[list[tuple[Ns, Ns]], Ns | None]:
+    """Returns when all episodes of a scope held, oldest first, as `read_sightings` does.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before one was found.
+    """
+    found = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
+    return [(each.first, each.until) for each in found.episodes], found.since
+
+
+def spell_of(held: Held) -> Spell:
+    """Returns a value that held as replies show it."""
+    return Spell(_cut(held.value), held.start, held.stop, held.ended)
+
+
+def _cut(value: JsonValue) -> JsonValue:
+    return shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
+
+
+def with_robot(view: View, topic: str, found: Episode, frame_id: str | None) -> Episode:
+    """Returns an episode with where the robot was when it began."""
+    at = TimeWindow(found.first, found.first + 1)
+    bags = view.stream.overlapping_bags([topic], at)
+    if not bags:
+        return found
+    recording = min(each.bag.recording for each in bags)
+    return replace(found, robot=robot_at(view, found.first, recording, frame_id))
+
+
+class SaidMeanwhile:
+    """What another topic said during intervals.
+
+    Raises:
+        InvalidArgumentsError: its messages have more than one value.
+        NoDataError: there is no such topic.
+    """
+
+    def __init__(self, view: View, topic: str) -> None:
+        self._view = view
+        self._topic = resolve_topic(view, topic)
+        self._values = HeldValues(view, self._topic, asked="with")
+        self._is_over = False
+
+    def during(self, first: Ns, until: Ns) -> tuple[Spell, ...] | None:
+        """Returns the values that held at some time of an interval; None where time is over."""
+        if not self._is_over:
+            try:
+                held = self._values.during(first, max(until, first + 1))
+                return tuple(spell_of(each) for each in held if not each.is_blank)
+            except QueryTimeoutError:
+                self._is_over = True
+                self._view.notes.complete = False
+                self._view.notes.add(
+                    f"out of time before what {self._topic} said was read for all of them: ask for "
+                    "fewer, or in a shorter window"
+                )
+        return None
+
+
+def topic_changes(
+    memory: Memory,
+    call: Call,
+    topic: str,
+    span: TimeRange,
+    *,
+    max_samples: int = 100,
+    fields: Sequence[str] = (),
+) -> Changes:
+    """Returns the values that a topic held in a window, in order; texts that are empty end others.
+
+    Raises:
+        InvalidArgumentsError: more than one field is named, or there is no single value.
+        NoDataError: there is no such topic, or it said nothing in the window.
+        QueryTimeoutError: the call's time is over before any was found.
+    """
+    if len(fields) > 1:
+        raise InvalidArgumentsError("changes are of one field: name one in fields")
+    view, window = open_span(memory, call, span)
+    topic = resolve_topic(view, topic)
+    values = HeldValues(view, topic, *fields, asked="changes")
+    start, _ = window.asked()
+    found: list[Spell] = []
+    elapsed, is_silent = elapsed_in(view, window), True
+    try:
+        for held in values.back(window.stop):
+            if held.stop <= start:
+                break
+            is_silent = False
+            if not held.is_blank:
+                skipped = elapsed.skipped_between(held.start, held.stop)
+                found.append(replace(spell_of(held), skipped=skipped))
+            if held.start <= start:
+                break
+    except QueryTimeoutError:
+        if not found:
+            raise
+        view.notes.complete = False
+        view.notes.add(
+            f"out of time: only what is after {unix_text(values.reached)} is listed; to see the "
+            "rest, ask again with that as end"
+        )
+    if is_silent:
+        raise no_data_between(view, (topic,), window)
+    found.reverse()
+    if len(found) > max_samples:
+        view.notes.add(
+            f"the first {max_samples} of {len(found)} changes: to continue, ask again with "
+            f"start={unix_text(found[max_samples].first)}"
+        )
+    note_unread(view, window, gaps=len(found) > max_samples)
+    note_edges(view, window)
+    note_robots(view, topic, window)
+    types = view.snapshot.timeline.types_of(topic)
+    return Changes(
+        topic,
+        ", ".join(sorted(types)),
+        len(found),
+        tuple(found[:max_samples]),
+        notes=view.notes.sentences(),
+    )

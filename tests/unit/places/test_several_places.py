@@ -1,0 +1,270 @@
+"""`where` with several places: any of them counts, and by place each has a row.
+
+What is expected is counted from the drawn world itself, second by second.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.core.regions import Place, Rectangle
+from tests.support.examples import examples
+from tests.support.memories import asked
+from tests.support.rooms import BEGIN, ROOMS, SEEN, asked_of, bounds, draw, runs_of, write
+
+if TYPE_CHECKING:
+    from ros2_memory.history.context import Memory
+    from tests.support.rooms import World
+
+SECONDS = 400
+HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+SPAN = {"start": BEGIN, "end": BEGIN + SECONDS}
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    return draw(3, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def folder(world: World, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bags = tmp_path_factory.mktemp("rooms")
+    write(world, bags)
+    return bags
+
+
+@pytest.fixture(scope="module")
+def memory(folder: Path) -> Memory:
+    return asked_of(folder, stored=True)
+
+
+def table(reply: Any) -> dict[str, dict[str, Any]]:
+    names = reply["columns"][1:]
+    return {row[0]: dict(zip(names, row[1:], strict=True)) for row in reply["rows"]} | {
+        "all": dict(zip(names, reply["all"], strict=True))
+    }
+
+
+def test_the_world_visits_every_room(world: World) -> None:
+    assert {world.room(nth) for nth in range(SECONDS)} == {*ROOMS, None}
+
+
+@settings(max_examples=examples(8), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 10_000),
+    stored=st.booleans(),
+    rooms=st.lists(st.sampled_from([*ROOMS]), min_size=2, max_size=3, unique=True),
+)
+def test_what_happened_in_any_of_several_places_is_what_happened_in_one_of_them(
+    seed: int, stored: bool, rooms: list[str]
+) -> None:
+    world = draw(seed, 150)
+    with TemporaryDirectory() as name:
+        bags = Path(name)
+        write(world, bags)
+        memory = asked_of(bags, stored=stored)
+        where = ", ".join(rooms)
+        runs = world.runs_in(*rooms)
+        seen = asked(memory, bags, "find_matches", where=where, limit=100, **HELLO)
+        assert [
+            (row["first_seen"] - BEGIN, row["last_seen"] - BEGIN, row["count"])
+            for row in reversed(seen["sightings"])
+        ] == [(run.first, run.last, run.messages) for run in runs]
+        visits = asked(memory, bags, "visits", where=where, limit=100)
+        assert [row["arrived"] - BEGIN for row in reversed(visits["visits"])] == [
+            run.first for run in runs
+        ]
+        driven = asked(
+            memory, bags, "trajectory_summary", where=where, start=BEGIN, end=BEGIN + 150
+        )
+        assert driven["visits"] == len(runs)
+        assert driven["distance_m"] == pytest.approx(world.metres_in(*rooms), abs=0.3)
+        by_place = table(asked(memory, bags, "visits", where=where, by="place"))
+        assert [*by_place] == [*rooms, "(elsewhere)", "(unknown)", "all"]
+        for room in rooms:
+            own = world.runs_in(room)
+            assert by_place[room]["entries"] == sum(run.first > 0 for run in own)
+            # A wall is crossed half a second before the first message in the room, and after.
+            ends = sum((run.first > 0) + (run.last < 149) for run in own)
+            seconds = sum(run.last - run.first for run in own) + ends / 2
+            assert by_place[room]["minutes"] == pytest.approx(seconds / 60, abs=0.02)
+
+
+@pytest.mark.parametrize("tool", ["find_matches", "trajectory_summary", "visits"])
+def test_one_table_has_a_row_for_each_place_and_what_was_elsewhere(
+    memory: Memory, folder: Path, world: World, tool: str
+) -> None:
+    given: dict[str, Any] = {**(HELLO if tool == "find_matches" else {}), **SPAN}
+    rows = table(asked(memory, folder, tool, by="place", where=bounds("hall", "kitchen"), **given))
+    assert [*rows] == ["hall", "kitchen", "(elsewhere)", "(unknown)", "all"]
+    named = table(asked(memory, folder, tool, by="place", where=["hall", "kitchen"], **given))
+    assert rows == named
+    if tool == "trajectory_summary":
+        for room in ("hall", "kitchen"):
+            assert rows[room]["metres"] == pytest.approx(world.metres_in(room), abs=0.3)
+        inside = rows["hall"]["metres"] + rows["kitchen"]["metres"]
+        assert inside + rows["(elsewhere)"]["metres"] == pytest.approx(rows["all"]["metres"])
+    elif tool == "find_matches":
+        for room in ("hall", "kitchen"):
+            expected = sum(run.messages for run in world.runs_in(room))
+            assert rows[room]["seconds"] == pytest.approx(expected, abs=len(world.runs_in(room)))
+        assert rows["(elsewhere)"]["seconds"] > 0
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        ["hall", "den"],
+        "hall, den",
+        "Den,  HALL",
+        '["hall", "den"]',
+        {"hall": "hall", "mine": "den"},
+        bounds("hall", "den"),
+        {**bounds("den"), "hall": "hall"},
+    ],
+    ids=str,
+)
+def test_places_are_named_or_given_by_their_bounds(
+    memory: Memory, folder: Path, world: World, where: Any
+) -> None:
+    reply = asked(memory, folder, "visits", where=where, limit=100)
+    assert reply["total"] == len(world.runs_in("hall", "den"))
+    assert sorted(reply["where"].split(", ")) == ["den", "hall"]
+
+
+def test_a_place_may_be_given_with_its_name_alone(
+    memory: Memory, folder: Path, world: World
+) -> None:
+    where = {"corner": {"x": 1.25, "y": 0.0, "radius_m": 0.6}}
+    reply = asked(memory, folder, "visits", where=where, limit=100)
+    inside = [nth for nth in range(SECONDS) if abs(world.x[nth] - 1.25) <= 0.6]
+    assert (reply["where"], reply["total"]) == ("corner", len(runs_of(inside)))
+    assert all(row["closest_m"] == 0 for row in reply["visits"])
+
+
+def test_metres_in_places_by_hour_add_up_to_those_in_them(
+    memory: Memory, folder: Path, world: World
+) -> None:
+    hours = table(asked(memory, folder, "trajectory_summary", where="hall, den", by="hour", **SPAN))
+    whole = asked(memory, folder, "trajectory_summary", where="hall, den", **SPAN)
+    assert hours["all"]["metres"] == pytest.approx(whole["distance_m"], abs=0.01)
+    assert hours.pop("all")["metres"] == pytest.approx(
+        sum(row["metres"] for row in hours.values()), abs=0.02
+    )
+    assert whole["distance_m"] == pytest.approx(world.metres_in("hall", "den"), abs=0.3)
+
+
+def test_things_in_any_of_several_places_say_in_which(memory: Memory, folder: Path) -> None:
+    where = {"stove": {"x": [1, 2], "y": [0, 1]}, "corner": {"x": 4.5, "y": 0.5, "radius_m": 0.4}}
+    found = asked(memory, folder, "find_things", where=where)
+    assert {row["label"]: (row["in"], row["also_in"]) for row in found["things"]} == {
+        "cup": ("stove", ["kitchen"]),
+        "cat": ("corner", ["hall"]),
+    }
+    assert found["labels"] == {"cat": 2, "cup": 2} or found["total"] >= 2
+
+
+def test_compare_has_the_minutes_in_each_and_recap_what_happened_in_any(
+    memory: Memory, folder: Path, world: World
+) -> None:
+    half = SECONDS // 2
+    ends = {"start": BEGIN, "end": BEGIN + half}
+    later = {"with_start": BEGIN + half, "with_end": BEGIN + SECONDS - 1}
+    minutes = asked(memory, folder, "compare", where=bounds("kitchen", "hall"), **ends, **later)
+    for room in ("kitchen", "hall"):
+        spent = [
+            sum(world.room(nth) == room for nth in part) / 60
+            for part in (range(half), range(half, SECONDS))
+        ]
+        if abs(spent[0] - spent[1]) > 0.1 * max(spent) + 0.3:
+            assert minutes["minutes"][room]["this"] == pytest.approx(spent[0], abs=0.15)
+            assert minutes["minutes"][room]["with"] == pytest.approx(spent[1], abs=0.15)
+    assert minutes["minutes"].keys() <= {"kitchen", "hall"}
+    told = asked(memory, folder, "recap", where="kitchen, den", **SPAN)
+    assert told["visits"] == len(world.runs_in("kitchen", "den"))
+    assert told["where"] == "kitchen, den"
+
+
+@pytest.mark.parametrize(
+    ("where", "said"),
+    [
+        ("hall, attic", 'no place is named "attic"; there are: den, hall, kitchen'),
+        ([], "where was []; give the name of a place"),
+        (",", 'no place is named ","'),
+        (["hall", 5], "give the name of a place"),
+        ({"hall": 5, "den": "den"}, 'where: "hall" was 5; give'),
+        ({"hall": {"x": [5, 1], "y": [0, 1]}, "den": "den"}, 'where: "hall": x was [5, 1]'),
+        ({"hall": {"z": 1}}, 'where: "hall" has no "z"; give'),
+        ({"x": 1, "y": 2, "radius": 3}, 'where has no "radius"; give'),
+        ({f"p{nth}": {"x": nth, "y": 0, "radius_m": 1} for nth in range(31)}, "more than 30"),
+    ],
+)
+def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
+    memory: Memory, folder: Path, where: Any, said: str
+) -> None:
+    reply = asked(memory, folder, "visits", where=where)
+    assert reply["error"] == "invalid_arguments"
+    assert said in reply["detail"]
+
+
+def test_places_of_two_frames_are_refused(memory: Memory, folder: Path) -> None:
+    attic = Place("attic", "map", Rectangle(0, 1, 0, 1))
+    limits = replace(memory.limits, places=(*memory.limits.places, attic))
+    reply = asked(replace(memory, limits=limits), folder, "visits", where="hall, attic")
+    assert "hall is in odom, attic is in map: ask about places of one frame" in reply["detail"]
+
+
+@pytest.mark.parametrize("by", [None, "label", "hour"])
+def test_of_several_conditions_on_other_topics_all_must_hold(
+    memory: Memory, folder: Path, world: World, by: str | None
+) -> None:
+    """In the hall, as two conditions on x say it together, and where a third one adds nothing."""
+    low, high = ROOMS["hall"]
+    x = {"topic": "/odom", "field": "position.x"}
+    both = [
+        {**x, "condition_type": "above", "value": low},
+        {**x, "condition_type": "below", "value": high},
+        {"topic": "/chatter", "condition_type": "equals", "value": "hello"},
+    ]
+    given = {**HELLO, "topic": "/chatter" if by != "label" else SEEN, "limit": 100}
+    given |= {"value": "" if by == "label" else "hello"} | ({} if by is None else {"by": by})
+    found = asked(memory, folder, "find_matches", **given, **{"while": both})
+    assert found == asked(memory, folder, "find_matches", **given, **{"while": json.dumps(both)})
+    runs = world.runs_in("hall")
+    if by is None:
+        assert [
+            (row["first_seen"] - BEGIN, row["last_seen"] - BEGIN)
+            for row in reversed(found["sightings"])
+        ] == [(run.first, run.last) for run in runs]
+    elif by == "hour":
+        whole = table(found)["all"]
+        assert whole["count"] == len(runs)
+    else:
+        within = asked(memory, folder, "find_matches", **given, where="hall")
+        assert found["rows"] == within["rows"]
+
+
+@pytest.mark.parametrize(
+    ("conditions", "said"),
+    [
+        ([], "which is an empty list: leave it out"),
+        ([5], "which is not an object"),
+        ([{"topic": "/odom"}], "needs a valid condition_type and value"),
+        ([{"topic": "/odom", "wheree": 1}], 'has no "wheree"; it has topic, condition_type'),
+        ([{**HELLO}] * 9, "has 9 conditions, more than 8"),
+        ([{**HELLO}, {**HELLO, "topic": "/never"}], "/never"),
+    ],
+)
+def test_conditions_that_are_none_are_named(
+    memory: Memory, folder: Path, conditions: Any, said: str
+) -> None:
+    reply = asked(memory, folder, "find_matches", **HELLO, **{"while": conditions})
+    assert said in reply["detail"]
