@@ -119,6 +119,7 @@ def _source_of(
         limits if _has_places(settings, own) else replace(limits, places=(), places_file=""),
         extractor=shared.extractor,
         decoder=shared.reader,
+        large=shared.large,
         store=build_columns_of_lake(own, name, shared.reader),
         settings=reading_of(own, shared.schemas),
         refresh_s=LAKE_REFRESH_S,

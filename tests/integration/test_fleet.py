@@ -138,8 +138,8 @@ def test_what_there_is_and_what_happened_is_told_of_each(server: EpisodicServer)
     status = {row["robot_name"]: row for row in reply(server, "memory_status")["robots"]}
     assert status.keys() == {*NAMES}
     assert status["damaged"]["damaged"] == 1
-    assert "does not exist" in status["offline"]["trust"]
-    assert status["r1"]["trust"] == "nothing is known to be missing"
+    assert "does not exist" in status["offline"]["doubts"]
+    assert status["r1"]["doubts"] == "no loss or fault was found"
 
 
 async def test_a_token_decides_about_whom_is_answered(robots: Robots, tmp_path: Path) -> None:

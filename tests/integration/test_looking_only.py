@@ -151,7 +151,7 @@ def moved_to(served: Served) -> list[str]:
 
 def times_stored(served: Served) -> int:
     """How often a bag was stored, by the server or its helper."""
-    return sum(each["event"] == "bag_stored" for each in served.events())
+    return sum(each["bags"] for each in served.events() if each["event"] == "bags_stored")
 
 
 def numbered(file: Path) -> dict[str, int]:

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import threading
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
 
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NotInLakeError
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    LakeError,
+    NoDataError,
+    NotInLakeError,
+    QueryTimeoutError,
+    RefusedError,
+)
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS, Clock
 
@@ -132,12 +138,7 @@ class Robot:
         if source is None:
             return ask(self.memory()), None
         if not lake and self._has_bags():
-            try:
-                return ask(self.memory()), None
-            except NoDataError:
-                with suppress(NoDataError, NotInLakeError):
-                    return _of_lake(source, ask, begin_of)
-                raise
+            return self._own_first(source, ask, begin_of)
         try:
             found = _of_lake(source, ask, begin_of)
             if source.latest is not None or not self.is_mounted:
@@ -149,6 +150,21 @@ class Robot:
             if not self._has_bags():
                 raise
         return ask(self.memory()), None
+
+    def _own_first(
+        self, source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
+    ) -> tuple[T, FromLake | None]:
+        """Returns what the mounted memory has; where it has no data, what the lake has."""
+        try:
+            return ask(self.memory()), None
+        except NoDataError as error:
+            try:
+                return _of_lake(source, ask, begin_of)
+            except NoDataError:
+                raise error from None
+            except (RefusedError, LakeError, QueryTimeoutError) as failure:
+                notes = (*error.notes, f"the lake has no answer either: {failure}")
+                raise NoDataError(error.reason, error.detail, notes) from failure
 
     def _has_bags(self) -> bool:
         """Returns whether there are bags besides those of the lake, or may be."""

@@ -228,6 +228,7 @@ class _FleetQuestions:
         answer = _single(_answer(question, memory, call))
         if isinstance(answer, Sightings) and not is_ahead:
             page.add(each.last for each in answer.sightings)
+            page.add(each.until for each in answer.episodes)
         value = as_json(answer, memory.index.bag_dir)
         return RobotReply(robot.name, value, latest, is_ahead), answer
 

@@ -119,7 +119,10 @@ def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written
 
 
 def drop_with_files(state_dir: Path, catalog: IcebergCatalog, identifier: str) -> None:
-    """Drops a table, with the files of it that were recorded; killed anywhere, it is done again.
+    """Drops a table, with the files of it that were recorded.
+
+    Killed before the drop, it is done again; right after it, one file of metadata may stay, which
+    has no rows.
 
     Raises:
         OSError: a file cannot be deleted.
@@ -131,9 +134,9 @@ def drop_with_files(state_dir: Path, catalog: IcebergCatalog, identifier: str) -
     # Last, since the table is opened by it.
     for file in sorted(own - {table.metadata_location}):
         _delete(table, file)
+    _keep(state_dir, {file: at for file, at in recorded.items() if file not in own})
     catalog.drop_table(identifier)
     _delete(table, table.metadata_location)
-    _keep(state_dir, {file: at for file, at in recorded.items() if file not in own})
 
 
 def _delete(table: IcebergTable, file: str) -> None:

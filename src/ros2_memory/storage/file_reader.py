@@ -105,7 +105,7 @@ class FileReader(BagReader):
                     yield from bags.batches(here, topics, window, bare)
                 else:
                     if here.stat().st_size > LARGE_BYTES:
-                        self._large.take()
+                        self._large.acquire()
                     records = bags.records(here, topics, window, newest_first=False)
                     yield from batched(enumerate(records))
 
@@ -138,7 +138,7 @@ class FileReader(BagReader):
     def decode(self, record: Record) -> object:
         """Decodes the message of a record."""
         if len(record.payload) > MUCH_DECODED_BYTES:
-            self._large.take()
+            self._large.acquire()
         return self._decoding.decode(record)
 
     def definition(self, channel: Channel) -> Definition | None:

@@ -253,8 +253,10 @@ class SqliteBags:
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
         if len(found[0]) > LARGE_BYTES:
-            self._large.take()
-        payload = uncompressed_payload(channel, found[0], self._max_message_bytes, self._large.take)
+            self._large.acquire()
+        payload = uncompressed_payload(
+            channel, found[0], self._max_message_bytes, self._large.acquire
+        )
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:

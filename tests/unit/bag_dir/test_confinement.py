@@ -96,8 +96,8 @@ def asking(bag_dir: Path) -> Iterator[EpisodicServer]:
     settings = settings_for(bag_dir)
     memory = build_memory(settings)
     filler = build_backfill(settings, memory)
-    for bag in filler.waiting():
-        filler.store(bag)
+    for batch in filler.batches():
+        filler.store(batch)
     server = build_server(settings, memory)
     try:
         yield server

@@ -182,13 +182,13 @@ def test_counts_become_one_table_whose_first_column_is_the_robot() -> None:
 @pytest.mark.parametrize("tool", ["compare", "recap", "memory_status", "data_time_range"])
 def test_where_a_reply_is_about_a_robot_it_becomes_a_row_the_newest_first(tool: str) -> None:
     replies = [
-        RobotReply(name, {"latest": at, "trust": "x", "notes": ["n"]}, latest=at)
+        RobotReply(name, {"latest": at, "doubts": "x", "notes": ["n"]}, latest=at)
         for name, at in (("r1", 3), ("r2", 8), ("r3", 5))
     ]
     found = reply_of(tool, replies)
     assert found == {
         "robots": [
-            {"robot_name": name, "latest": at, "trust": "x", "notes": ["n"]}
+            {"robot_name": name, "latest": at, "doubts": "x", "notes": ["n"]}
             for name, at in (("r2", 8), ("r3", 5), ("r1", 3))
         ]
     }
@@ -196,10 +196,10 @@ def test_where_a_reply_is_about_a_robot_it_becomes_a_row_the_newest_first(tool: 
 
 def test_rows_that_are_too_long_together_are_given_shortly() -> None:
     replies = [
-        RobotReply(f"r{number}", {"trust": "all", "silences": ["x" * 100]}) for number in range(9)
+        RobotReply(f"r{number}", {"doubts": "all", "silences": ["x" * 100]}) for number in range(9)
     ]
     found = reply_of("memory_status", replies, max_chars=900)
-    assert found["robots"] == [{"robot_name": f"r{n}", "trust": "all"} for n in range(9)]
+    assert found["robots"] == [{"robot_name": f"r{n}", "doubts": "all"} for n in range(9)]
     assert "pass robot" in found["notes"][0]
 
 

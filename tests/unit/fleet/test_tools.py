@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import json
 import threading
+from collections import Counter
 from dataclasses import replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +21,7 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
 )
-from ros2_memory.core.regions import Circle, Place
+from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
@@ -306,6 +308,50 @@ class TestMaps:
         assert found["by_robot"]["r2"]["total"] == 0
         assert any(note.startswith("no answer of r3: ") for note in found["notes"])
 
+    def test_labels_of_all_are_one_table_with_the_robot(self, folder: Path) -> None:
+        given: dict[str, object] = {
+            "topic": "/vision/*",
+            "condition_type": "contains",
+            "value": "",
+            "by": "label",
+        }
+        found = reply(fleet_over(folder, NAMES), "find_matches", given)
+        assert found["columns"][:3] == ["robot_name", "label", "count"]
+        for name in NAMES:
+            rows = {row[1]: row[2:] for row in found["rows"] if row[0] == name}
+            assert rows.keys() == {label for _, label in seeded(name).seen}
+            # It publishes what it sees alone: a label lasts until another one is seen.
+            runs = Counter(label for label, _ in groupby(label for _, label in seeded(name).seen))
+            assert {label: row[0] for label, row in rows.items()} == runs
+            assert found["all"][name][0] == runs.total()
+
+    def test_several_named_places_are_those_of_each_robot_with_a_row_for_each(
+        self, folder: Path
+    ) -> None:
+        def robot(name: str) -> Robot:
+            places = (
+                Place("kitchen", "map", Rectangle(-9.0, 1.0, -9.0, 99.0)),
+                Place("hall", "map", Rectangle(1.0, 9.0, -9.0, 99.0)),
+            )
+            limits = QuerySettings(places=places)
+            return Robot(name, folder / name, lambda: fleet_memory(folder / name, limits))
+
+        fleet = Fleet(map(robot, NAMES), FixedClock(NOW))
+        given: dict[str, object] = {"where": "hall, kitchen", "by": "place"}
+        found = reply(fleet, "visits", given)
+        rows = {(row[0], row[1]) for row in found["rows"]}
+        kinds = ("hall", "kitchen", "(elsewhere)", "(unknown)")
+        assert rows == {(name, kind) for name in NAMES for kind in kinds}
+        names = found["columns"]
+        for robot_name in NAMES:
+            alone = reply(fleet, "visits", {**given, "robot": robot_name})
+            own = [row for row in found["rows"] if row[0] == robot_name]
+            minutes = {row[1]: row[names.index("minutes")] for row in own}
+            at = alone["columns"].index("minutes")
+            assert minutes == {row[0]: row[at] for row in alone["rows"]}
+            # It swings about x = 1 from one place to the other, once in 63 s.
+            assert minutes["hall"] + minutes["kitchen"] == pytest.approx(59 / 60, abs=0.02)
+
 
 class TestTrouble:
     def test_a_missing_directory_is_named_and_never_claimed_about(
@@ -322,7 +368,7 @@ class TestTrouble:
         ]
         assert str(tmp_path) not in json.dumps(found)
         status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
-        assert "check fleet.robots" in status["trust"]
+        assert "check fleet.robots" in status["doubts"]
 
     def test_one_that_hangs_blocks_one_thread_however_often_it_is_asked(self, folder: Path) -> None:
         released = threading.Event()

@@ -10,6 +10,7 @@ import pyarrow as pa
 import pytest
 
 from ros2_memory.core.bag_summary import BagSummary
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.timeline import SEGMENT_BAGS
@@ -143,6 +144,7 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
         refresh_s=0,
         days=1,
         most_bags=1,
+        large=LargeReads(),
     )
     shipping.ship([START_S - DAY_S])
     assert starts(robot) == [START_S - DAY_S]
@@ -169,6 +171,7 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
         refresh_s=0,
         days=1,
         most_bags=1,
+        large=LargeReads(),
     )
     index = robot.memory.index
     assert starts(robot) == [START_S]
@@ -214,6 +217,7 @@ def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
         refresh_s=0,
         days=2,
         most_bags=1,
+        large=LargeReads(),
     )
     assert starts(robot) == [last, START_S]
     older = robot.memory.index.snapshot(before * NS_PER_S)

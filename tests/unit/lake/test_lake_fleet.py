@@ -79,6 +79,21 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
     assert ("lake" in json.dumps(nothing)) is not left
 
 
+def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
+    bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    bags[0].unlink()
+    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+    assert fleet is not None
+    for file in (tmp_path / "lake").rglob("*.parquet"):
+        file.unlink()
+    asked = {"robot": "hall", "topic": "/chatter"}
+    assert "notes" not in reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 11})
+    old = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 1})
+    assert old["error"] == "no_data"
+    assert any("the lake has no answer either: " in note for note in old["notes"])
+
+
 def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path: Path) -> None:
     write_bag(tmp_path / "hall", 0)
     draw = Random(0)

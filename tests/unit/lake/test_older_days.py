@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory, QuerySettings
@@ -57,6 +58,7 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> L
         refresh_s=0,
         days=1,
         most_bags=1,
+        large=LargeReads(),
     )
 
 

@@ -64,10 +64,10 @@ def ask(bag_dir: Path, tool: str, **given: object) -> Any:
 def test_splits_that_retention_deleted_around_a_moment_are_not_missing(bag_dir: Path) -> None:
     memory = memory_of(bag_dir, clock=SettableClock(NOW))
     assert absent_splits(memory.index.snapshot(), bag_dir) == []
-    assert ask(bag_dir, "memory_status")["trust"] == "nothing is known to be missing"
+    assert ask(bag_dir, "memory_status")["doubts"] == "no loss or fault was found"
     # A file that somebody else deleted is.
     (bag_dir / B / f"{B}_3.mcap").unlink()
-    assert "lists 1 missing file and 10 messages" in ask(bag_dir, "memory_status")["trust"]
+    assert "lists 1 missing file and 10 messages" in ask(bag_dir, "memory_status")["doubts"]
 
 
 def test_a_gap_that_retention_made_is_named_so_by_every_tool(bag_dir: Path) -> None:
@@ -102,8 +102,8 @@ def test_a_search_across_what_was_deleted_says_so(bag_dir: Path) -> None:
 def test_what_was_recorded_and_deleted_did_not_end_with_the_recorder(bag_dir: Path) -> None:
     died = Loss(EVERY_TOPIC, T0 + 59 * S, T0 + 99 * S, 0, "unclean")
     append_losses(bag_dir, [died])
-    trust = ask(bag_dir, "memory_status")["trust"]
-    assert trust == (
+    doubts = ask(bag_dir, "memory_status")["doubts"]
+    assert doubts == (
         f"nothing was recorded from {T0_S + 59}.000001 to {T0_S + 100}.000000 (41 s), because the "
         "recorder ended without a shutdown"
     )

@@ -101,7 +101,7 @@ async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
             "episodic://moments",
         ]
         assert "/odom" in {row["topic"] for row in await read(client, "episodic://topics")}
-        assert "trust" in await read(client, "episodic://status")
+        assert "doubts" in await read(client, "episodic://status")
         assert (await read(client, "episodic://moments"))["moments"] == []
 
 

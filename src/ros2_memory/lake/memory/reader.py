@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.columns.pack import is_large
 from ros2_memory.core.errors import BagError, NotInLakeError
 from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.tables import topic_key
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.files import Lake
@@ -66,9 +68,13 @@ class LakeReader(BagReader):
         robot: its name there.
         index: its bags.
         decoder: decodes messages, as it does those of files.
+        large: the turn to hold much of a bag.
     """
 
-    def __init__(self, lake: Lake, robot: str, index: LakeIndex, decoder: BagReader) -> None:
+    def __init__(
+        self, lake: Lake, robot: str, index: LakeIndex, decoder: BagReader, large: LargeReads
+    ) -> None:
+        self._large = large
         self._lake = lake
         self._robot = robot
         self._index = index
@@ -156,10 +162,12 @@ class LakeReader(BagReader):
         for head in wanted:
             topic = head.channel.topic
             if not head.has_payloads and topic not in bare:
-                raise _not_shipped(topic)
+                raise _has_times_alone(topic)
             data = self._packed_of(here, head, names)
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
+            if is_large(data):
+                self._large.acquire()
             try:
                 batch = unpacked_messages(data, head.channel)
             except ValueError as error:
@@ -233,7 +241,7 @@ class LakeReader(BagReader):
         return self._channels.setdefault(channel, channel)
 
 
-def _not_shipped(topic: str) -> NotInLakeError:
+def _has_times_alone(topic: str) -> NotInLakeError:
     return NotInLakeError(
         f"the lake has only the times of {topic}, whose messages are large: name it in "
         "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's own memory"

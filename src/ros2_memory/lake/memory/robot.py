@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.columns.store import ColumnStore
+    from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.context import QuerySettings
@@ -35,6 +36,7 @@ class LakeRobot:
         limits: the settings of queries.
         extractor: knows the types of messages.
         decoder: decodes messages.
+        large: the turn to hold much of a bag.
         store: of the columns of its bags, which are made again from the lake; None for none.
         settings: what follows from bags depends on, as a text.
         refresh_s: how old (s) the index may be.
@@ -54,6 +56,7 @@ class LakeRobot:
         *,
         extractor: SchemaExtractor,
         decoder: BagReader,
+        large: LargeReads,
         store: ColumnStore | None = None,
         settings: str = "",
         refresh_s: float = 60.0,
@@ -65,12 +68,13 @@ class LakeRobot:
         )
         self.memory = Memory(
             self._index,
-            LakeReader(lake, name, self._index, decoder),
+            LakeReader(lake, name, self._index, decoder, large),
             extractor,
             clock,
             # Nothing is recorded here, and nothing deleted.
             replace(limits, kept=None, recording="", screened=False),
-            Scanner(store, self._index.bag_dir, settings),
+            Scanner(store, self._index.bag_dir, settings, large),
+            large=large,
         )
 
     @property

@@ -235,11 +235,11 @@ function newestOf(view) {
 }
 function showSummary() {
   const { range, status } = state.view;
-  const sound = status.trust === "nothing is known to be missing";
+  const sound = status.doubts === "no loss or fault was found";
   const newest = range.latest === null ? "nothing is recorded" : newestOf(state.view);
   const parts = [state.recording ? `only ${state.recording}` : recorderOf(status), newest].filter(Boolean);
   at("summary").replaceChildren(plain(`${parts.join(" \u00b7 ")} \u00b7 `), sound
-    ? "nothing is known to be missing" : el("span", { class: "warn" }, "! something is missing: see State"));
+    ? "no loss or fault was found" : el("span", { class: "warn" }, "! something is missing: see State"));
   if (range.latest !== null && at("back").hidden && state.hovered === null) headOfNow();
 }
 function headOfNow() {

@@ -146,7 +146,7 @@ const recorderOf = (status) => (status.recorder === null ? "" : status.recorder
   + (status.restarts ? `, ${counted(status.restarts, "restart")}` : ""));
 
 function showState(host, status, range) {
-  const sound = status.trust === "nothing is known to be missing";
+  const sound = status.doubts === "no loss or fault was found";
   const own = status.budget.max_gb !== null;
   const recorder = recorderOf(status)
     || (own ? "no heartbeat yet" : state.recording ? "not shown for one recording"
@@ -174,8 +174,8 @@ function showState(host, status, range) {
       + counted(each.moments, "moment") + (each.refused ? `, ${each.refused} refused` : "")));
   }
   // The files are listed below.
-  const trust = status.trust.replace(/; data_time_range (lists them|says why)/g, "");
-  const parts = [el("p", { class: sound ? "good" : "warn" }, (sound ? "\u2713 " : "! ") + trust), list];
+  const doubts = status.doubts.replace(/; data_time_range (lists them|says why)/g, "");
+  const parts = [el("p", { class: sound ? "good" : "warn" }, (sound ? "\u2713 " : "! ") + doubts), list];
   for (const each of status.fell_silent) {
     parts.push(el("p", { class: "warn" }, "! ", bdi(each.topic), ` fell silent ${ago(each.ago_s)}`));
   }

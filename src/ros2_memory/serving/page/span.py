@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Polygon, Rectangle
+from ros2_memory.core.regions import Circle, Polygon
 from ros2_memory.core.reply import degrees, moment, render, rounded
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -412,10 +412,11 @@ def _place(place: Place) -> JsonObject:
     match place.region:
         case Circle(x, y, radius_m):
             return {"name": place.name, "circle": [x, y, radius_m]}
-        case Rectangle(min_x, max_x, min_y, max_y):
-            corners = [(min_x, min_y), (max_x, min_y), (max_x, max_y), (min_x, max_y)]
         case Polygon(corners=given):
             corners = [*given]
+        case region:
+            min_x, max_x, min_y, max_y = region.bounds
+            corners = [(min_x, min_y), (max_x, min_y), (max_x, max_y), (min_x, max_y)]
     return {"name": place.name, "corners": [[x, y] for x, y in corners]}
 
 

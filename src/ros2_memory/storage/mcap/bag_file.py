@@ -143,7 +143,7 @@ class McapBags:
         self._max_chunk_bytes = max_chunk_mb << 20
         self._large = large or LargeReads()
         self._uncompressed = partial(
-            uncompressed_payload, max_bytes=self._max_chunk_bytes, take_turn=self._large.take
+            uncompressed_payload, max_bytes=self._max_chunk_bytes, take_turn=self._large.acquire
         )
         self._indexes: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
@@ -280,7 +280,7 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        for group in read_groups(file, chunks.together, self._max_chunk_bytes, self._large.take):
+        for group in read_groups(file, chunks.together, self._max_chunk_bytes, self._large.acquire):
             yield from self._batches_of_group(file, group, wanted, window, passed)
             del group  # before the next is read
         for chunk in chunks.alone:
@@ -493,7 +493,9 @@ class McapBags:
         reason = self._contradictions.get(file.key)
         if reason is not None:
             return self._index_without_indexes(file, reason)
-        return self._cache_index(file, _read_index(file, self._max_chunk_bytes, self._large.take))
+        return self._cache_index(
+            file, _read_index(file, self._max_chunk_bytes, self._large.acquire)
+        )
 
     def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
         self._indexes.put(file.key, index, index.memory_bytes)
@@ -658,14 +660,14 @@ class McapBags:
         return self._index_without_indexes(file, reason)
 
     def _index_without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
-        index = index_by_scan(file, self._max_chunk_bytes, reason, self._large.take)
+        index = index_by_scan(file, self._max_chunk_bytes, reason, self._large.acquire)
         return self._cache_index(file, index._replace(contradiction=reason))
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
         data = self._chunks.get(key)
         if data is None:
-            data = chunk_data(file, chunk, self._max_chunk_bytes, self._large.take)
+            data = chunk_data(file, chunk, self._max_chunk_bytes, self._large.acquire)
             self._chunks.put(key, data, len(data))
         return data
 
