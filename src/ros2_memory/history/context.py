@@ -13,6 +13,7 @@ from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns, unix_from_ns
 from ros2_memory.index.listed_splits import absent_splits
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.index.listed_splits import Absent
+    from ros2_memory.index.listed_splits import Absent, Listings
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.foreign import Foreign
     from ros2_memory.retention.policy import RetentionLimits
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 ClockOfTransforms = Literal["auto", "stamp", "log"]
 NowOfMemory = Literal["wall", "latest"]
+_LISTINGS: Final[Key[Listings]] = Key()
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +113,8 @@ class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
     `columns` scans topics, from its store where that has the bags; every answer is the same without
-    the store. `large` is the turn to hold much of a bag, which the reader takes.
+    the store. `large` is the turn to hold much of a bag, which the reader takes. `memo` has what
+    was found out about the bags and stays true.
     """
 
     index: SnapshotSource
@@ -121,6 +124,7 @@ class Memory:
     limits: QuerySettings
     columns: Scanner
     large: LargeReads = field(default_factory=LargeReads)
+    memo: Memo = field(default_factory=Memo)
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.
@@ -132,7 +136,7 @@ class Memory:
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns what recordings' metadata.yaml lists and is not there."""
-        return absent_splits(snapshot, self.index.bag_dir)
+        return absent_splits(snapshot, self.index.bag_dir, self.memo.of(_LISTINGS, dict))
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.

@@ -7,11 +7,8 @@ there that decides which ones count.
 from __future__ import annotations
 
 import re
-from collections import OrderedDict
 from itertools import chain, islice
-from threading import Lock
 from typing import TYPE_CHECKING, Final, Protocol
-from weakref import WeakKeyDictionary
 
 from ros2_memory.analysis.conditions import (
     Equals,
@@ -43,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Schema
@@ -55,13 +51,10 @@ _CONSTANT: Final = re.compile(
 """A constant in the text of a message definition, as ROS 2 writes it."""
 _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
-_MOST_QUESTIONS: Final = 4
 _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
-_MOST_TRUTHS: Final = 65_536
-"""Messages of which it is known whether they met a condition: some 8 MB for each question."""
 
 
 def condition_of(
@@ -207,33 +200,6 @@ def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
     return [f"{name} = {value}" for name, value in dict.fromkeys(some)]
 
 
-class _Truths:
-    """Which messages met a condition, for the questions that were asked last. Thread-safe.
-
-    A message is known by its bytes and its type, as duplicates are, so that it is decoded once.
-    """
-
-    def __init__(self) -> None:
-        self._lock = Lock()
-        self._known: WeakKeyDictionary[SchemaExtractor, OrderedDict[str, dict[int, bool]]] = (
-            WeakKeyDictionary()
-        )
-
-    def of(self, extractor: SchemaExtractor, condition: Condition) -> dict[int, bool]:
-        """Returns the stored knowledge about a condition, to be extended."""
-        with self._lock:
-            known = self._known.setdefault(extractor, OrderedDict())
-            question = repr(condition)  # 1 and True are equal, and not the same condition
-            known.setdefault(question, {})
-            known.move_to_end(question)
-            if len(known) > _MOST_QUESTIONS:
-                known.popitem(last=False)
-            return known[question]
-
-
-_TRUTHS: Final = _Truths()
-
-
 def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
     """Returns the error of a search that found no match back to a time when it had to end."""
     back_to, budget_s = unix_text(searched_to), view.call.deadline.budget_s
@@ -269,7 +235,6 @@ class ReverseSearch:
         _require_frame(view, self.topics, condition)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
-        self._truths = _TRUTHS.of(view.memory.extractor, condition)
 
     def candidates(self, until: Ns) -> CandidateTables:
         """Returns the tables that can contain a match before a moment."""
@@ -364,31 +329,18 @@ class ReverseSearch:
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
-        channel = found.record.channel
-        key = hash((found.record.payload, channel.schema, channel.encoding))
-        known = self._truths.get(key)
-        if known is not None:
-            self._has_decoded = True
-            return known
-        met = self._decoded(found)
-        if met is not None and len(self._truths) < _MOST_TRUTHS:
-            self._truths[key] = met
-        return met
-
-    def _decoded(self, found: StoredMessage) -> bool | None:
         channel, memory = found.record.channel, self._view.memory
         with self._view.call.stages.timed("extract"):
             try:
                 message = memory.reader.decode(found.record)
                 value = memory.extractor.exact(message, channel.type)
                 self._has_decoded = True
-                met = self.condition.matches(value)
+                return self.condition.matches(value)
             except UndecodableError as error:
                 # A copy: the raised error keeps its traceback alive, and the message with it.
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
                 self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
                 return None
-        return met
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:
         """Notes which topics have messages from a moment on that could not be tested."""

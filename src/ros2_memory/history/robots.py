@@ -8,13 +8,15 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
+from dataclasses import dataclass
+from functools import partial
 from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, united
 from ros2_memory.core.text import listed
@@ -37,9 +39,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.spans import Spans
-    from ros2_memory.history.context import Call, Memory, SnapshotSource
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
-    from ros2_memory.index.timeline import Timeline
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
@@ -57,27 +58,25 @@ _MAX_TREES: Final = 32
 """Recordings of which static transforms are compared, the newest."""
 _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
-_APART: Final[WeakKeyDictionary[SnapshotSource, dict[tuple[Path, Path], str | None]]] = (
-    WeakKeyDictionary()
-)
-"""Caches, for pairs of recordings, the topic on which they differ: the past does not change."""
-_PARENTS: Final[WeakKeyDictionary[SnapshotSource, dict[str, Mapping[str, str]]]] = (
-    WeakKeyDictionary()
-)
-"""Caches the parent of each static frame of a recording that is closed."""
-_MAKERS: Final[WeakKeyDictionary[Timeline, list[tuple[str, Sequence[BagFile]]]]] = (
-    WeakKeyDictionary()
-)
-"""Caches, for a timeline, the recordings of which frames are compared."""
-
-
+_APART: Final[Key[dict[tuple[Path, Path], str | None]]] = Key()
+"""Of a memory: for pairs of recordings, the topic on which they differ. The past stays."""
+_PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
+"""Of a memory: the parent of each static frame of a recording that is closed."""
+_MAKERS: Final[Key[list[tuple[str, Sequence[BagFile]]]]] = Key()
+"""Of a timeline: the recordings of which frames are compared."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
-_DESCRIBED: Final[WeakKeyDictionary[SnapshotSource, tuple[Ns | None, tuple[str, ...]]]] = (
-    WeakKeyDictionary()
-)
-"""Caches when it was last looked whether robots are mixed, and what was found."""
+_DESCRIBED: Final[Key[_Described]] = Key()
+"""Of a memory."""
+
+
+@dataclass(slots=True)
+class _Described:
+    """When it was last looked whether robots are mixed, and what was found."""
+
+    at: Ns | None = None
+    sentences: tuple[str, ...] = ()
 
 
 class Mixed(NamedTuple):
@@ -119,7 +118,7 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     recordings ran, show no second robot. A few messages are read once of each of the first pairs.
     """
     view = View(memory, call)  # notes on what is read here are of no answer
-    known = _APART.setdefault(memory.index, {})
+    known = memory.memo.of(_APART, dict)
     found: list[Mixed] = []
     bags: Mapping[str, Sequence[BagFile]] | None = None
     steps = _steps_back(view)
@@ -143,9 +142,10 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     alone: they are of one robot.
     """
     view = View(memory, call)
-    known = _PARENTS.setdefault(memory.index, {})
+    known = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    for path, bags in _of_different_makers(view):
+    makers = view.snapshot.timeline.memo.of(_MAKERS, partial(_of_different_makers, view))
+    for path, bags in makers:
         try:
             parents = known[path] if path in known else _static_parents(view, bags)
         except QueryTimeoutError:
@@ -167,12 +167,10 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
-    now = memory.clock.now()
-    at, known = _DESCRIBED.get(memory.index, (None, ()))
-    if at is None or abs(now - at) > _RECENT_NS:
-        known = tuple(_described(memory, call))
-        _DESCRIBED[memory.index] = (now, known)
-    return known
+    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, _Described)
+    if known.at is None or abs(now - known.at) > _RECENT_NS:
+        known.at, known.sentences = now, tuple(_described(memory, call))
+    return known.sentences
 
 
 def _described(memory: Memory, call: Call) -> Iterator[str]:
@@ -218,14 +216,6 @@ def _spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
 
 def _of_different_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     """Returns the newest recordings with static transforms, of this program's one in a folder."""
-    timeline = view.snapshot.timeline
-    known = _MAKERS.get(timeline)
-    if known is None:
-        known = _MAKERS[timeline] = _found_makers(view)
-    return known
-
-
-def _found_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     topics = view.memory.limits.tf_static_topics
     root = f"{view.memory.index.bag_dir}/"
     newest: dict[str, tuple[str, Sequence[BagFile]]] = {}

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, TypeAlias
-from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -32,15 +32,14 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.index.timeline import Timeline
 
 Session: TypeAlias = frozenset[str]
 """The folders of its recordings, as they were named when they were recorded."""
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
-_JOINED: Final[WeakKeyDictionary[Timeline, Mapping[str, Session]]] = WeakKeyDictionary()
-"""Caches the chains of a timeline, for which sidecars are read; a new bag makes a new one."""
+_CHAINS: Final[Key[Mapping[str, Session]]] = Key()
+"""Of a timeline: sidecars are read for them."""
 
 
 class Sessions:
@@ -70,7 +69,7 @@ class Sessions:
             "moving": self._spans_of(limits.tf_topics),
             "static": self._spans_of(limits.tf_static_topics),
         }
-        self._joined = self._chains()
+        self._joined = view.snapshot.timeline.memo.of(_CHAINS, self._chains)
         self._poses = [*self._spans_of((view.pose_topic,)).items()]
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
@@ -228,15 +227,10 @@ class Sessions:
 
     def _chains(self) -> Mapping[str, Session]:
         """Returns, by folder, the recordings with transforms or poses joined by handovers."""
-        timeline = self._view.snapshot.timeline
-        known = _JOINED.get(timeline)
-        if known is None:
-            recordings = map(timeline.recordings, self._topics)
-            paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
-            chains = _joined(paths) if len(paths) > 1 else {}
-            known = {folder: frozenset(each | {self._carried}) for folder, each in chains.items()}
-            _JOINED[timeline] = known
-        return known
+        recordings = map(self._view.snapshot.timeline.recordings, self._topics)
+        paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
+        chains = _joined(paths) if len(paths) > 1 else {}
+        return {folder: frozenset(each | {self._carried}) for folder, each in chains.items()}
 
 
 def _joined(paths: Mapping[str, Path]) -> dict[str, set[str]]:

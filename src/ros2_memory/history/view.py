@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Final
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -43,11 +43,11 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Sessions
-    from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
 
 
-_CENSUSES: Final[WeakKeyDictionary[Timeline, dict[str, dict[str, Census]]]] = WeakKeyDictionary()
+_CENSUSES: Final[Key[dict[str, dict[str, Census]]]] = Key()
+"""Of a timeline: its topics' censuses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class View:
         From the summaries of bags; messages are read only where recordings overlap. What is counted
         without a doubt stays in memory until a bag comes or goes.
         """
-        counted = _CENSUSES.setdefault(self.snapshot.timeline, {})
+        counted = self.snapshot.timeline.memo.of(_CENSUSES, dict)
         if topic in counted:
             return counted[topic]
         before = self.notes.added

@@ -69,12 +69,12 @@ class _Listed(NamedTuple):
     is_total: bool = False
 
 
-_KNOWN: Final[dict[tuple[Path, str], tuple[_Stamp, _Listed]]] = {}
-"""By bag directory and folder: how it was, and what it held then."""
+Listings: TypeAlias = "dict[str, tuple[_Stamp, _Listed]]"
+"""By folder: how it was when its metadata.yaml was read, and what that listed."""
 
 
-def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
-    """Returns what is missing of the recordings of a snapshot.
+def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Absent]:
+    """Returns what is missing of the recordings of a snapshot; `known` are listings of before.
 
     A recorder of ours deletes splits of its recordings, whose metadata.yaml still lists them. Those
     that it noted are not missing, nor are those before the first split that is left: versions
@@ -90,14 +90,14 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path) -> list[Absent]:
             bags[name] += tally.bags
             messages[name] += tally.messages
     absent, deleted = [], read_deleted(bag_dir)
-    for path, listed_there in _listed(snapshot, bag_dir):
+    for path, listed_there in _listed(snapshot, bag_dir, known):
         if listed_there is None or listed_there.bags is None:
             absent.append(Absent(path, unreadable=True))
             continue
         # Asked only where the first file is missing: it takes longer than all else here.
         is_own = bool(listed_there.first) and _may_be_deleted(own, bag_dir, Path(path))
-        known = deleted.get(path.removeprefix(f"{bag_dir}/"))
-        gone = frozenset[str]() if known is None else frozenset(known.files)
+        noted = deleted.get(path.removeprefix(f"{bag_dir}/"))
+        gone = frozenset[str]() if noted is None else frozenset(noted.files)
         absent.append(_compare(path, listed_there, bags[path], messages[path], gone, is_own=is_own))
     return [each for each in absent if each.files or each.messages or each.unreadable]
 
@@ -160,7 +160,9 @@ def _compare(
     return Absent(path, tuple(name for name, _ in missing), lost)
 
 
-def _listed(snapshot: Snapshot, bag_dir: Path) -> Iterator[tuple[str, _Listed | None]]:
+def _listed(
+    snapshot: Snapshot, bag_dir: Path, known: Listings
+) -> Iterator[tuple[str, _Listed | None]]:
     """Yields the folders with a metadata.yaml that is not being written, and what that lists.
 
     None where the folder or the file cannot be read.
@@ -171,9 +173,9 @@ def _listed(snapshot: Snapshot, bag_dir: Path) -> Iterator[tuple[str, _Listed | 
             stamp = _stamp(path)
             if not settled(stamp[0], now):
                 continue
-            known = _KNOWN.get((bag_dir, path))
-            if known is None or known[0] != stamp:
-                known = stamp, _read(bag_dir, path)
+            listing = known.get(path)
+            if listing is None or listing[0] != stamp:
+                listing = stamp, _read(bag_dir, path)
         except FileNotFoundError:
             continue
         except (OSError, ValueError):
@@ -181,10 +183,10 @@ def _listed(snapshot: Snapshot, bag_dir: Path) -> Iterator[tuple[str, _Listed | 
             continue
         # A folder that changed just now may change again within the same mtime.
         if settled(stamp[2], now):
-            _KNOWN[bag_dir, path] = known
-        yield path, known[1]
-    if len(_KNOWN) > _MAX_CACHED_FOLDERS:
-        _KNOWN.clear()
+            known[path] = listing
+        yield path, listing[1]
+    if len(known) > _MAX_CACHED_FOLDERS:
+        known.clear()
 
 
 def _stamp(folder: str) -> _Stamp:

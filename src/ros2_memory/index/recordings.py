@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 import threading
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -22,6 +23,7 @@ from weakref import WeakKeyDictionary
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.core.memo import Key
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.segment import folder_of
 from ros2_memory.index.timeline import Timeline
@@ -47,6 +49,8 @@ _IN_MOMENTS: Final = f"/{MOMENTS_FOLDER}/"
 _MOMENT: Final = re.compile(rf"(?P<bag_dir>.*){_IN_MOMENTS}\d{{8}}T\d{{6}}Z[^/]*/(?P<recording>.+)")
 _MAX_READ: Final = 200
 """How many pairs are checked for a handover; each costs two files."""
+_OVERLAPS: Final[Key[tuple[Overlapping, ...]]] = Key()
+"""Of a timeline: its pairs, but for their handovers."""
 
 
 def paths_named(root: str, name: str) -> re.Pattern[str]:
@@ -203,14 +207,8 @@ def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
     Bags that a wrong clock dated are left out. Those in a saved moment count with the recording
     that they were saved from.
     """
-    known = _KNOWN.get(snapshot.timeline)
-    if known is None:
-        known = _KNOWN[snapshot.timeline] = _long_overlaps(snapshot)
-    return tuple(each for each in known if not _took_over(each))
-
-
-_KNOWN: Final[WeakKeyDictionary[Timeline, tuple[Overlapping, ...]]] = WeakKeyDictionary()
-"""Caches the pairs of a timeline, but for their handovers; a new bag makes a new timeline."""
+    overlaps = snapshot.timeline.memo.of(_OVERLAPS, partial(_long_overlaps, snapshot))
+    return tuple(each for each in overlaps if not _took_over(each))
 
 
 def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:

@@ -14,6 +14,7 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
+from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import overlap_spans, united
 from ros2_memory.index.segment import (
@@ -45,10 +46,15 @@ process still has the segments of those that are left, but for the first few."""
 
 
 class Timeline:
-    """Bags sorted by (start, end, path). Immutable; `changed` returns the next one."""
+    """Bags sorted by (start, end, path). Immutable; `changed` returns the next one.
+
+    Attributes:
+        memo: what was derived from these bags; a new bag makes a new timeline.
+    """
 
     def __init__(self, segments: Sequence[Segment] = ()) -> None:
         self.segments = tuple(segments)
+        self.memo = Memo()
         self._recordings: dict[str, dict[Path, Span]] = {}
         self._before_last: dict[str, dict[Path, Span]] = {}  # of all segments but the last
 

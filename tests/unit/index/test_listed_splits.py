@@ -9,7 +9,7 @@ import pytest
 
 from ros2_memory.bag_dir.metadata_yaml import Listing
 from ros2_memory.index import listed_splits
-from ros2_memory.index.listed_splits import Absent, absent_splits
+from ros2_memory.index.listed_splits import Absent
 from tests.support.bags import text, write_mcap
 from tests.support.memories import memory_of
 
@@ -37,7 +37,7 @@ def recording(bag_dir: Path, name: str = "r", *, messages: int = 1) -> Memory:
 
 
 def found(memory: Memory) -> Sequence[Absent]:
-    return absent_splits(memory.index.snapshot(), memory.index.bag_dir)
+    return memory.absent_splits(memory.index.snapshot())
 
 
 @pytest.mark.parametrize("messages", [1, 0, 7])

@@ -19,7 +19,6 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
-from ros2_memory.index.listed_splits import absent_splits
 from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import topic_range
 from ros2_memory.results import SilentTopic
@@ -486,7 +485,7 @@ class TestWhatIsMissingIsNamedAndCounted:
         snapshot = memory.index.snapshot()
         (tmp_path / "bags" / "rec").rename(tmp_path / "outside")
         (tmp_path / "bags" / "rec").symlink_to(tmp_path / "outside")
-        (absent,) = absent_splits(snapshot, tmp_path / "bags")
+        (absent,) = memory.absent_splits(snapshot)
         assert (absent.files, absent.unreadable) == ((), True)
 
     def test_splits_cut_by_a_handover_hold_fewer_than_listed(self, tmp_path: Path) -> None:

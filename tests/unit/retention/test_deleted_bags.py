@@ -20,7 +20,6 @@ from ros2_memory.bag_dir.state_files import (
     deleted_spans,
     read_deleted,
 )
-from ros2_memory.index.listed_splits import absent_splits
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
 from tests.support.memories import asked, memory_of
@@ -63,7 +62,7 @@ def ask(bag_dir: Path, tool: str, **given: object) -> Any:
 
 def test_splits_that_retention_deleted_around_a_moment_are_not_missing(bag_dir: Path) -> None:
     memory = memory_of(bag_dir, clock=SettableClock(NOW))
-    assert absent_splits(memory.index.snapshot(), bag_dir) == []
+    assert memory.absent_splits(memory.index.snapshot()) == []
     assert ask(bag_dir, "memory_status")["doubts"] == "no loss or fault was found"
     # A file that somebody else deleted is.
     (bag_dir / B / f"{B}_3.mcap").unlink()

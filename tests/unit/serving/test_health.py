@@ -85,7 +85,7 @@ async def test_listings_are_read_before_the_first_question(
     memory = memory_at(tmp_path, seconds=3600)
     await read_listings(memory)
     monkeypatch.setattr(listed_splits, "read_listing", None)
-    [absent] = listed_splits.absent_splits(memory.index.snapshot(), tmp_path)
+    [absent] = memory.absent_splits(memory.index.snapshot())
     assert absent.files == ("r_1.mcap",)
 
 

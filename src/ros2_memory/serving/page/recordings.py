@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.robots import ADVICE, describe_mixed, mixed_recordings
@@ -89,7 +90,8 @@ class Recordings:
             found = self._memories.get(name)
         if found is None:
             limits = replace(memory.limits, now="latest", kept=None, recording=name)
-            found = replace(memory, index=OneRecording(memory.index, name), limits=limits)
+            index = OneRecording(memory.index, name)
+            found = replace(memory, index=index, limits=limits, memo=Memo())
         snapshot = found.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
             names = [str(each["name"]) for each in self._list(memory)]

@@ -1,0 +1,28 @@
+"""What was derived from an object and is remembered as long as that object lives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+T = TypeVar("T")
+
+
+class Key(Generic[T]):
+    """Names one value of a `Memo`, and says its type."""
+
+
+class Memo:
+    """Values by key, each made once. Thread-safe; two threads may both make one, and one stays."""
+
+    def __init__(self) -> None:
+        self._values: dict[Key[object], object] = {}
+
+    def of(self, key: Key[T], make: Callable[[], T]) -> T:
+        """Returns the value of a key; makes it where it is asked for the first time."""
+        name = cast("Key[object]", key)
+        if name not in self._values:
+            return cast("T", self._values.setdefault(name, make()))
+        return cast("T", self._values[name])
