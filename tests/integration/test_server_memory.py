@@ -27,7 +27,7 @@ CACHED_MB: Final = 160
 """What may stay: chunks (32 MB), columns (48 MB), and what the C library keeps of each arena."""
 AT_ONCE: Final = 8
 SHAPES: Final = {
-    "few": (24 if LONG else 4, 40 * MB, MB),
+    "few": (24 if LONG else 10, 40 * MB, MB),
     "many": (3000 if LONG else 600, 400_000, MB),
     "together": (3000 if LONG else 300, 400_000, 60 * MB),
 }

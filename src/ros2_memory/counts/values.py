@@ -72,14 +72,14 @@ def count_values(
     held: list[Held] = []
     try:
         held += values.during(start, stop)
-    except QueryTimeoutError:
+    except QueryTimeoutError as error:
         # What is newer is known all the same.
         held += values.known[::-1]
         if not held:
             raise
         start = values.reached
         view.notes.complete = False
-        view.notes.add(f"out of time: only what is after {unix_text(start)} is counted")
+        view.notes.add(f"{error}: only what is after {unix_text(start)} is counted")
     if not held:
         raise no_data_between(view, (topic,), asked)
     tallies = _tallied(view, held, asked, (start, stop), condition)

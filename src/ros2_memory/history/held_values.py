@@ -14,23 +14,25 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.columns.table import Texts
 from ros2_memory.columns.words import words_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from ros2_memory.columns.table import Texts
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
 TEXT: Final = "std_msgs/msg/String"
+_MOST_CHARS: Final = 16 << 20
+"""How much of values a call may hold, as JSON text."""
 
 
 class Held(NamedTuple):
@@ -132,10 +134,15 @@ class HeldValues:
         """Returns the values that held at some time from `start` on and before `stop`, in order.
 
         Raises:
-            QueryTimeoutError: the time for reading is over.
+            QueryTimeoutError: the time for reading is over, or the values are too long to be held.
         """
         self.known = []
+        chars = 0
         for held in self.back(stop):
+            chars += len(held.word)
+            if chars > _MOST_CHARS:
+                self.reached = self.known[-1].start if self.known else stop
+                raise QueryTimeoutError(f"the values take more than {_MOST_CHARS:,} characters")
             if held.stop > start:
                 self.known.append(held)
             if held.start <= start:
@@ -158,8 +165,13 @@ class HeldValues:
         """Yields runs in order, or the newest first; those that go on in the next rows joined."""
         waiting: _Run | None = None
         for together in self._blocks(window, newest_first=newest_first):
-            runs = self._of_block(together)
-            for run in reversed(runs) if newest_first else runs:
+            parts = [part for rows in together if (part := self._said(rows)) is not None]
+            if len(parts) < len(together):
+                runs = self._read(together, window, newest_first=newest_first)
+            else:
+                joined = self._joined(parts)
+                runs = reversed(joined) if newest_first else iter(joined)
+            for run in runs:
                 older, newer = (run, waiting) if newest_first else (waiting, run)
                 if older is not None and newer is not None and self._goes_on(older, newer):
                     waiting = _Run(run.word, older.first, newer.last)
@@ -190,10 +202,10 @@ class HeldValues:
 
     def _check(self, _: Ns) -> None:
         if self._reading.expired():
-            raise QueryTimeoutError("the rest is left out")
+            raise QueryTimeoutError("out of time")
 
-    def _of_block(self, together: Sequence[Rows]) -> list[_Run]:
-        parts = [self._said(rows) for rows in together]
+    def _joined(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
+        """Returns the runs of rows that overlap in time, in order."""
         times = np.concatenate([part[0] for part in parts])
         known: dict[str, int] = {}
         codes = np.concatenate(
@@ -222,19 +234,25 @@ class HeldValues:
             )
         ]
 
-    def _said(self, rows: Rows) -> tuple[IntArray, Texts]:
-        """Returns the log times of some rows, and what each says: by its columns, else as read."""
+    def _said(self, rows: Rows) -> tuple[IntArray, Texts] | None:
+        """Returns the log times of some rows, and what each says; None where columns lack it."""
         texts = words_of(rows.table, self._field, self._view.memory.extractor)
-        if texts is not None:
-            return rows.times, texts if rows.index is None else texts.rows(rows.index)
-        times: list[Ns] = []
-        words: list[str] = []
-        for found in messages_of(self._view, rows):
+        if texts is None:
+            return None
+        return rows.times, texts if rows.index is None else texts.rows(rows.index)
+
+    def _read(
+        self, together: Sequence[Rows], window: TimeWindow, *, newest_first: bool
+    ) -> Iterator[_Run]:
+        """Yields a run for each message of the times of some rows, one of which may be large."""
+        first, last = min(rows.first for rows in together), max(rows.last for rows in together)
+        part = window.intersect(TimeWindow(first, last + 1))
+        for found in self._view.stream.messages([self._topic], part, newest_first=newest_first):
+            self._check(found.time)
             message = self._view.bags.decode(found)
             if message is not None:
-                times.append(found.time)
-                words.append(self._word(message, found.record.channel.type))
-        return np.array(times, np.int64), Texts.of(words)
+                word = self._word(message, found.record.channel.type)
+                yield _Run(word, found.time, found.time)
 
     def _word(self, message: object, type_name: str) -> str:
         extractor = self._view.memory.extractor

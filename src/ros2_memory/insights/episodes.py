@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections import deque
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 _LOOKED_AT: Final = 50
 """Of the newest values of a topic so many are looked at for an empty text."""
+_LONGEST_STATE: Final = 10_000
+"""No text that says what a robot does is longer (characters)."""
 _LONGEST_TEXT: Final = 200
 MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
@@ -65,8 +67,17 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     """
     if len(topics) != 1 or not is_text(view, topics[0]):
         return False
-    newest = HeldValues(view, topics[0]).back(MAX_NS)
-    return any(held.is_blank for held in islice(newest, _LOOKED_AT))
+    newest = takewhile(_may_be_state, HeldValues(view, topics[0]).back(MAX_NS))
+    try:
+        return any(held.is_blank for held in islice(newest, _LOOKED_AT))
+    except QueryTimeoutError:
+        if view.call.deadline.expired():
+            raise
+        return False  # The time for reading is over: what can be found without them is.
+
+
+def _may_be_state(held: Held) -> bool:
+    return len(held.word) <= _LONGEST_STATE
 
 
 def find_episodes(
@@ -111,7 +122,6 @@ def _met(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Epi
     Each when the text before it is known, so one that yields nothing more has looked at all.
     """
     start, _ = scope.window.asked()
-    known: dict[str, bool] = {}
     waiting: Episode | None = None
     newer: Held | None = None
     named = (held for held in values.back(scope.window.stop) if not held.is_blank)
@@ -127,9 +137,7 @@ def _met(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Epi
             waiting = None
         if held is None or held.stop <= start:
             return
-        if held.word not in known:
-            known[held.word] = condition.matches(json.loads(held.word))
-        if known[held.word] and scope.holds_at(held.start):
+        if condition.matches(json.loads(held.word)) and scope.holds_at(held.start):
             following = newer or values.named_after(held.stop)
             after = None if following is None else spell_of(following)
             waiting = Episode(spell_of(held), None, after)
@@ -187,11 +195,11 @@ class SaidMeanwhile:
             try:
                 held = self._values.during(first, max(until, first + 1))
                 return tuple(spell_of(each) for each in held if not each.is_blank)
-            except QueryTimeoutError:
+            except QueryTimeoutError as error:
                 self._is_over = True
                 self._view.notes.complete = False
                 self._view.notes.add(
-                    f"out of time before what {self._topic} said was read for all of them: ask for "
+                    f"{error} before what {self._topic} said was read for all of them: ask for "
                     "fewer, or in a shorter window"
                 )
         return None

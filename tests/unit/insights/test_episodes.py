@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.history import held_values
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
 from tests.support.bags import boolean, odom, text, write_mcap
@@ -240,3 +241,43 @@ def test_a_search_that_runs_out_of_time_says_from_where_to_go_on(
     memory = only(written(tmp_path / "again"), 4, monkeypatch)
     none = ask(memory, "find_matches", **given, value="wash the potato")
     assert (none["error"], none["searched_back_to"]) == ("timeout", BEGIN + 260)
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("get_topic_in_range", {"topic": "/task", "changes": True}),
+        ("get_topic_in_range", {"topic": "/docked", "by": "value"}),
+        (
+            "find_matches",
+            {"topic": "/task", "condition_type": "contains", "value": "pot", "with": "/action"},
+        ),
+    ],
+)
+def test_messages_that_have_no_columns_give_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tool: str, given: dict[str, object]
+) -> None:
+    given = {"start": BEGIN, "end": BEGIN + 935, **given}
+    by_columns = ask(written(tmp_path / "columns"), tool, **given)
+    monkeypatch.setattr(held_values, "words_of", lambda *_: None)
+    assert ask(written(tmp_path / "messages"), tool, **given) == by_columns
+
+
+def test_texts_that_are_too_long_for_a_state_are_sightings(tmp_path: Path) -> None:
+    said = ["", *["wash the pot " + "x" * 20_000] * 3]
+    rows = [text((BEGIN + n) * S, each, "/task") for n, each in enumerate(said)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", rows)
+    memory = memory_of(tmp_path)
+    given = {"topic": "/task", "condition_type": "contains", "value": "pot"}
+    assert "episodes" not in ask(memory, "find_matches", **given)
+
+
+def test_values_that_are_too_long_to_be_held_are_named(
+    memory: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_values, "_MOST_CHARS", 80)
+    window = {"start": BEGIN, "end": BEGIN + 319}
+    reply = ask(memory, "get_topic_in_range", topic="/task", by="value", **window)
+    assert [row[0] for row in reply["rows"]] == ["use a butter knife", "wash the pot"]
+    [note] = [each for each in reply["notes"] if "more than 80 characters" in each]
+    assert f"only what is after {BEGIN + 200}.000000 is counted" in note
