@@ -17,6 +17,7 @@ from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.documented_history import heartbeat
 from tests.support.processes import until
 from tests.support.robot_run import T0, T0_S
+from tests.unit.test_positions import fix
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -99,8 +100,8 @@ def show(browser: Browser, served: Served, address: str = "") -> None:
 def test_a_first_look_is_four_requests(page: Browser) -> None:
     requests = page.run(REQUESTS)
     assert requests[:3] == ["/page/page.css", "/page/page.js", "/page/span"]
-    # Besides the page itself; what follows is asked for later, to see what is new.
-    assert set(requests[3:]) <= {"/page/span"}
+    # Besides the page itself; the topics, and what is new, are asked for later.
+    assert set(requests[3:]) <= {"/page/span", "/page/topics"}
 
 
 def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
@@ -206,26 +207,51 @@ def test_it_is_used_with_the_keyboard_alone(page: Browser) -> None:
 
 
 def test_a_number_is_plotted_below_the_timeline(page: Browser, served: Served) -> None:
-    page.run("document.getElementById('plot-part').open = true")
-    page.awaits("return document.querySelectorAll('#plot-topic option').length > 0")
-    page.run(
-        "const topic = document.getElementById('plot-topic'); topic.value = '/odom';"
-        "topic.dispatchEvent(new Event('change'));"
-    )
     field = "linear_velocity.x"
-    page.awaits(
-        "return [...document.querySelectorAll('#plot-field option')]"
-        ".some((each) => each.value === arguments[0])",
-        field,
-    )
-    page.run(f"document.getElementById('plot-field').value = '{field}'")
-    page.press("#plot-add")
+    number = f"[aria-label='Plot /odom {field}']"
+    page.awaits("return document.querySelector(arguments[0]) !== null", number)
+    assert "1,200 messages" in page.text("#topics") or "1200 messages" in page.text("#topics")
+    assert page.run("return [...document.querySelectorAll('.spoke')].every((each) => each.width)")
+    page.press(number, 3, 3)
     page.awaits("return document.querySelector('.uplot canvas') !== null")
     assert f"/odom:{field}: from 0 to 1" in page.run(
         "return document.querySelector('.plot').getAttribute('aria-label')"
     )
     show(page, served, page.run("return location.hash"))
     page.awaits("return document.querySelector('.uplot canvas') !== null")
+
+
+def test_where_no_pose_topic_is_clear_it_is_chosen_and_the_address_keeps_it(
+    chromium: Browser, scratch: Path
+) -> None:
+    """Two topics of poses and a satellite receiver: nothing is drawn until one was chosen."""
+    messages = []
+    for n in range(100):
+        at = T0 + n * NS_PER_S // 10
+        messages.append(odom(at, n / 10, 0.0, topic="/wheels"))
+        messages.append(odom(at, 0.0, n / 5, topic="/lidar"))
+        messages.append(fix(at, n * 1e-6, 0.0))
+    write_mcap(scratch / "unclear" / "rec" / "rec_0.mcap", messages)
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    with serving(scratch / "unclear", scratch / "log_unclear", *given) as server:
+        show(chromium, server)
+        chromium.awaits("return !document.getElementById('poses-part').hidden")
+        assert "Choose it above" in chromium.text("#map-key")
+        offered = "return [...document.getElementById('poses').options].map((each) => each.text)"
+        assert chromium.run(offered) == ["choose a topic", "/lidar", "/wheels", "/fix (GPS)"]
+        for topic, end in (("/wheels", (9.9, 0)), ("/lidar", (0, 19.8)), ("/fix", (0, 11.01))):
+            chromium.run(
+                "const chosen = document.getElementById('poses'); chosen.value = arguments[0];"
+                "chosen.dispatchEvent(new Event('change'));",
+                topic,
+            )
+            chromium.awaits("return state.view.poses === arguments[0]", topic)
+            x, y = chromium.run("return [map.paths[0].x.at(-1), map.paths[0].y.at(-1)]")
+            assert (x, y) == pytest.approx(end, abs=0.02)
+        assert "east and north of 48.123457, 11.765432" in chromium.text("#map-key")
+        show(chromium, server, chromium.run("return location.hash"))
+        assert chromium.run("return state.view.path.y.at(-1)") == pytest.approx(11.01, abs=0.02)
+        chromium.awaits("return document.getElementById('poses').value === '/fix'")
 
 
 def test_what_the_server_had_no_time_for_is_kept_and_asked_for_again(page: Browser) -> None:

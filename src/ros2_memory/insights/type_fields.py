@@ -46,7 +46,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
             failure = error.reason
             continue
         value = memory.extractor.exact(message, type_name)
-        fields = dict(_fields(value, ""))
+        fields = dict(fields_of(value))
         if len(fields) > MAX_FIELDS:
             view.notes.add(f"{MAX_FIELDS} of {len(fields)} fields")
         shown = tuple(fields.items())[:MAX_FIELDS]
@@ -57,14 +57,14 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     )
 
 
-def _fields(value: JsonValue, path: str) -> Iterator[tuple[str, str]]:
+def fields_of(value: JsonValue, path: str = "") -> Iterator[tuple[str, str]]:
     """Yields dot-paths and the kinds of their values; a list is described by its first element."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _fields(inner, f"{path}.{name}" if path else name)
+            yield from fields_of(inner, f"{path}.{name}" if path else name)
     elif isinstance(value, list):
         if value and isinstance(value[0], dict | list):
-            yield from _fields(value[0], path)
+            yield from fields_of(value[0], path)
         else:
             yield path, f"list of {_kind(value[0])}s" if value else "list"
     else:

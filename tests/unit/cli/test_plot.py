@@ -23,6 +23,7 @@ pytest.importorskip("matplotlib", reason="needs the extra plot")
 
 from ros2_memory.cli.options import day_of
 from ros2_memory.cli.plot import scene
+from ros2_memory.places.local_map import east_north
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -132,7 +133,7 @@ def test_metres_east_and_north_lead_back_to_the_fix(
     north = latitude + math.degrees(metres[1] / radius)
     east = longitude + math.degrees(metres[0] / radius / math.cos(math.radians(latitude)))
     wrapped = (east + 180) % 360 - 180
-    found = scene.east_north(origin, Geodetic(north, wrapped, 0.0))
+    found = east_north(origin, Geodetic(north, wrapped, 0.0))
     assert math.dist(found, metres) <= 0.007 * math.hypot(*metres) + 1e-3
 
 

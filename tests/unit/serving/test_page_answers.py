@@ -36,13 +36,20 @@ from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.routes import moment_request, page_routes, span_request, warm_up
+from ros2_memory.serving.page.routes import (
+    moment_request,
+    page_routes,
+    span_request,
+    topics_window,
+    warm_up,
+)
 from ros2_memory.serving.page.span import (
     MOST_POINTS,
     driven_cells,
     span_shown,
     thinned,
 )
+from ros2_memory.serving.page.topics import topics_shown
 from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
@@ -578,3 +585,49 @@ def test_the_only_topic_of_poses_gives_the_path_with_a_note(tmp_path: Path) -> N
     found = shown(memory_of(tmp_path))
     assert (found["path"]["x"], found["path"]["y"]) == ([1.0], [2.0])
     assert any(note.startswith("by /base, the only topic") for note in found["notes"])
+
+
+def topics(memory: Memory, query: str) -> dict[str, Any]:
+    reply = topics_shown(memory, Call(), topics_window(QueryParams(query)))
+    found: dict[str, Any] = json.loads(to_json_text(reply))
+    return found
+
+
+def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory) -> None:
+    """Recorded are 0 to 40 s and 140 to 160 s; the robot sees a cup in each bag's second half."""
+    found = topics(memory, f"start={BEGIN_S}&end={BEGIN_S + 60}")
+    rows = {row["topic"]: row for row in found["topics"]}
+    assert found["topics_total"] == len(rows) == 2
+    odometry, seen = (rows[topic] for topic in sorted(rows))
+    assert (odometry["count"], odometry["rate_hz"]) == (600, 10.0)
+    assert sum(odometry["spoke"]) == 400
+    assert set(odometry["spoke"][:40]) <= {9, 10, 11}
+    assert set(odometry["spoke"][41:]) == {0}
+    assert set(seen["spoke"][:10]) == {0} != set(seen["spoke"][10:20])
+    assert {"position.x", "orientation.yaw_deg", "linear_velocity.x"} <= set(odometry["numbers"])
+    assert found["places_robot"] == [{"topic": "/odom", "kind": "poses"}]
+
+
+@pytest.mark.parametrize("query", ["", "start=1", "start=2&end=1", "start=1&end=x"])
+def test_topics_of_no_span_are_refused(memory: Memory, query: str) -> None:
+    with pytest.raises(InvalidArgumentsError, match=r"give start|must be a number"):
+        topics(memory, query)
+
+
+def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
+    """Whatever time is looked at, the origin is the same."""
+    messages = [fix(BEGIN + n * S, n * 1e-5, 0.0) for n in range(20)]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    plain = memory_of(tmp_path)
+    memory = replace(plain, limits=replace(plain.limits, pose_topic="/fix"))
+    whole = shown(memory, "last=1000")
+    assert whole["path"]["frame"] == "east and north of 48.123457, 11.765432"
+    assert (whole["path"]["x"][0], whole["path"]["y"][0]) == (0.0, 0.0)
+    assert whole["path"]["y"][-1] == pytest.approx(21.13, abs=0.02)
+    assert whole["robot"]["y"] == pytest.approx(21.13, abs=0.02)
+    late = shown(memory, f"start={BEGIN_S + 10}&end={BEGIN_S + 12}")
+    assert late["path"]["y"][0] == pytest.approx(11.12, abs=0.02)
+    assert whole["places"] == []
+    assert topics(plain, f"start={BEGIN_S}&end={BEGIN_S + 20}")["places_robot"] == [
+        {"topic": "/fix", "kind": "fixes"}
+    ]

@@ -29,13 +29,14 @@ from ros2_memory.history.no_data import (
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
+from ros2_memory.places.local_map import east_north, fixes_in, local_frame
 from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.queries import trajectory_summary
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import Geodetic, JsonValue
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Memory
     from ros2_memory.results import Event, Recap, TrajectorySummary
@@ -79,10 +80,6 @@ _TOPIC: Final = "#94a3b8"
 
 _MOST_MOMENTS: Final = 300
 """Transforms that are looked up: each takes some milliseconds."""
-_MOST_FIXES: Final = 4000
-_RADIUS_M: Final = 6_378_137.0
-_ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
-"""Of the ellipsoid of WGS 84."""
 
 
 class TimelineRow(NamedTuple):
@@ -295,19 +292,12 @@ def _by_transforms(
 
 def _by_fixes(view: View, window: TimeWindow, topic: str) -> FoundPath:
     """Returns the path of a satellite receiver, in metres east and north of its first fix."""
-    total, messages = view.pick(topic, window, _MOST_FIXES)
-    fixes: list[tuple[Ns, Geodetic]] = []
-    for each in messages:
-        message = view.bags.decode(each)
-        extractor = view.memory.extractor
-        fix = None if message is None else extractor.geodetic(message, each.record.channel.type)
-        if fix is not None and math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
-            fixes.append((each.time, fix))
+    total, fixes = fixes_in(view, topic, window)
     if not fixes:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} has a position")
     first = fixes[0][1]
     path = _drawn(
-        f"east and north of {first.latitude:.6f}, {first.longitude:.6f}",
+        local_frame(first),
         [(at, *east_north(first, fix)) for at, fix in fixes],
     )
     return (
@@ -315,20 +305,6 @@ def _by_fixes(view: View, window: TimeWindow, topic: str) -> FoundPath:
         f"{_line(path)}; by {len(fixes)} of {total} fixes of {topic}",
         view.notes.sentences(),
     )
-
-
-def east_north(origin: Geodetic, fix: Geodetic) -> tuple[float, float]:
-    """Returns how far (m) a fix lies east and north of another, on the plane that touches there.
-
-    By the ellipsoid's radii of curvature; off by 1 m some 10 km away.
-    """
-    latitude = math.radians(origin.latitude)
-    flat = 1 - _ECCENTRICITY_SQUARED * math.sin(latitude) ** 2
-    across = _RADIUS_M / math.sqrt(flat) * math.cos(latitude)
-    along = _RADIUS_M * (1 - _ECCENTRICITY_SQUARED) / flat**1.5
-    degrees_east = (fix.longitude - origin.longitude + 180) % 360 - 180
-    degrees_north = fix.latitude - origin.latitude
-    return math.radians(degrees_east) * across, math.radians(degrees_north) * along
 
 
 def _drawn(frame: str, points: Sequence[tuple[Ns, float, float]]) -> DrawnPath:

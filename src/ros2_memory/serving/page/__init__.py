@@ -25,6 +25,7 @@ SCRIPTS: Final = (
     "map.js",
     "timeline.js",
     "signals.js",
+    "topics.js",
     "panels.js",
     "ask.js",
     "main.js",

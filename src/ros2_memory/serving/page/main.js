@@ -14,6 +14,8 @@ const state = {
   span: null,
   t: null,  // the chosen time; null for now
   recording: "",  // the name of the only one that is shown; empty for all
+  poses: "",  // the topic that places the robot; empty for the configured one
+  placing: null,  // which topics can place the robot
   hovered: null,
 };
 let asking = null;  // cancels the running look
@@ -32,8 +34,8 @@ const map = new RobotMap(at("map"), { time: pointed, thing: (each) => chooseThin
 const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch });
 const plots = new Plots(at("plots"), { time: pointed, changed: () => remember() });
 
-/* The address has what is shown: #last=3600, or #from=...&to=..., with &at=..., &recording=... and
-   &plot=... */
+/* The address has what is shown: #last=3600, or #from=...&to=..., with &at=..., &recording=...,
+   &poses=... and &plot=... */
 function remember() {
   const given = new URLSearchParams();
   if (state.last !== null) given.set("last", state.last);
@@ -42,7 +44,7 @@ function remember() {
     given.set("to", state.span.end.toFixed(3));
   }
   if (state.t !== null) given.set("at", state.t.toFixed(3));
-  if (state.recording) given.set("recording", state.recording);
+  for (const [name, value] of Object.entries(chosenPart())) given.set(name, value);
   for (const each of plots.names) given.append("plot", each);
   const hash = `#${given}`;
   if (location.hash !== hash) history.replaceState(null, "", hash);
@@ -60,9 +62,15 @@ function readAddress() {
   }
   state.t = number("at");
   state.recording = given.get("recording") || "";
+  state.poses = given.get("poses") || "";
   plots.use(given.getAll("plot"));
 }
 
+/* Which part of the memory is looked at, and by which topic: so for all that is asked. */
+function chosenPart() {
+  return { ...(state.recording ? { recording: state.recording } : {}),
+    ...(state.poses ? { poses: state.poses } : {}) };
+}
 function query() {
   const given = new URLSearchParams();
   if (state.last === null) {
@@ -70,7 +78,7 @@ function query() {
     given.set("end", state.span.end.toFixed(3));
   } else given.set("last", state.last === "all" ? 1e10 : state.last);
   for (const each of plots.names) given.append("signal", each);
-  if (state.recording) given.set("recording", state.recording);
+  for (const [name, value] of Object.entries(chosenPart())) given.set(name, value);
   return given;
 }
 
@@ -79,7 +87,7 @@ async function look(isMore = false, isPatient = false) {
   if (asking) asking.abort();
   const mine = asking = new AbortController();
   const given = query();
-  const { view, recording } = state;
+  const { view, recording, poses } = state;
   lookedAt = Date.now();
   if (isPatient) given.set("patient", "1");
   if (isMore) {
@@ -111,8 +119,9 @@ async function look(isMore = false, isPatient = false) {
     if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
     state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
-    state.view.recording = recording;
+    Object.assign(state.view, { recording, poses });
     show(reply, isMore);
+    if (reply.status && state.view.range.earliest !== null) lookAtTopics();
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
     if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
@@ -131,6 +140,36 @@ async function look(isMore = false, isPatient = false) {
       at("summary").setAttribute("aria-busy", "false");
     }
   }
+}
+/* The topics of the span, after what else is shown of it. */
+async function lookAtTopics() {
+  const { view, recording, span } = state;
+  try {
+    const reply = await asked("/page/topics", { start: span.start.toFixed(3), end: span.end.toFixed(3),
+      ...(recording ? { recording } : {}) });
+    if (view.recording !== state.recording) return;
+    showTopics(at("topics"), reply, plotAlso);
+    state.placing = reply;
+    const [only, ...others] = reply.places_robot;
+    if (state.view.no_path && !state.poses && only && !others.length) placeBy(only.topic);
+    else showKey();
+  } catch (error) {
+    if (error instanceof Locked) lock(error);
+    else at("topics").replaceChildren(soft(error.message));
+  }
+}
+function plotAlso(name) {
+  plots.use([...plots.names, name]);
+  remember();
+  look();
+  at("plots").scrollIntoView({ block: "nearest" });
+}
+function placeBy(topic) {
+  state.poses = topic;
+  pointed(null, true);
+  map.fit();
+  remember();
+  look();
 }
 /* What was in view all the time is no event: the timeline has it wherever something was recorded. */
 function always(reply, range) {
@@ -290,8 +329,10 @@ function showKey() {
   // Without poses there is no map: the reason is shown instead.
   const isEmpty = Boolean(view.no_path) && !(view.places || []).length;
   at("map").hidden = at("map-tools").hidden = isEmpty;
+  if (state.placing) offerPoses(state.placing, view, state.poses);
   if (isEmpty) {
-    at("map-key").replaceChildren(el("span", { class: "warn" }, `No path: ${view.no_path}.`));
+    at("map-key").replaceChildren(el("span", { class: "warn" }, at("poses-part").hidden || state.poses
+      ? `No path: ${view.no_path}.` : "No path: which topic says where the robot is? Choose it above."));
     return;
   }
   at("map-key").replaceChildren(...(apart(view) ? [
@@ -376,8 +417,7 @@ async function ask(given, then) {
   const mine = ++turn;
   at("moment").setAttribute("aria-busy", "true");
   try {
-    const answer = await asked("/page/moment",
-      state.recording ? { ...given, recording: state.recording } : given);
+    const answer = await asked("/page/moment", { ...given, ...chosenPart() });
     if (mine === turn) then(answer);
   } catch (error) {
     if (error instanceof Locked) lock(error);
@@ -441,6 +481,8 @@ at("length").addEventListener("change", () => {
 });
 at("recording").addEventListener("change", () => {
   state.recording = at("recording").value;
+  state.poses = "";
+  state.placing = null;
   state.last = state.recording ? "all" : state.last || "all";  // another one was at another time
   at("mixed").hidden = true;
   pointed(null, true);
@@ -472,14 +514,11 @@ at("earlier").addEventListener("click", () => line.pan(-0.5));
 at("later").addEventListener("click", () => line.pan(0.5));
 at("time-in").addEventListener("click", () => line.zoom(2));
 at("time-out").addEventListener("click", () => line.zoom(0.5));
-offerPlots((name) => {
-  plots.use([...plots.names, name]);
-  remember();
-  look();
-});
+at("poses").addEventListener("change", () => placeBy(at("poses").value));
 matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
   map.draw();
   line.draw();
+  drawSpokes();
 });
 window.addEventListener("hashchange", () => { readAddress(); look(); });
 document.addEventListener("visibilitychange", () => { if (!document.hidden) follow(); });
@@ -488,7 +527,7 @@ document.addEventListener("visibilitychange", () => { if (!document.hidden) foll
 async function follow() {
   if (document.hidden || isLooking || !at("locked").hidden) return;
   const { view } = state;
-  if (!view || view.recording !== state.recording) {  // the last look failed
+  if (!view || view.recording !== state.recording || view.poses !== state.poses) {  // the last look failed
     if (Date.now() - lookedAt >= FILLING_MS) await look();
     return;
   }

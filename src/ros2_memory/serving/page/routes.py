@@ -1,14 +1,16 @@
-"""The two endpoints of the page: `/page/span` and `/page/moment`, each a GET that returns JSON.
+"""The endpoints of the page: `/page/span`, `/page/moment` and `/page/topics`, GETs of JSON.
 
 They answer from the same queries as the tools, in the queue of the tools that may take long. With
-`recording=NAME` they answer from that recording alone. `/page/moment` also takes `tool=NAME` and
-its `arguments` as JSON; a tool that writes is refused.
+`recording=NAME` they answer from that recording alone, with `poses=TOPIC` the robot is where that
+topic has it. `/page/moment` also takes `tool=NAME` and its `arguments` as JSON; a tool that writes
+is refused.
 """
 
 from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -25,6 +27,7 @@ from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
 from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
+from ros2_memory.serving.page.topics import topics_shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,6 +45,7 @@ log = get_logger(__name__)
 
 SPAN_PATH: Final = "/page/span"
 MOMENT_PATH: Final = "/page/moment"
+TOPICS_PATH: Final = "/page/topics"
 
 _HEADERS: Final = {
     "cache-control": "no-store",
@@ -61,9 +65,7 @@ def page_routes(
     """Returns the routes of the page; `progress`: how far the store of columns is filled."""
     recordings = Recordings()
 
-    def chosen(given: QueryParams, memory: Memory) -> Memory:
-        name = _short(given, "recording", _LONGEST_NAME)
-        return recordings.alone(memory, name) if name else memory
+    chosen = partial(_chosen, recordings)
 
     def span(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
         part, asked = chosen(given, memory), span_request(given)
@@ -74,6 +76,9 @@ def page_routes(
             window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
             shown |= recordings.paths(part, call, window)
         return shown
+
+    def topics(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+        return topics_shown(chosen(given, memory), call, topics_window(given))
 
     def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
         return moment_shown(chosen(given, memory), call, moment_request(given))
@@ -96,7 +101,15 @@ def page_routes(
 
         return Route(path, answer, methods=["GET"])
 
-    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment)]
+    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment), route(TOPICS_PATH, topics)]
+
+
+def _chosen(recordings: Recordings, given: QueryParams, memory: Memory) -> Memory:
+    """Returns the part of a memory that a query string names, in which its `poses` place it."""
+    name = _short(given, "recording", _LONGEST_NAME)
+    part = recordings.alone(memory, name) if name else memory
+    topic = _short(given, "poses", _LONGEST_NAME)
+    return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
 
 
 def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
@@ -168,6 +181,18 @@ def moment_request(given: QueryParams) -> MomentRequest:
         end_s=_number(given, "end"),
         label=label,
     )
+
+
+def topics_window(given: QueryParams) -> TimeWindow:
+    """Returns the span of a query string of `/page/topics`.
+
+    Raises:
+        InvalidArgumentsError: a number is missing or invalid, or the span has no length.
+    """
+    start_s, end_s = _number(given, "start"), _number(given, "end")
+    if start_s is None or end_s is None or start_s >= end_s:
+        raise InvalidArgumentsError("give start, and end after it, in Unix seconds")
+    return TimeWindow.from_unix(start_s, end_s)
 
 
 def tool_arguments(given: QueryParams) -> JsonObject:

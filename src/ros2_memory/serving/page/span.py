@@ -38,6 +38,7 @@ from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.saved_moments import list_moments
 from ros2_memory.insights.status import memory_status
+from ros2_memory.places.local_map import local_track
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import data_time_range
@@ -273,8 +274,7 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     view = View(memory, call, window.stop)
     places = robot_places(view, window)
     if places is None:
-        why = _without_poses(view)
-        return Shown({"path": None, "robot": None, "no_path": why}, (why,))
+        return _path_by_fixes(view, window, latest)
     tracks = RobotTracks(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
     found = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
@@ -289,6 +289,19 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     if found.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
     return Shown(shown, tuple(notes))
+
+
+def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
+    """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
+    found = local_track(view, view.pose_topic, window)
+    if found is None:
+        why = _without_poses(view)
+        return Shown({"path": None, "robot": None, "no_path": why}, (why,))
+    frame, track = found
+    newest = local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1))
+    robot = None if newest is None else _last(newest[1])
+    shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
+    return Shown(shown, view.notes.sentences())
 
 
 def _without_poses(view: View) -> str:

@@ -1,0 +1,82 @@
+"""A satellite receiver's fixes as a map in metres, east and north of one of them."""
+
+from __future__ import annotations
+
+import math
+from itertools import islice
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.motion.robot_track import empty_track, track_of
+from ros2_memory.core.model import TimeWindow
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.model import Geodetic
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.view import View
+
+MOST_FIXES: Final = 4000
+"""Fixes of a path, evenly spaced."""
+_MOST_TRIED: Final = 1000
+"""A receiver that has no satellites yet sends fixes without a place."""
+_RADIUS_M: Final = 6_378_137.0
+_ECCENTRICITY_SQUARED: Final = 6.694_379_990_14e-3
+"""Of the ellipsoid of WGS 84."""
+
+
+def east_north(origin: Geodetic, fix: Geodetic) -> tuple[float, float]:
+    """Returns how far (m) a fix lies east and north of another, on the plane that touches there.
+
+    By the ellipsoid's radii of curvature; off by 1 m some 10 km away.
+    """
+    latitude = math.radians(origin.latitude)
+    flat = 1 - _ECCENTRICITY_SQUARED * math.sin(latitude) ** 2
+    across = _RADIUS_M / math.sqrt(flat) * math.cos(latitude)
+    along = _RADIUS_M * (1 - _ECCENTRICITY_SQUARED) / flat**1.5
+    degrees_east = (fix.longitude - origin.longitude + 180) % 360 - 180
+    degrees_north = fix.latitude - origin.latitude
+    return math.radians(degrees_east) * across, math.radians(degrees_north) * along
+
+
+def local_frame(origin: Geodetic) -> str:
+    """Returns the name of the frame around a fix, for people."""
+    return f"east and north of {origin.latitude:.6f}, {origin.longitude:.6f}"
+
+
+def fixes_in(view: View, topic: str, window: TimeWindow) -> tuple[int, list[tuple[Ns, Geodetic]]]:
+    """Returns how many messages a window holds, and the fixes among `MOST_FIXES` of them."""
+    total, messages = view.pick(topic, window, MOST_FIXES)
+    return total, [*_fixes(view, messages)]
+
+
+def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotTrack] | None:
+    """Returns the path of a receiver in a window around its first recorded fix, and that frame.
+
+    None where the topic has no fix at all.
+    """
+    if topic not in view.snapshot.timeline.topics():
+        return None
+    every = view.stream.messages([topic], TimeWindow.everything())
+    _, origin = next(_fixes(view, islice(every, _MOST_TRIED)), (0, None))
+    if origin is None:
+        return None
+    _, fixes = fixes_in(view, topic, window)
+    if not fixes:
+        return local_frame(origin), empty_track()
+    times = np.array([at for at, _ in fixes], np.int64)
+    x, y = np.array([east_north(origin, fix) for _, fix in fixes]).T
+    return local_frame(origin), track_of(times, x, y, np.full(len(fixes), math.nan))
+
+
+def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:
+    extractor = view.memory.extractor
+    for each in messages:
+        message = view.bags.decode(each)
+        fix = None if message is None else extractor.geodetic(message, each.record.channel.type)
+        if fix is not None and math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
+            yield each.time, fix
