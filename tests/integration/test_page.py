@@ -101,7 +101,7 @@ def test_a_first_look_is_four_requests(page: Browser) -> None:
     requests = page.run(REQUESTS)
     assert requests[:3] == ["/page/page.css", "/page/page.js", "/page/span"]
     # Besides the page itself; the topics, and what is new, are asked for later.
-    assert set(requests[3:]) <= {"/page/span", "/page/topics"}
+    assert set(requests[3:]) <= {"/page/span", "/page/topics", "/page/labels"}
 
 
 def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
@@ -219,6 +219,38 @@ def test_a_number_is_plotted_below_the_timeline(page: Browser, served: Served) -
     )
     show(page, served, page.run("return location.hash"))
     page.awaits("return document.querySelector('.uplot canvas') !== null")
+
+
+def test_each_label_has_a_row_of_the_timeline_and_its_sightings_are_listed(page: Browser) -> None:
+    """The detections of this history have no place, and are seen in both bags all the time."""
+    page.awaits("return state.view.seen !== null")
+    rows = page.run(
+        "return line.lanes.filter((each) => each.label !== undefined)"
+        ".map((each) => [each.label, each.bars.length])"
+    )
+    assert sorted(rows) == sorted([[ATTACK, 2], ["cup", 2]])
+    assert page.text("#events").count("cup in view") == 2
+    page.press("#timeline", 20, page.run("return line.lanes[2].top + 5"))
+    page.awaits("return document.getElementById('moment').textContent.includes('sighting')")
+    assert page.text("#moment-title") == page.run("return plain(line.lanes[2].label)")
+
+
+def test_of_many_labels_those_seen_longest_have_rows_and_the_rest_on_demand(page: Browser) -> None:
+    page.awaits("return state.view.seen !== null")
+    page.run(
+        "const { start } = state.span; const labels = Array.from({ length: 14 }, (_, n) =>"
+        " ({ label: `thing ${n}`, bars: [[start, start + 1]] }));"
+        "state.view.seen = { labels, until: Infinity }; line.show(state.view, state.span);"
+    )
+    count = "return line.lanes.filter((each) => each.label !== undefined).length"
+    high = page.run("return document.getElementById('timeline').clientHeight")
+    assert page.run(count) == 10
+    assert page.text("#all-labels") == "All 14 labels"
+    page.press("#all-labels")
+    assert page.run(count) == 14
+    assert page.run("return document.getElementById('timeline').clientHeight") > high
+    page.press("#all-labels")
+    assert page.run(count) == 10
 
 
 def test_where_no_pose_topic_is_clear_it_is_chosen_and_the_address_keeps_it(

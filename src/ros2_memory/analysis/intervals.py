@@ -107,6 +107,14 @@ class IntervalTable(NamedTuple):
             for first, last, label, *_, best in rows
         )
 
+    def spans(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+        """Returns by label the first and the last time of each of its intervals, in order."""
+        rows = _rows(self.rows)
+        of = [rows[rows["label"] == place] for place in range(len(self.labels))]
+        return {
+            label: (its["first"], its["last"]) for label, its in zip(self.labels, of, strict=True)
+        }
+
     def most_lasting(self, at_most: int) -> IntervalTable:
         """Returns the longest intervals, in order of time; of equally long ones the earliest."""
         if self.size <= at_most:

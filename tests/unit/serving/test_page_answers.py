@@ -34,14 +34,15 @@ from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.page import span
+from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
     moment_request,
     page_routes,
     span_request,
-    topics_window,
     warm_up,
+    window_asked,
 )
 from ros2_memory.serving.page.span import (
     MOST_POINTS,
@@ -588,7 +589,7 @@ def test_the_only_topic_of_poses_gives_the_path_with_a_note(tmp_path: Path) -> N
 
 
 def topics(memory: Memory, query: str) -> dict[str, Any]:
-    reply = topics_shown(memory, Call(), topics_window(QueryParams(query)))
+    reply = topics_shown(memory, Call(), window_asked(QueryParams(query)))
     found: dict[str, Any] = json.loads(to_json_text(reply))
     return found
 
@@ -631,3 +632,21 @@ def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_
     assert topics(plain, f"start={BEGIN_S}&end={BEGIN_S + 20}")["places_robot"] == [
         {"topic": "/fix", "kind": "fixes"}
     ]
+
+
+def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: Memory) -> None:
+    def labels(start_s: float, end_s: float) -> dict[str, Any]:
+        window = TimeWindow.from_unix(BEGIN_S + start_s, BEGIN_S + end_s)
+        found: Any = json.loads(to_json_text(labels_shown(memory, Call(), window)))
+        return {row["label"]: row for row in found["labels"]}
+
+    found = labels(0, 200)
+    assert found.keys() == {"cup"}
+    assert found["cup"]["sightings"] == 3
+    assert found["cup"]["seconds"] == pytest.approx(28.5, abs=0.3)
+    bars = [[each - BEGIN_S for each in bar] for bar in found["cup"]["bars"]]
+    assert [begin for begin, _ in bars] == pytest.approx([10, 30, 150], abs=0.6)
+    # Where it is seen all the time, a recap names it as seen throughout, and counts no sighting.
+    assert "sightings" not in shown(memory, f"start={BEGIN_S + 11}&end={BEGIN_S + 19}")["counts"]
+    assert labels(11, 19)["cup"]["sightings"] == 1
+    assert labels(0, 5) == {}

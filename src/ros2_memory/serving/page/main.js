@@ -31,7 +31,8 @@ let turn = 0;  // of questions about a moment
 
 const map = new RobotMap(at("map"), { time: pointed, thing: (each) => chooseThing(each),
   stretch: chooseStretch });
-const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch });
+const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch,
+  label: (each) => chooseLabel(each), labels: offerLabels });
 const plots = new Plots(at("plots"), { time: pointed, changed: () => remember() });
 
 /* The address has what is shown: #last=3600, or #from=...&to=..., with &at=..., &recording=...,
@@ -121,7 +122,9 @@ async function look(isMore = false, isPatient = false) {
     state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
     Object.assign(state.view, { recording, poses });
     show(reply, isMore);
-    if (reply.status && state.view.range.earliest !== null) lookAtTopics();
+    if (state.view.range.earliest === null) return;
+    if (reply.status) lookAtTopics();
+    if (reply.whole_ms !== undefined) lookAtLabels();
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
     if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
@@ -158,6 +161,26 @@ async function lookAtTopics() {
     else at("topics").replaceChildren(soft(error.message));
   }
 }
+/* When each label was in view: all sightings, of which the events have the longest. */
+async function lookAtLabels() {
+  const { recording, span } = state;
+  try {
+    const { labels, labels_total, end } = await asked("/page/labels", { ...chosenPart(),
+      start: span.start.toFixed(3), end: span.end.toFixed(3) });
+    const { view } = state;
+    if (recording !== state.recording || span.start !== state.span.start) return;
+    view.seen = { labels, total: labels_total, until: Math.min(end, view.range.latest) };
+    line.show(view, state.span);
+    showEvents(at("events"), view, chooseStretch, chooseLabel);
+  } catch (error) {
+    if (error instanceof Locked) lock(error);  // else the rows are by the events alone
+  }
+}
+function offerLabels(number) {
+  at("all-labels").hidden = number <= MOST_LABELS;
+  at("all-labels").textContent = line.hasAll ? `Only the ${MOST_LABELS} labels seen longest`
+    : `All ${number} labels`;
+}
 function plotAlso(name) {
   plots.use([...plots.names, name]);
   remember();
@@ -183,7 +206,7 @@ function always(reply, range) {
     (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
 }
 function whole(reply) {
-  return { path: null, paths: [], robot: null, places: [], moments: [], owed: null, ...reply, things: reply.things || [],
+  return { path: null, paths: [], seen: null, robot: null, places: [], moments: [], owed: null, ...reply, things: reply.things || [],
     events: reply.events || [], isWhole: Boolean(reply.events && reply.path !== undefined) };
 }
 /* What is shown, with an answer about what came since. */
@@ -218,7 +241,7 @@ function continued(view, reply) {
   });
   next.events = reply.events ? [...kept, ...more] : view.events;
   // Totals of the newest minute are not those of the span.
-  for (const key of ["distance_m", "counts", "max_speed", "stood_s"]) next[key] = view[key];
+  for (const key of ["distance_m", "counts", "max_speed", "stood_s", "throughout"]) next[key] = view[key];
   return next;
 }
 
@@ -249,7 +272,7 @@ function show(reply, isMore) {
   plots.move(state.span);
   plots.show(reply.signals || [], isMore);
   showThings(at("things"), view, chooseThing);
-  showEvents(at("events"), view, chooseStretch);
+  showEvents(at("events"), view, chooseStretch, chooseLabel);
   showKey();
   showSpan();
   showControls();
@@ -505,6 +528,10 @@ at("live").addEventListener("click", () => {
 document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault();
   at("timeline").focus();
+});
+at("all-labels").addEventListener("click", () => {
+  line.hasAll = !line.hasAll;
+  line.show(state.view, state.span);
 });
 at("back").addEventListener("click", () => pointed(null, true));
 at("map-in").addEventListener("click", () => map.zoom(1.4));

@@ -104,9 +104,24 @@ function eventRows(events, point) {
     link(each.in ? `${each.text} in ${each.in}` : each.text, () => point(each)),
     `${when(each.t)}${each.end > each.t ? `, ${lasting(each.end - each.t)}` : ""}`));
 }
-function showEvents(host, view, point) {
+/* The sightings that were counted, the newest first; first what was in view all the time. */
+function sightingRows(view, point, choose) {
+  const { counts = {}, throughout = [] } = view;
+  const always = new Set(throughout);
+  const some = view.events.filter((each) => each.kind === "thing"
+    && !always.has(each.text.replace(IN_VIEW, ""))).reverse();
+  const all = throughout.map((label) => pair(link(`${label} in view`, () => choose(label)), "all the time"));
+  const rows = [...all, ...eventRows(some, point)];
+  const left = (counts.sightings || 0) - some.length;
+  if (!rows.length && !left) return [];
+  return [el("h3", {}, "Sightings"), ...listing(rows, 6),
+    ...(left > 0 ? [soft(`${counted(left, "shorter sighting")} are in the rows of the timeline.`)] : [])];
+}
+function showEvents(host, view, point, choose) {
   const shown = view.events.filter((each) => each.kind !== "thing").reverse();
-  const counts = Object.entries(view.counts || {})
+  const { counts: some = {}, throughout = [] } = view;
+  const seen = (some.sightings || 0) + throughout.length;
+  const counts = Object.entries({ ...some, ...(seen ? { sightings: seen } : {}) })
     .map(([kind, n]) => `${n} ${n === 1 ? ONE[kind] || kind : kind}`).join(", ");
   const isProblem = (each) => PROBLEMS.includes(each.kind);
   const [problems, others] = [shown.filter(isProblem), shown.filter((each) => !isProblem(each))];
@@ -114,7 +129,8 @@ function showEvents(host, view, point) {
     ...(problems.length ? [el("h3", {}, "Problems"), ...listing(bundled(problems, point))] : []),
     ...(problems.length && others.length ? [el("h3", {}, "All else")] : []),
     ...listing(eventRows(others, point), problems.length ? 4 : 8),
-    ...(shown.length ? [] : [soft(view.isWhole ? "No events." : "Not known yet.")]),
+    ...sightingRows(view, point, choose),
+    ...(shown.length || seen ? [] : [soft(view.isWhole ? "No events." : "Not known yet.")]),
     ...notesOf(view.notes));
 }
 /* Rows of events, the newest first; of a clock that was set often, one row for all. */

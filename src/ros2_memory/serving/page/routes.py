@@ -1,5 +1,7 @@
-"""The endpoints of the page: `/page/span`, `/page/moment` and `/page/topics`, GETs of JSON.
+"""The endpoints of the page: GETs that return JSON.
 
+`/page/span` is the first look, `/page/moment` a time or a tool, `/page/topics` and `/page/labels`
+list what a span has of them.
 They answer from the same queries as the tools, in the queue of the tools that may take long. With
 `recording=NAME` they answer from that recording alone, with `poses=TOPIC` the robot is where that
 topic has it. `/page/moment` also takes `tool=NAME` and its `arguments` as JSON; a tool that writes
@@ -23,6 +25,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
+from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
@@ -45,7 +48,6 @@ log = get_logger(__name__)
 
 SPAN_PATH: Final = "/page/span"
 MOMENT_PATH: Final = "/page/moment"
-TOPICS_PATH: Final = "/page/topics"
 
 _HEADERS: Final = {
     "cache-control": "no-store",
@@ -77,8 +79,13 @@ def page_routes(
             shown |= recordings.paths(part, call, window)
         return shown
 
-    def topics(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        return topics_shown(chosen(given, memory), call, topics_window(given))
+    def inside(
+        work: Callable[[Memory, Call, TimeWindow], JsonObject],
+        given: QueryParams,
+        memory: Memory,
+        call: Call,
+    ) -> JsonObject:
+        return work(chosen(given, memory), call, window_asked(given))
 
     def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
         return moment_shown(chosen(given, memory), call, moment_request(given))
@@ -101,7 +108,11 @@ def page_routes(
 
         return Route(path, answer, methods=["GET"])
 
-    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment), route(TOPICS_PATH, topics)]
+    apart = [
+        route("/page/topics", partial(inside, topics_shown)),
+        route("/page/labels", partial(inside, labels_shown)),
+    ]
+    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment), *apart]
 
 
 def _chosen(recordings: Recordings, given: QueryParams, memory: Memory) -> Memory:
@@ -183,8 +194,8 @@ def moment_request(given: QueryParams) -> MomentRequest:
     )
 
 
-def topics_window(given: QueryParams) -> TimeWindow:
-    """Returns the span of a query string of `/page/topics`.
+def window_asked(given: QueryParams) -> TimeWindow:
+    """Returns the span that a query string names.
 
     Raises:
         InvalidArgumentsError: a number is missing or invalid, or the span has no length.

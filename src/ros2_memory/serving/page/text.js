@@ -96,6 +96,13 @@ function sharp(canvas) {
   return { context, width, height };
 }
 
+/* As much of a text as fits into a width. */
+function fitting(c, text, wide) {
+  if (c.measureText(text).width <= wide) return text;
+  let some = text.slice(0, 40);
+  while (some && c.measureText(`${some}\u2026`).width > wide) some = some.slice(0, -1);
+  return `${some}\u2026`;
+}
 /* Draws at most once for each frame. */
 function eachFrame(draw) {
   let waiting = 0;

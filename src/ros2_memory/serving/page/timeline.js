@@ -1,18 +1,41 @@
-/* The timeline: what was recorded, standstills, things in view, events and kept moments. */
+/* The timeline: what was recorded, standstills, a row for each label in view, events, kept moments. */
 
-const GUTTER = 58;  // left of the plots, too: names of lanes, and numbers of axes
+const GUTTER = 76;  // left of the plots, too: names of lanes, and numbers of axes
 const EDGE = 10;
 const OVERVIEW = 14;
 const LANE = 22;
+const LABEL_LANE = 16;
+const BELOW = 38;  // times and dates
+const MOST_LABELS = 10;
 const SHORTEST_S = 1;
-const LANES = ["recorded", "stood", "seen", "events", "kept"];
 const SPANS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
   86400, 172800, 604800, 1209600, 2592000];
 const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn",
   silence: "warn", drop: "warn", flip: "accent", goal: "good" };
 
+const IN_VIEW = / in view$/;
+
+/* The labels that were in view, those seen longest first, each with the times: as they were counted,
+   and by the events that came since. */
+function labelsOf(view) {
+  const { labels, until } = view.seen || { labels: [], until: -Infinity };
+  const bars = new Map(labels.map((each) => [each.label, each.bars.map(([t, end]) => ({ t, end }))]));
+  for (const each of view.events) {
+    if (each.kind !== "thing" || (each.end ?? each.t) <= until) continue;
+    const label = each.text.replace(IN_VIEW, "");
+    if (!bars.has(label)) bars.set(label, []);
+    bars.get(label).push(each);
+  }
+  const rows = [...bars].map(([label, its]) => ({ label, bars: its.map((each) => (
+    { kind: "thing", t: each.t, end: each.end ?? each.t, text: `${label} in view` })) }));
+  if (labels.length) return rows;
+  const length = ({ bars: its }) => its.reduce((sum, each) => sum + each.end - each.t, 0);
+  return rows.sort((one, other) => length(other) - length(one));
+}
+
 class Timeline {
-  /* `told` has span(start, end, isDone), time(t, isChosen), stretch({t, end, text}). */
+  /* `told` has span(start, end, isDone), time(t, isChosen), stretch({t, end, text}), label(label),
+     labels(number). */
   constructor(canvas, told) {
     this.canvas = canvas;
     this.told = told;
@@ -21,6 +44,8 @@ class Timeline {
     this.span = null;
     this.t = null;
     this.stretch = null;
+    this.lanes = [];
+    this.hasAll = false;  // rows of all labels, not only of the first
     pointers(canvas, {
       hover: (x, y, event) => this.hover(x, y, event),
       leave: () => told.time(null, false),
@@ -37,18 +62,33 @@ class Timeline {
     this.view = view;
     this.span = span;
     this.lanes = this.sorted(view);
+    this.bottom = this.lanes.at(-1).top + LANE;
+    this.canvas.style.height = `${this.bottom + BELOW}px`;
     this.describe();
     this.draw();
   }
-  /* The bars and marks of each lane. */
+  /* The lanes from top to bottom, each with its bars or marks. */
   sorted(view) {
     const of = (...kinds) => view.events.filter((each) => kinds.includes(each.kind));
-    const silent = of("silence");
-    return { recorded: silent, stood: of("stop"), seen: of("thing"),
-      events: of("error", "failed goal", "goal", "flip", "drop", "clock step"),
-      kept: view.moments.map((each) => ({ kind: "kept", t: each.start, end: each.end,
-        text: `kept: ${each.label}` })) };
+    const labels = labelsOf(view);
+    this.told.labels(labels.length);
+    const seen = (this.hasAll ? labels : labels.slice(0, MOST_LABELS))
+      .map(({ label, bars }) => ({ name: label, kind: "seen", label, bars }));
+    const lanes = [{ name: "recorded", kind: "recorded", bars: of("silence") },
+      { name: "stood", kind: "stood", bars: of("stop") }, ...seen,
+      { name: "events", kind: "events",
+        bars: of("error", "failed goal", "goal", "flip", "drop", "clock step") },
+      { name: "kept", kind: "kept", bars: view.moments.map((each) => ({ kind: "kept", t: each.start,
+        end: each.end, text: `kept: ${each.label}` })) }];
+    let top = OVERVIEW + 6;
+    for (const lane of lanes) {
+      lane.top = top;
+      lane.high = lane.label === undefined ? LANE : LABEL_LANE;
+      top += lane.high;
+    }
+    return lanes;
   }
+  laneAt(y) { return this.lanes.find(({ top, high }) => y >= top && y < top + high); }
   describe() {
     const { span, canvas } = this;
     const t = this.t === null ? span.end : this.t;
@@ -131,11 +171,11 @@ class Timeline {
 
   /* The bar or mark under a point. */
   found(x, y) {
-    const lane = LANES[Math.floor((y - OVERVIEW - 6) / LANE)];
+    const lane = this.laneAt(y);
     if (!lane || x < GUTTER) return null;
     let best = null;
     let least = 6;
-    for (const each of this.lanes[lane]) {
+    for (const each of lane.bars) {
       const left = this.x(each.t);
       const right = Math.max(this.x(each.end === undefined ? each.t : each.end), left);
       const away = Math.max(left - x, x - right, 0);
@@ -145,7 +185,11 @@ class Timeline {
     return best;
   }
   hover(x, y, event) {
-    if (!this.view || x < GUTTER || y < OVERVIEW) return;
+    if (!this.view || y < OVERVIEW) return;
+    if (x < GUTTER) {
+      tip(this.laneAt(y)?.label ?? "", event);
+      return;
+    }
     const t = this.timeAt(x);
     const found = this.found(x, y);
     const lasted = found && found.end !== undefined && found.end > found.t
@@ -154,7 +198,12 @@ class Timeline {
     this.told.time(t, false);
   }
   click(x, y) {
-    if (!this.view || x < GUTTER) return;
+    if (!this.view) return;
+    if (x < GUTTER) {
+      const { label } = this.laneAt(y) || {};
+      if (label !== undefined) this.told.label(label);
+      return;
+    }
     if (y < OVERVIEW + 4) {
       const { earliest, latest } = this.view.range;
       const middle = earliest + (x - GUTTER) / this.wide * (latest - earliest);
@@ -172,20 +221,20 @@ class Timeline {
     if (!this.view || !this.span || !width) return;
     c.font = "11px system-ui, sans-serif";
     this.drawOverview(c);
-    const bottom = OVERVIEW + 6 + LANES.length * LANE;
+    const { bottom } = this;
     this.drawTicks(c, bottom, height);
     c.save();
     c.beginPath();
     c.rect(GUTTER, 0, this.wide, height);
     c.clip();
     this.drawRecorded(c, OVERVIEW + 6);
-    for (const [n, lane] of LANES.entries()) {
-      if (n) this.drawLane(c, lane, OVERVIEW + 6 + n * LANE);
-    }
+    for (const lane of this.lanes.slice(1)) this.drawLane(c, lane);
     this.drawChosen(c, bottom);
     c.restore();
     c.fillStyle = colour("soft");
-    for (const [n, lane] of LANES.entries()) c.fillText(lane, 0, OVERVIEW + 6 + n * LANE + 14);
+    for (const { name, top, high } of this.lanes) {
+      c.fillText(fitting(c, plain(name), GUTTER - 6), 0, top + high / 2 + 4);
+    }
   }
   /* The whole memory, and which part of it is shown. */
   drawOverview(c) {
@@ -246,37 +295,27 @@ class Timeline {
       c.fillRect(this.x(start), top + LANE - 7, wide, 3);
     }
     c.fillStyle = colour("warn");
-    for (const each of this.lanes.recorded) {
+    for (const each of this.lanes[0].bars) {
       const left = this.x(each.t);
       c.fillRect(left, top + 4, Math.max(this.x(each.end || this.span.end) - left, 2), 4);
     }
   }
-  drawLane(c, lane, top) {
-    const middle = top + LANE / 2;
+  drawLane(c, { kind, bars, top, high }) {
+    const middle = top + high / 2;
     c.fillStyle = colour("grid");
     c.fillRect(GUTTER, middle - 0.5, this.wide, 1);
-    const isSeen = lane === "seen";
-    const { counts = {} } = this.view;
-    if (isSeen && !this.lanes.seen.length && counts.sightings) {
-      c.fillStyle = colour("soft");
-      c.fillText(`${counts.sightings} sightings: zoom in to see when`, GUTTER + 6, middle + 4);
-    }
-    for (const each of this.lanes[lane]) {
+    for (const each of bars) {
       const left = this.x(each.t);
       const wide = Math.max(this.x(each.end === undefined ? each.t : each.end) - left, 0);
-      const isMark = lane === "events";
-      c.fillStyle = colour(isMark ? COLOURS[each.kind] || "accent" : lane);
+      const isMark = kind === "events";
+      c.fillStyle = colour(isMark ? COLOURS[each.kind] || "accent" : kind);
       if (isMark && wide > 2 && each.kind !== "flip") {
         c.globalAlpha = 0.5;
         c.fillRect(left, middle - 1, wide, 2);
         c.globalAlpha = 1;
       }
-      if (isMark) c.fillRect(left - 1.5, top + 3, 3, LANE - 6);
-      else {
-        c.globalAlpha = isSeen ? 0.45 : 1;
-        c.fillRect(left, middle - 5, Math.max(wide, 2), 10);
-        c.globalAlpha = 1;
-      }
+      if (isMark) c.fillRect(left - 1.5, top + 3, 3, high - 6);
+      else c.fillRect(left, middle - 5, Math.max(wide, 2), 10);
     }
   }
   drawChosen(c, bottom) {
