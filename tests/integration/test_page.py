@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -100,8 +101,9 @@ def show(browser: Browser, served: Served, address: str = "") -> None:
 def test_a_first_look_is_four_requests(page: Browser) -> None:
     requests = page.run(REQUESTS)
     assert requests[:3] == ["/page/page.css", "/page/page.js", "/page/span"]
-    # Besides the page itself; the topics, and what is new, are asked for later.
-    assert set(requests[3:]) <= {"/page/span", "/page/topics", "/page/labels"}
+    # Besides the page itself; lists, the path in detail, and what is new are asked for later.
+    later = {"/page/topics", "/page/labels", "/page/path"}
+    assert set(requests[3:]) <= {"/page/span"} | later
 
 
 def test_it_shows_the_memory_at_a_glance(page: Browser) -> None:
@@ -355,8 +357,8 @@ def test_where_no_pose_is_recorded_the_reason_stands_in_place_of_a_map(page: Bro
     """No empty grid, and nothing is claimed of what was in view where nothing sees."""
     page.run(
         "state.view = { ...state.view, path: null, robot: null, places: [], things: [], events: [],"
-        " counts: {}, no_path: 'poses are on /pose: set data.pose_topic=/pose' };"
-        "map.show(state.view); showKey(); showLatest();"
+        " throughout: [], counts: {}, no_path: 'poses are on /pose: set data.pose_topic=/pose' };"
+        "state.placing = { places_robot: [] }; map.show(state.view); showKey(); showLatest();"
     )
     assert page.text("#map-key") == "No path: poses are on /pose: set data.pose_topic=/pose."
     assert page.run("return document.getElementById('map').checkVisibility()") is False
@@ -700,6 +702,50 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
         )
         chromium.awaits(READY)
         assert chromium.run("return Math.max(...state.view.path.x)") == 120
+    assert chromium.complaints() == []
+
+
+OFF_PATH = """
+  const [poses] = arguments;
+  const shape = map.exactly(map.paths[0]);
+  const inside = poses.map(([x, y]) => [map.px(x), map.py(y)]).filter(([x, y]) =>
+    x > 0 && y > 0 && x < map.canvas.clientWidth && y < map.canvas.clientHeight);
+  const away = ([x, y]) => Math.min(...shape.t.slice(1).map((_, n) => {
+    if (shape.starts.has(n + 1)) return Infinity;
+    const [ax, ay] = [map.px(shape.x[n]), map.py(shape.y[n])];
+    const [dx, dy] = [map.px(shape.x[n + 1]) - ax, map.py(shape.y[n + 1]) - ay];
+    const share = clamp(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0, 1);
+    return Math.hypot(ax + dx * share - x, ay + dy * share - y);
+  }));
+  map.place(arguments[1]);
+  const arrow = [map.px(map.moment.x), map.py(map.moment.y)];
+  return [inside.length, Math.max(...inside.map(away)), away(arrow)];
+"""
+
+
+def test_at_every_zoom_the_path_is_drawn_as_driven_and_the_arrow_lies_on_it(
+    chromium: Browser, scratch: Path
+) -> None:
+    """Circles of 1 m; the first look has a track, of which a pose may be 5 cm off."""
+    angles = [n * 0.02 for n in range(1200)]
+    poses = [(math.sin(each), 1 - math.cos(each)) for each in angles]
+    messages = [odom(T0 + n * NS_PER_S // 20, x, y) for n, (x, y) in enumerate(poses)]
+    write_mcap(scratch / "circles" / "rec" / "rec_0.mcap", messages)
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    chromium.looks(width=1200, height=900)
+    chromium.open("about:blank")
+    chromium.complaints()
+    with serving(scratch / "circles", scratch / "log_circles", *given) as server:
+        show(chromium, server)
+        for factor in (1, 6, 6, 3):
+            chromium.run("map.zoom(arguments[0], map.px(1), map.py(1))", factor)
+            chromium.run("map.pan(map.canvas.clientWidth / 2 - map.px(1), 0)")
+            chromium.awaits("return map.exactly(map.paths[0]) !== null")
+            at_s = T0_S + math.pi / 2 / 0.4 + 0.02  # it passes x 1, y 1
+            inside, off_px, arrow_px = chromium.run(OFF_PATH, poses, at_s)
+            assert inside >= 5
+            assert off_px <= 2
+            assert arrow_px <= 2
     assert chromium.complaints() == []
 
 

@@ -90,7 +90,7 @@ async def test_it_is_shown_without_the_token_which_it_asks_for(host: str) -> Non
             assert (await http.get(path)).status_code == 200
         assert (await http.post("/")).status_code == 401
         assert (await http.post("/mcp")).status_code == 401
-        for path in ("/page/span", "/page/moment", "/page/topics", "/page/labels"):
+        for path in ("/page/span", "/page/moment", "/page/topics", "/page/path"):
             assert (await http.get(path)).status_code == 401
             assert (await http.get(path, headers=SHOWN)).status_code != 401
 
@@ -110,7 +110,7 @@ async def test_another_site_may_link_to_the_page_alone() -> None:
     visit["sec-fetch-dest"] = "document"
     async with client(app()) as http:
         assert (await http.get("/", headers=visit)).status_code == 200
-        for path in ("/page/page.js", "/page/span", "/page/moment", "/page/topics", "/page/labels"):
+        for path in ("/page/page.js", "/page/span", "/page/moment", "/page/topics", "/page/path"):
             assert (await http.get(path, headers=visit)).status_code == 403
 
 

@@ -33,11 +33,13 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.serving.page import span
+from ros2_memory.serving.page import drawn_path, span
+from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
+    box_asked,
     moment_request,
     page_routes,
     span_request,
@@ -650,3 +652,80 @@ def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: 
     assert "sightings" not in shown(memory, f"start={BEGIN_S + 11}&end={BEGIN_S + 19}")["counts"]
     assert labels(11, 19)["cup"]["sightings"] == 1
     assert labels(0, 5) == {}
+
+
+def off_line(path: dict[str, Any], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each point is from the nearest line that is drawn."""
+    x, y = np.array(path["x"]), np.array(path["y"])
+    to = np.setdiff1d(np.arange(1, len(x)), path["begins"])
+    ax, ay, dx, dy = x[to - 1], y[to - 1], x[to] - x[to - 1], y[to] - y[to - 1]
+    share = (points[:, :1] - ax) * dx + (points[:, 1:] - ay) * dy
+    share = (share / np.maximum(dx * dx + dy * dy, 1e-12)).clip(0, 1)
+    away = np.hypot(points[:, :1] - ax - dx * share, points[:, 1:] - ay - dy * share)
+    nearest: NDArray[np.float64] = away.min(axis=1)
+    return nearest
+
+
+def circles(folder: Path, laps: int) -> tuple[Memory, NDArray[np.float64]]:
+    """It drives circles of 1 m, 20 poses a second, 5 cm from one to the next."""
+    angles = np.arange(126 * laps) * 0.05
+    poses = np.stack([np.sin(angles), 1 - np.cos(angles)], axis=1)
+    messages = [odom(BEGIN + n * S // 20, x, y) for n, (x, y) in enumerate(poses.tolist())]
+    write_mcap(folder / "bag.mcap", messages)
+    return memory_of(folder), poses
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        Box(-2, -2, 2, 3, 0.01),
+        Box(-0.2, -0.1, 0.2, 0.2, 0.001),
+        Box(0.99, 0.9, 1.01, 1.1, 0.0002),
+        Box(-9, -9, 9, 9, 0.1),
+        Box(5, 5, 6, 6, 0.001),
+    ],
+)
+def test_no_pose_in_a_box_is_a_pixel_off_the_path_that_is_drawn(tmp_path: Path, box: Box) -> None:
+    memory, poses = circles(tmp_path, laps=3)
+    window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
+    found: Any = path_in_box(memory, Call(), window, box)
+    assert found["exact"]
+    assert found["t"] == sorted(found["t"])
+    inside = (poses >= [box.x0, box.y0]) & (poses <= [box.x1, box.y1])
+    inside = poses[inside.all(axis=1)]
+    assert (
+        off_line(found, inside).max(initial=0) <= box.pixel_m + 1e-4
+        if len(inside)
+        else (found["t"] == [])
+    )
+
+
+def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(drawn_path, "MOST_POINTS", 400)
+    memory, poses = circles(tmp_path, laps=8)
+    window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
+    found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
+    assert 100 < len(found["x"]) <= 400
+    assert off_line(found, poses).max() <= 0.004
+
+
+def test_where_time_runs_out_the_track_takes_the_place_of_older_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(*_: object) -> None:
+        raise QueryTimeoutError("it takes too long")
+
+    memory, poses = circles(tmp_path, laps=1)
+    monkeypatch.setattr("ros2_memory.places.robot_tracks.RobotTracks.poses", slow)
+    window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
+    found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.001))
+    assert not found["exact"]
+    assert off_line(found, poses).max() <= 0.06
+
+
+@pytest.mark.parametrize("query", ["", "x0=0&y0=0&x1=1&y1=1", "x0=0&y0=0&x1=1&y1=1&pixel=-1"])
+def test_a_box_without_its_corners_or_a_pixel_is_refused(query: str) -> None:
+    with pytest.raises(InvalidArgumentsError, match="give x0"):
+        box_asked(QueryParams(query))

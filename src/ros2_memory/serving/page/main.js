@@ -3,6 +3,7 @@
 const POLL_MS = 2000;
 const FILLING_MS = 4000;
 const REST_MS = 200;
+const CLOSER_MS = 120;
 const OVERLAP_S = 15;  // of the newest events, some go on
 const STATUS_MS = 60000;
 const LIVE_S = 600;  // a bag may be readable only when it is closed
@@ -25,12 +26,13 @@ let isWholeOwed = false;
 let statusAt = 0;
 let pause = FILLING_MS;
 let lookedAt = 0;
+const closest = new Map();  // by path: what was asked of it last
 let lookLater = 0;
 let restLater = 0;
 let turn = 0;  // of questions about a moment
 
 const map = new RobotMap(at("map"), { time: pointed, thing: (each) => chooseThing(each),
-  stretch: chooseStretch });
+  stretch: chooseStretch, closer });
 const line = new Timeline(at("timeline"), { span: spanned, time: pointed, stretch: chooseStretch,
   label: (each) => chooseLabel(each), labels: offerLabels });
 const plots = new Plots(at("plots"), { time: pointed, changed: () => remember() });
@@ -121,6 +123,9 @@ async function look(isMore = false, isPatient = false) {
     if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
     state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
     Object.assign(state.view, { recording, poses });
+    // Of another span, or of more of it, the path is looked up anew; what came since goes on from it.
+    const { start, path } = state.view;
+    state.view.of = isMore ? view.of : [recording, poses, start, path && path.whole].join();
     show(reply, isMore);
     if (state.view.range.earliest === null) return;
     if (reply.status) lookAtTopics();
@@ -175,6 +180,26 @@ async function lookAtLabels() {
   } catch (error) {
     if (error instanceof Locked) lock(error);  // else the rows are by the events alone
   }
+}
+/* The path as it was driven where the map shows it, once the map rests. */
+function closer(path, box) {
+  const { span, view } = state;
+  const given = { ...chosenPart(), ...(path.name ? { recording: path.name } : {}), ...box,
+    start: span.start.toFixed(3), end: Math.max(span.end, view.end).toFixed(3) };
+  const asking = `${new URLSearchParams(given)} ${view.of}`;
+  const before = closest.get(path.name) || {};
+  if (before.asking === asking) return;
+  clearTimeout(before.timer);
+  const mine = { asking };
+  closest.set(path.name, mine);
+  mine.timer = setTimeout(async () => {
+    try {
+      const reply = await asked("/page/path", given);
+      if (closest.get(path.name) === mine) map.enlarge(path, box, reply);
+    } catch (error) {
+      if (error instanceof Locked) lock(error);  // else the path stays as the first look has it
+    }
+  }, CLOSER_MS);
 }
 function offerLabels(number) {
   at("all-labels").hidden = number <= MOST_LABELS;

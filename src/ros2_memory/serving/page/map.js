@@ -1,6 +1,9 @@
 /* The map: the path, things, standstills, places, the robot now and at the time pointed at. */
 
 const NEAR_PX = 14;
+const BESIDE = 0.25;  // of the canvas, to each side, for which the exact path is asked, too
+const LARGER = 1.5;  // so much larger than asked for it is drawn until it is asked for anew
+const NEWER_S = 30;
 const UNSEEN_S = 10;  // the robot may have moved since an older pose
 
 /* The number of the last time that is not after `t`; -1 before the first. */
@@ -23,17 +26,20 @@ const ofPath = (n) => (n ? `path-${n + 1}` : "path");
 const apart = (view) => Boolean(view.paths && view.paths.length);
 
 class RobotMap {
-  /* `told` has time(t, isChosen), thing(thing), stretch(event). */
+  /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(path, box): the path is to be
+     drawn more exactly. */
   constructor(canvas, told) {
     this.canvas = canvas;
     this.told = told;
     this.draw = eachFrame(() => this.drawn());
     this.view = null;
+    this.exact = new Map();  // by name: the path as it was driven in a part of the map
     this.fits = true;
     this.centre = { x: 0, y: 0 };
     this.scale = 40;
     this.paths = [];
     this.isApart = false;
+    this.t = null;
     this.moment = null;
     this.moments = [];
     this.chosen = null;
@@ -55,7 +61,10 @@ class RobotMap {
     // Of several robots each has a path of its own.
     this.isApart = apart(view);
     this.paths = this.isApart ? view.paths.filter((each) => each.t) : path ? [path] : [];
-    for (const each of this.paths) each.starts = new Set(each.begins);
+    for (const each of this.paths) {
+      each.starts = new Set(each.begins);
+      each.of = view.of;
+    }
     this.things = view.things.filter((each) => path && each.frame === path.frame);
     this.stops = view.events.filter((each) => each.kind === "stop" && each.x !== undefined);
     const driven = this.isApart ? `paths of ${this.paths.map((each) => plain(each.name)).join(", ")}`
@@ -65,8 +74,50 @@ class RobotMap {
     this.draw();
   }
 
-  /* Where the robot was at a time: between two poses, or at one shortly before. */
+  /* What is in sight, and a little more: its corners, and how long a pixel is (m). */
+  box() {
+    const [wide, high] = [this.canvas.clientWidth * BESIDE, this.canvas.clientHeight * BESIDE];
+    const low = this.world(-wide, this.canvas.clientHeight + high);
+    const to = this.world(this.canvas.clientWidth + wide, -high);
+    return { x0: low.x, y0: low.y, x1: to.x, y1: to.y, pixel: 1 / this.scale };
+  }
+  /* The path as it was driven, if it is known for all that is in sight; else null. */
+  exactly(path) {
+    const found = this.exact.get(path.name || "");
+    if (!found || found.frame !== path.frame || found.of !== path.of) return null;
+    const [low, to] = [this.world(0, this.canvas.clientHeight), this.world(this.canvas.clientWidth, 0)];
+    const { box } = found;
+    const isIn = box.x0 <= low.x && box.y0 <= low.y && box.x1 >= to.x && box.y1 >= to.y;
+    return isIn && box.pixel * this.scale <= LARGER ? found : null;
+  }
+  /* What a path is drawn by. */
+  shapeOf(path) { return this.exactly(path) || path; }
+  enlarge(path, box, reply) {
+    this.exact.set(path.name || "", { ...reply, box, of: path.of, name: path.name, starts: new Set(reply.begins) });
+    if (this.t !== null) this.place(this.t);
+    this.draw();
+  }
+  /* Asks for what is drawn too coarsely. */
+  getCloser() {
+    const box = this.box();
+    for (const path of this.paths) {
+      const found = this.exactly(path);
+      if (path.t.length > 1 && (!found || path.t.at(-1) - found.until > NEWER_S)) this.told.closer(path, box);
+    }
+  }
+
+  /* Where the robot was at a time: between two poses, or at one shortly before; on what is drawn. */
   at(t, path = this.isApart ? null : this.paths[0]) {
+    const on = this.between(t, path);
+    const shape = on && this.exactly(path);
+    if (!shape) return on;
+    const n = lastBefore(shape.t, t);
+    if (n < 0 || n + 1 >= shape.t.length || shape.starts.has(n + 1)) return on;
+    const share = (t - shape.t[n]) / (shape.t[n + 1] - shape.t[n] || 1);
+    return { yaw: on.yaw, x: shape.x[n] + (shape.x[n + 1] - shape.x[n]) * share,
+      y: shape.y[n] + (shape.y[n + 1] - shape.y[n]) * share, isExact: true };
+  }
+  between(t, path) {
     if (!path) return null;
     const n = lastBefore(path.t, t);
     if (n < 0) return null;
@@ -83,6 +134,7 @@ class RobotMap {
 
   /* Puts the robot where it was at a time; null: where it is now. */
   place(t) {
+    this.t = t;
     this.moment = t === null ? null : this.at(t);
     this.moments = t === null || !this.isApart ? [] : this.paths.map((each) => this.at(t, each));
     this.draw();
@@ -90,7 +142,8 @@ class RobotMap {
   /* Puts it where an answer has it: between points of a long path it is not known. */
   correct(answer) {
     const [path] = this.paths;
-    if (!answer.robot || this.isApart || !path || !path.cells || answer.frame !== path.frame) return;
+    if (!answer.robot || this.isApart || !path || !path.cells || answer.frame !== path.frame
+      || (this.moment && this.moment.isExact)) return;
     this.moment = { x: answer.robot.x, y: answer.robot.y, yaw: answer.robot.yaw_deg };
     this.draw();
   }
@@ -149,7 +202,7 @@ class RobotMap {
   timeNear(x, y) {
     let best = { t: null };
     let least = NEAR_PX;
-    for (const path of this.paths) for (let n = 0; n < path.t.length; n++) {
+    for (const path of this.paths.map((each) => this.shapeOf(each))) for (let n = 0; n < path.t.length; n++) {
       const last = n + 1 === path.t.length || path.starts.has(n + 1) || path.cells;
       const to = last ? n : n + 1;
       const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
@@ -217,6 +270,7 @@ class RobotMap {
     const { context: c, width, height } = sharp(this.canvas);
     if (!this.view || !width) return;
     if (this.fits) this.fitted(width, height);
+    this.getCloser();
     c.font = "12px system-ui, sans-serif";
     c.lineJoin = "round";
     this.drawGrid(c, width, height);
@@ -352,15 +406,20 @@ class RobotMap {
       c.strokeStyle = colour(ofPath(index));
       c.lineWidth = 2;
       c.beginPath();
-      this.drawCells(c, path.cells, colour(ofPath(index)));
-      const first = path.cells ? lastBefore(path.t, path.cells.until) : 0;
-      for (let n = first; n < path.t.length; n++) {
-        const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
-        if (path.starts.has(n) || n === first) c.moveTo(x, y);
-        else c.lineTo(x, y);
-      }
+      const exact = this.exactly(path);
+      if (exact) this.trace(c, exact, 0);
+      else this.drawCells(c, path.cells, colour(ofPath(index)));
+      const until = exact ? exact.until : path.cells ? path.cells.until : null;
+      this.trace(c, path, until === null ? 0 : Math.max(lastBefore(path.t, until), 0));
       c.stroke();
     });
+  }
+  trace(c, path, first) {
+    for (let n = first; n < path.t.length; n++) {
+      const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
+      if (path.starts.has(n) || n === first) c.moveTo(x, y);
+      else c.lineTo(x, y);
+    }
   }
   /* Of a long time, where the path was: lines between some of its points would cut corners. */
   drawCells(c, cells, fill) {

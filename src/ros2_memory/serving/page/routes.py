@@ -1,7 +1,7 @@
 """The endpoints of the page: GETs that return JSON.
 
 `/page/span` is the first look, `/page/moment` a time or a tool, `/page/topics` and `/page/labels`
-list what a span has of them.
+list what a span has of them, and `/page/path` is the path in a part of the map.
 They answer from the same queries as the tools, in the queue of the tools that may take long. With
 `recording=NAME` they answer from that recording alone, with `poses=TOPIC` the robot is where that
 topic has it. `/page/moment` also takes `tool=NAME` and its `arguments` as JSON; a tool that writes
@@ -14,7 +14,7 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 from starlette.responses import Response
 from starlette.routing import Route
@@ -25,6 +25,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
+from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.serving.dispatch import Dispatcher
 
+    _Work: TypeAlias = Callable[[QueryParams, Memory, Call], JsonObject]
+
 log = get_logger(__name__)
 
 SPAN_PATH: Final = "/page/span"
@@ -56,6 +59,8 @@ _HEADERS: Final = {
 }
 _WEEK_S: Final = 7 * 86_400.0
 _MOST_TRIES: Final = 5
+_LEAST_PIXEL_M: Final = 1e-4
+"""Positions are stored as finely."""
 _LONGEST_LABEL: Final = 200
 _LONGEST_NAME: Final = 1000
 _LONGEST_ARGUMENTS: Final = 10_000
@@ -66,7 +71,6 @@ def page_routes(
 ) -> list[Route]:
     """Returns the routes of the page; `progress`: how far the store of columns is filled."""
     recordings = Recordings()
-
     chosen = partial(_chosen, recordings)
 
     def span(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
@@ -79,18 +83,10 @@ def page_routes(
             shown |= recordings.paths(part, call, window)
         return shown
 
-    def inside(
-        work: Callable[[Memory, Call, TimeWindow], JsonObject],
-        given: QueryParams,
-        memory: Memory,
-        call: Call,
-    ) -> JsonObject:
-        return work(chosen(given, memory), call, window_asked(given))
+    def of_part(work: _Work, given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+        return work(given, chosen(given, memory), call)
 
-    def moment(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        return moment_shown(chosen(given, memory), call, moment_request(given))
-
-    def route(path: str, work: Callable[[QueryParams, Memory, Call], JsonObject]) -> Route:
+    def route(path: str, work: _Work) -> Route:
         async def answer(request: Request) -> Response:
             client = request.client.host if request.client else None
             given = request.query_params
@@ -108,11 +104,16 @@ def page_routes(
 
         return Route(path, answer, methods=["GET"])
 
-    apart = [
-        route("/page/topics", partial(inside, topics_shown)),
-        route("/page/labels", partial(inside, labels_shown)),
-    ]
-    return [route(SPAN_PATH, span), route(MOMENT_PATH, moment), *apart]
+    parts: dict[str, _Work] = {
+        MOMENT_PATH: lambda given, part, call: moment_shown(part, call, moment_request(given)),
+        "/page/topics": lambda given, part, call: topics_shown(part, call, window_asked(given)),
+        "/page/labels": lambda given, part, call: labels_shown(part, call, window_asked(given)),
+        "/page/path": lambda given, part, call: path_in_box(
+            part, call, window_asked(given), box_asked(given)
+        ),
+    }
+    of_parts = [route(path, partial(of_part, work)) for path, work in parts.items()]
+    return [route(SPAN_PATH, span), *of_parts]
 
 
 def _chosen(recordings: Recordings, given: QueryParams, memory: Memory) -> Memory:
@@ -206,6 +207,20 @@ def window_asked(given: QueryParams) -> TimeWindow:
     return TimeWindow.from_unix(start_s, end_s)
 
 
+def box_asked(given: QueryParams) -> Box:
+    """Returns the part of the map that a query string names: `x0`, `y0`, `x1`, `y1` and `pixel`.
+
+    Raises:
+        InvalidArgumentsError: a number is missing or invalid, or a pixel has no size.
+    """
+    x0, y0, x1, y1, pixel_m = (
+        _number(given, name, " of metres") for name in ("x0", "y0", "x1", "y1", "pixel")
+    )
+    if x0 is None or y0 is None or x1 is None or y1 is None or pixel_m is None or pixel_m <= 0:
+        raise InvalidArgumentsError("give x0, y0, x1, y1 and pixel (above 0), in metres")
+    return Box(x0, y0, x1, y1, max(pixel_m, _LEAST_PIXEL_M))
+
+
 def tool_arguments(given: QueryParams) -> JsonObject:
     """Returns the arguments that a query string has for a tool.
 
@@ -231,7 +246,7 @@ def _short(given: QueryParams, name: str, longest: int) -> str:
     return text
 
 
-def _number(given: QueryParams, name: str) -> float | None:
+def _number(given: QueryParams, name: str, unit: str = " of seconds") -> float | None:
     text = given.get(name)
     if text is None:
         return None
@@ -240,5 +255,5 @@ def _number(given: QueryParams, name: str) -> float | None:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise InvalidArgumentsError(f"{name} must be a number of seconds, not {text[:40]!r}")
+        raise InvalidArgumentsError(f"{name} must be a number{unit}, not {text[:40]!r}")
     return number

@@ -1,0 +1,188 @@
+"""The path as it was driven, for the part of the map that is looked at.
+
+The first look has the robot's track, of which a pose may be 5 cm off, and of a long span some of
+its points. Here every pose in a box of the map counts: none lies farther from the lines than half
+a pixel of the screen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
+from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.core.geometry import simplified
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.history.view import View
+from ros2_memory.places.local_map import local_track
+from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.robot_tracks import RobotTracks
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.reply import JsonObject
+    from ros2_memory.history.context import Call, Memory
+
+MOST_POINTS: Final = 20_000
+_MOST_PIXELS: Final = 20_000_000
+"""A path that passes more, as where it jumps far, is not searched for what it repeats."""
+_QUICK_S: Final = 2.0
+_TOGETHER_NS: Final = 5 * NS_PER_S
+"""A robot that leaves the box for less is read on: reading begins anew for each stretch."""
+
+
+class Box(NamedTuple):
+    """A part of the map: corners, and how long (m) a pixel of the screen is there."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+    pixel_m: float
+
+
+class _Line(NamedTuple):
+    """Points of a path in order of time; `begins`: whether no line leads to a point."""
+
+    times: NDArray[np.int64]
+    x: NDArray[np.float64]
+    y: NDArray[np.float64]
+    begins: NDArray[np.bool_]
+
+
+def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> JsonObject:
+    """Returns the path in a window where it passes a box, and whether every pose there counted.
+
+    Raises:
+        NoDataError: no topic places the robot.
+        QueryTimeoutError: the call's time is over before its track is known.
+    """
+    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    places, tracks = robot_places(view, window), None
+    if places is not None:
+        tracks = RobotTracks(view, places.map_frame)
+        frame, track = places.map_frame, tracks.over(window).track
+    elif (found := local_track(view, view.pose_topic, window)) is not None:
+        frame, track = found
+    else:
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, "no topic places the robot")
+    track = cut(track, window)
+    stretches = [*stretches_inside(track, box)]
+    lines: list[_Line] = []
+    is_exact = tracks is None or box.pixel_m >= TOLERANCE_M
+    if tracks is not None and not is_exact:
+        lines = [*_every_pose(tracks, track, stretches)]
+        is_exact = len(lines) == len(stretches)
+    older = stretches[: len(stretches) - len(lines)]
+    line = _joined([*(_of_track(track, each) for each in older), *lines[::-1]])
+    line = _drawn(line, box.pixel_m)
+    return {
+        "frame": frame,
+        "exact": is_exact,
+        "until": unix_from_ns(int(track.times[-1])) if len(track.times) else None,
+        "t": np.round(line.times / NS_PER_S, 3).tolist(),
+        "x": np.round(line.x, 4).tolist(),
+        "y": np.round(line.y, 4).tolist(),
+        "begins": np.flatnonzero(line.begins).tolist(),
+    }
+
+
+def stretches_inside(track: RobotTrack, box: Box) -> Iterator[tuple[int, int]]:
+    """Yields the first and the last vertex of each stretch of a track that may pass a box."""
+    low_x, high_x = _bounds(track.x)
+    low_y, high_y = _bounds(track.y)
+    room = TOLERANCE_M + box.pixel_m
+    inside = (low_x <= box.x1 + room) & (high_x >= box.x0 - room) & ~track.begins[1:]
+    inside &= (low_y <= box.y1 + room) & (high_y >= box.y0 - room)
+    steps = np.flatnonzero(inside)
+    begins = track.times[steps[1:]] - track.times[steps[:-1] + 1] > _TOGETHER_NS
+    begins |= np.cumsum(track.begins)[steps[1:]] != np.cumsum(track.begins)[steps[:-1]]
+    for some in np.split(steps, np.flatnonzero(begins) + 1):
+        if len(some):
+            yield int(some[0]), int(some[-1]) + 1
+
+
+def _bounds(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.minimum(values[1:], values[:-1]), np.maximum(values[1:], values[:-1])
+
+
+def _every_pose(
+    tracks: RobotTracks, track: RobotTrack, stretches: Sequence[tuple[int, int]]
+) -> Iterator[_Line]:
+    """Yields a line through each pose of a stretch, the newest stretch first, while time lasts."""
+    for first, last in reversed(stretches):
+        start, stop = int(track.times[first]), int(track.times[last]) + 1
+        try:
+            poses = tracks.poses(TimeWindow(start, stop))
+        except QueryTimeoutError:
+            return
+        fine = np.isfinite(poses.x) & np.isfinite(poses.y)
+        times, at = np.unique(poses.times[fine], return_index=True)
+        begins = np.arange(len(times)) == 0
+        yield _Line(times, poses.x[fine][at], poses.y[fine][at], begins)
+
+
+def _of_track(track: RobotTrack, stretch: tuple[int, int]) -> _Line:
+    part = slice(stretch[0], stretch[1] + 1)
+    times = track.times[part]
+    return _Line(times, track.x[part], track.y[part], np.arange(len(times)) == 0)
+
+
+def _joined(lines: Sequence[_Line]) -> _Line:
+    if not lines:
+        return _Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
+    return _Line(*(np.concatenate(column) for column in zip(*lines, strict=True)))
+
+
+def _drawn(line: _Line, pixel_m: float) -> _Line:
+    """Returns a line without what lies within half a pixel of it, or was drawn already.
+
+    Of a path that takes too many points for that, it is as many pixels as it must be.
+    """
+    while True:
+        few = _without_repeats(_simple(line, pixel_m / 2), pixel_m)
+        if len(few.times) <= MOST_POINTS:
+            return few
+        pixel_m *= 2
+
+
+def _simple(line: _Line, tolerance_m: float) -> _Line:
+    count = len(line.times)
+    if count < 2:
+        return line
+    ends = np.append(line.begins[1:], [True])
+    points = np.stack([line.x, line.y, np.zeros(count)], axis=1)
+    clock = (line.times - line.times[0]) / NS_PER_S
+    must = np.flatnonzero(line.begins | ends)
+    kept, _ = simplified(points, clock, must, tolerance_m=tolerance_m, at_most=count)
+    return _Line(line.times[kept], line.x[kept], line.y[kept], line.begins[kept])
+
+
+def _without_repeats(line: _Line, pixel_m: float) -> _Line:
+    """Returns a line without the steps of which each pixel was drawn by others."""
+    if len(line.times) <= MOST_POINTS:
+        return line
+    dx, dy = np.diff(line.x), np.diff(line.y)
+    counts = np.ceil(np.hypot(dx, dy) / pixel_m).astype(np.int64).clip(1)
+    counts[line.begins[1:]] = 0
+    if counts.sum() > _MOST_PIXELS:
+        return line
+    part = np.repeat(np.arange(len(counts)), counts)
+    share = (np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)) / counts[part]
+    cells = np.stack([line.x[part] + dx[part] * share, line.y[part] + dy[part] * share]) // pixel_m
+    row, column = (cells - cells.min(axis=1, keepdims=True)).astype(np.int64)
+    _, first = np.unique(row * (int(column.max(initial=0)) + 1) + column, return_index=True)
+    drawn = np.zeros(len(counts), np.bool_)
+    drawn[part[first]] = True
+    kept = np.append(drawn, [False]) | np.append([False], drawn)
+    # A line leads to a point alone where that step is drawn.
+    begins = ~np.append([False], drawn)
+    return _Line(line.times[kept], line.x[kept], line.y[kept], begins[kept])
