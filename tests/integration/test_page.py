@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -409,7 +410,9 @@ def test_of_bags_that_nobody_records_it_shows_neither_a_recorder_nor_a_budget(od
 
 def test_it_says_that_ago_counts_from_the_newest_recorded_moment(odd: Browser) -> None:
     newest = odd.run("return dated(state.view.range.latest)")
-    assert f"recorded until {newest}, " in odd.text("#summary")
+    assert f"recorded until {newest} \u00b7 " in odd.text("#summary")
+    # The header counts from no other moment.
+    assert "ago" not in odd.text("#summary")
     assert odd.run("return document.getElementById('live').hidden")
     assert f"counts from the newest recorded moment, {newest}" in odd.text("#state")
 
@@ -464,9 +467,63 @@ def test_without_a_bag_directory_it_says_so(chromium: Browser, scratch: Path) ->
         assert "does not exist" in chromium.text("#state")
         assert "nothing is recorded" in chromium.text("#summary")
         assert chromium.run("return document.getElementById('memory').hidden")
+        # The folder and the next step.
+        assert chromium.text("#name") == "nowhere"
+        assert f"{scratch / 'nowhere'}." in chromium.text("#empty")
+        assert "ros2-memory serve FOLDER" in chromium.text("#empty")
         # It looks again by itself.
         drive(scratch / "nowhere", "one", time.time_ns() - 60 * NS_PER_S, 20)
         chromium.awaits("return !document.getElementById('memory').hidden")
+        assert chromium.run("return document.getElementById('empty').hidden")
+
+
+def test_of_recordings_of_several_years_the_header_has_their_length_and_times_have_the_year(
+    chromium: Browser, scratch: Path
+) -> None:
+    for n, name in enumerate(("one", "two", "three")):
+        drive(scratch / "years", name, T0 - n * 400 * 86_400 * NS_PER_S, 20)
+    given = ("storage=mcap", "recorder=none", "data.now=latest")
+    with serving(scratch / "years", scratch / "log_years", *given) as server:
+        show(chromium, server, "#last=all")
+        assert chromium.text("#name") == "years"
+        assert "60 s in 3 recordings over 2.2 years" in chromium.text("#summary")
+        assert "60 s in 3 recordings over 2.2 years" in chromium.text("#state")
+        years = chromium.run("return [state.span.start, state.span.end].map(yearOf)")
+        assert all(f", {year}, " in chromium.text("#span-text") for year in years)
+        times = chromium.run(
+            "return [...document.querySelectorAll('#events li > span:last-child')]"
+            ".map((each) => each.textContent)"
+        )
+        assert times
+        assert all(re.search(r", 20\d\d, ", each) for each in times)
+
+
+def test_nothing_green_stands_above_something_red(page: Browser) -> None:
+    """This history has a damaged file: its line comes first, and nothing is called sound."""
+    assert page.text("div#state").startswith("! Damaged bags")
+    assert page.run("return document.querySelectorAll('#state .good').length") == 0
+    sound = page.run(
+        "const { status, range } = state.view;"
+        "const none = { ...range, damaged: [], incomplete: [], unread: [], clock_faults: [] };"
+        "const fine = { ...status, doubts: SOUND, fell_silent: [], rules: [], never_heard: [],"
+        " missing: [] };"
+        "return [troublesOf(fine, none), troublesOf({ ...fine, never_heard: ['/scan'] }, none),"
+        " troublesOf(fine, range)].map((each) => each.length > 0)"
+    )
+    assert sound == [False, True, True]
+
+
+def test_ago_counts_from_one_moment_in_header_and_footer(page: Browser) -> None:
+    shown = page.run(
+        "const { range, status } = state.view; range.now = range.latest + 42;"
+        "state.view.status = { ...status, now: range.latest + 1, recorder_alive: true };"
+        "const silent = agoOf(range.latest, range.latest + 1); document.body.append(silent);"
+        "showSummary(); silent.remove();"
+        "return [silent.textContent, dated(range.now)];"
+    )
+    assert "newest data 42 s ago" in page.text("#summary")
+    assert shown[0] == "42 s ago"
+    assert shown[1] in page.text("#since")
 
 
 def test_what_was_recorded_is_shown_as_text_and_never_runs(page: Browser) -> None:
@@ -678,7 +735,8 @@ def test_of_several_recordings_one_is_looked_at_alone(chromium: Browser, scratch
         chromium.awaits("return state.view.isWhole")
         assert chromium.run("return Math.min(...state.view.path.x)") == 100
         assert chromium.run("return document.getElementById('mixed').hidden")
-        assert "only wren" in chromium.text("#summary")
+        assert "this recording alone" in chromium.text("#summary")
+        assert chromium.text("#name") == "wren"
         chromium.run("pointed(arguments[0], true)", T0_S + 2)
         chromium.awaits("return document.getElementById('moment').textContent.includes('It saw')")
         # What is asked about a moment is asked of this recording, which had not begun.

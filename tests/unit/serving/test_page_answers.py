@@ -691,13 +691,12 @@ def test_no_pose_in_a_box_is_a_pixel_off_the_path_that_is_drawn(tmp_path: Path, 
     found: Any = path_in_box(memory, Call(), window, box)
     assert found["exact"]
     assert found["t"] == sorted(found["t"])
-    inside = (poses >= [box.x0, box.y0]) & (poses <= [box.x1, box.y1])
-    inside = poses[inside.all(axis=1)]
-    assert (
-        off_line(found, inside).max(initial=0) <= box.pixel_m + 1e-4
-        if len(inside)
-        else (found["t"] == [])
-    )
+    is_in = (poses >= [box.x0, box.y0]) & (poses <= [box.x1, box.y1])
+    inside = poses[is_in.all(axis=1)]
+    if len(inside):
+        assert off_line(found, inside).max() <= box.pixel_m + 1e-4
+    else:
+        assert found["t"] == []
 
 
 def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(

@@ -82,6 +82,7 @@ function query() {
   } else given.set("last", state.last === "all" ? 1e10 : state.last);
   for (const each of plots.names) given.append("signal", each);
   for (const [name, value] of Object.entries(chosenPart())) given.set(name, value);
+  given.set("named", "1");
   return given;
 }
 
@@ -283,13 +284,15 @@ function show(reply, isMore) {
   const view = state.view;
   const { range, status } = view;
   latest = range.latest;
-  showState(at("state"), status, range);
+  hasYears = latest !== null && yearOf(range.earliest) !== yearOf(latest);
+  showName(view);
+  showState(at("state"), view);
   showSummary();
   showFilling(view.filling);
   showRecordings(view);
   at("questions-part").hidden = !view.questions;
   if (view.questions) showQuestions(at("questions"), view.questions);
-  at("memory").hidden = range.earliest === null;
+  at("memory").hidden = at("length-part").hidden = range.earliest === null;
   if (range.earliest === null) return;
   state.span = state.last === null ? state.span : { start: view.start, end: view.end };
   map.show(view);
@@ -306,27 +309,55 @@ function show(reply, isMore) {
   place(state.hovered === null ? state.t : state.hovered);
   remember();
 }
+/* Of what this is the memory; where nothing is recorded, where that is looked for, and what to do. */
+function showName({ memory, range, status }) {
+  const name = state.recording || memory.name || "The robot's memory";
+  at("name").replaceChildren(bdi(name));
+  document.title = `${plain(name)} \u00b7 ros2-memory`;
+  const isEmpty = range.earliest === null;
+  at("empty").hidden = !isEmpty;
+  if (!isEmpty) return;
+  at("empty-why").replaceChildren(el("p", {}, "It is looked for in ", el("code", {}, memory.folder), "."),
+    el("p", {}, status.budget.max_gb === null
+      ? "Copy bags there, or serve another folder: " : "Start the recorder of this robot: ",
+    el("code", {}, status.budget.max_gb === null ? "ros2-memory serve FOLDER" : "ros2-memory up"),
+    ". This page looks again by itself."));
+}
+/* "Ago" counts from the newest recorded moment where "now" is that. */
+const isHalted = ({ status }) => status.latest !== null && status.now === status.latest;
+const nowOf = (view) => (isHalted(view) ? view.status.now : view.range.now);
 /* How old the newest data is, also where "now" is when that was recorded; below 0: of a simulation. */
-function ageOf({ range, status }) {
-  const halted = status.latest !== null && status.now === status.latest;
-  return (halted ? Date.now() / 1000 : range.now) - range.latest;
+function ageOf(view) {
+  return (isHalted(view) ? Date.now() / 1000 : view.range.now) - view.range.latest;
+}
+/* How much is recorded, where that is far less than from the first to the last. */
+function recordedOf({ range, recordings = [], recordings_total: total = 0 }) {
+  const whole = range.latest - range.earliest;
+  const length = whole - range.gaps.reduce((sum, [start, end]) => sum + end - start, 0);
+  const number = total - recordings.filter((each) => each.holds).length;
+  if (length > whole / 2 || number < 2) return `${lasting(whole)} in ${counted(range.bags, "bag")}`;
+  return `${lasting(length)} in ${counted(number, "recording")} over ${lasting(whole)}`;
 }
 /* Whether new data comes, or may come within minutes. */
 function isLive(view) {
   return view.range.latest !== null && (view.status.recorder_alive || Math.abs(ageOf(view)) < LIVE_S);
 }
 function newestOf(view) {
-  const age = ageOf(view);
-  if (isLive(view)) return `newest data ${ago(age)}`;
-  return `recorded until ${dated(view.range.latest)}${age > LIVE_S ? `, ${ago(age)}` : ""}`;
+  const { latest: newest, now } = view.range;
+  if (isLive(view)) return `newest data ${isHalted(view) ? dated(newest) : ago(now - newest)}`;
+  return `recorded until ${dated(newest)}${isHalted(view) ? "" : `, ${ago(now - newest)}`}`;
 }
 function showSummary() {
   const { range, status } = state.view;
-  const sound = status.doubts === "no loss or fault was found";
-  const newest = range.latest === null ? "nothing is recorded" : newestOf(state.view);
-  const parts = [state.recording ? `only ${state.recording}` : recorderOf(status), newest].filter(Boolean);
-  at("summary").replaceChildren(plain(`${parts.join(" \u00b7 ")} \u00b7 `), sound
-    ? "no loss or fault was found" : el("span", { class: "warn" }, "! something is missing: see State"));
+  const sound = !troublesOf(status, range).length;
+  const isSparse = range.latest !== null && recordedOf(state.view).includes(" over ");
+  const parts = [state.recording ? "this recording alone" : recorderOf(status),
+    range.latest === null ? "nothing is recorded" : newestOf(state.view),
+    isSparse ? recordedOf(state.view) : ""].filter(Boolean);
+  at("summary").replaceChildren(plain(parts.join(" \u00b7 ")), ...(range.latest === null ? [] : [" \u00b7 ", sound
+    ? SOUND : el("span", { class: "warn" }, "! something is missing: see State")]));
+  countAgo(nowOf(state.view));
+  showSince(state.view);
   if (range.latest !== null && at("back").hidden && state.hovered === null) headOfNow();
 }
 function headOfNow() {

@@ -4,6 +4,7 @@ const ZONE = Intl.DateTimeFormat().resolvedOptions().timeZone;
 const ONE = { gaps: "gap", "clock steps": "clock step", silences: "silence", errors: "error",
   "failed goals": "failed goal", stops: "stop", "on/off changes": "on/off change", "speed drops": "speed drop",
   goals: "goal", sightings: "sighting" };
+const SOUND = "no loss or fault was found";
 const MISSED = "not_seen_where_expected";
 const PROBLEMS = ["error", "failed goal", "gap", "clock step", "silence"];
 const FEW = 2;  // of one kind of problem, of which more are bundled
@@ -88,12 +89,11 @@ function showNow(host, view, choose, point) {
 }
 
 function showThings(host, view, choose) {
-  const now = view.range.now;
-  const seen = (each) => (isLive(view) ? ago(now - each.last) : when(each.last));
+  const seen = (each) => (isLive(view) ? agoOf(each.last, nowOf(view)) : when(each.last));
   const rows = view.things.map((each) => pair(
     el("span", {}, link(each.label, () => choose(each)), each.in ? ` in ${plain(each.in)}` : "",
       each.state === MISSED ? el("span", { class: "warn" }, " not seen where expected") : ""),
-    `${metres(each)} \u00b7 ${seen(each)}`));
+    el("span", {}, `${metres(each)} \u00b7 `, seen(each))));
   host.replaceChildren(...(rows.length ? listing(rows, 10)
     : [soft(view.events.some((each) => each.kind === "thing")
       ? "What was seen has no place on the map. The timeline shows when it was in view."
@@ -161,19 +161,38 @@ function faults(title, kind, range) {
 const recorderOf = (status) => (status.recorder === null ? "" : status.recorder
   + (status.restarts ? `, ${counted(status.restarts, "restart")}` : ""));
 
-function showState(host, status, range) {
-  const sound = status.doubts === "no loss or fault was found";
+/* What is wrong, the worst first: lines for people. */
+function troublesOf(status, range, now = status.now) {
+  const warn = (...text) => el("p", { class: "warn" }, "! ", ...text);
+  // The files are listed beside it.
+  const doubts = status.doubts.replace(/; data_time_range (lists them|says why)/g, "");
+  const rules = (status.rules || []).flatMap((each) => {
+    const since = each.matches_since === undefined ? ""
+      : `it has matched without an end since ${clock(each.matches_since)}`;
+    const why = [each.problem, since].filter(Boolean).join("; ");
+    return why ? [warn(`Rule ${each.rule}: ${why}`)] : [];
+  });
+  return [...faults("Damaged bags, not in the answers", "damaged", range),
+    ...faults("Incomplete bags", "incomplete", range), ...faults("Unread bags", "unread", range),
+    ...faults("Bags with a wrong clock", "clock_faults", range),
+    ...(doubts === SOUND ? [] : [warn(doubts)]),
+    ...status.fell_silent.map((each) => warn(bdi(each.topic), " fell silent ",
+      agoOf(status.now - each.ago_s, now))),
+    ...rules, ...together("Never heard", "never_heard", status),
+    ...together("Offered by nobody", "missing", status)];
+}
+function showState(host, view) {
+  const { status, range } = view;
+  const now = nowOf(view);
   const own = status.budget.max_gb !== null;
   const recorder = recorderOf(status)
     || (own ? "no heartbeat yet" : state.recording ? "not shown for one recording"
       : "none in this deployment");
-  const halted = status.latest !== null && status.now === status.latest;
   const failing = status.recorder === "died";
   const budget = status.budget;
   const list = el("dl", {},
     entry("Recorder", el("span", { class: failing ? "bad" : "" }, recorder)),
-    entry("Recorded", range.earliest === null ? "nothing"
-      : `${lasting(range.latest - range.earliest)} in ${counted(range.bags, "bag")}`),
+    entry("Recorded", range.earliest === null ? "nothing" : recordedOf(view)),
     entry("Gaps", String(range.gaps.length)));
   if (own) {
     list.append(entry("Budget", `${size(budget.used_gb)} of ${size(budget.max_gb)}`,
@@ -185,31 +204,21 @@ function showState(host, status, range) {
   } else list.append(entry("Size", size(budget.used_gb)));
   if (budget.full_in_days !== undefined) list.append(entry("Full in", `${budget.full_in_days} days`));
   for (const each of status.rules || []) {
-    const last = each.last_ago_s === undefined ? "" : `, ${ago(each.last_ago_s)}`;
-    list.append(entry(`Rule ${each.rule}`, `fired ${counted(each.fired, "time")}${last}; `
+    const last = each.last_ago_s === undefined ? [] : [", ", agoOf(status.now - each.last_ago_s, now)];
+    list.append(entry(`Rule ${each.rule}`, `fired ${counted(each.fired, "time")}`, ...last, "; "
       + counted(each.moments, "moment") + (each.refused ? `, ${each.refused} refused` : "")));
   }
-  // The files are listed below.
-  const doubts = status.doubts.replace(/; data_time_range (lists them|says why)/g, "");
-  const parts = [el("p", { class: sound ? "good" : "warn" }, (sound ? "\u2713 " : "! ") + doubts), list];
-  for (const each of status.fell_silent) {
-    parts.push(el("p", { class: "warn" }, "! ", bdi(each.topic), ` fell silent ${ago(each.ago_s)}`));
-  }
-  for (const each of status.rules || []) {
-    const since = each.matches_since === undefined ? ""
-      : `it has matched without an end since ${clock(each.matches_since)}`;
-    const why = [each.problem, since].filter(Boolean).join("; ");
-    if (why) parts.push(el("p", { class: "warn" }, `! Rule ${each.rule}: ${why}`));
-  }
-  parts.push(...together("Never heard", "never_heard", status),
-    ...together("Offered by nobody", "missing", status),
-    ...faults("Damaged bags, not in the answers", "damaged", range),
-    ...faults("Incomplete bags", "incomplete", range), ...faults("Unread bags", "unread", range),
-    ...faults("Bags with a wrong clock", "clock_faults", range),
-    ...notesOf([...new Set([...(range.notes || []), ...(status.notes || [])])]));
-  const since = halted ? "the newest recorded moment" : "the time of this look";
-  parts.push(soft(`\u201cAgo\u201d counts from ${since}, ${dated(status.now)}. Time zone: ${ZONE}.`));
-  host.replaceChildren(...parts);
+  const troubles = troublesOf(status, range, now);
+  host.replaceChildren(
+    ...(troubles.length || failing ? troubles : [el("p", { class: "good" }, `\u2713 ${SOUND}`)]), list,
+    ...notesOf([...new Set([...(range.notes || []), ...(status.notes || [])])]),
+    el("p", { class: "soft", id: "since" }));
+  showSince(view);
+}
+/* From which moment every "ago" on the page counts. */
+function showSince(view) {
+  const since = isHalted(view) ? "the newest recorded moment" : "the time of this look";
+  at("since").textContent = `\u201cAgo\u201d counts from ${since}, ${dated(nowOf(view))}. Time zone: ${ZONE}.`;
 }
 
 function showQuestions(host, questions) {

@@ -14,6 +14,7 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
+from socket import gethostname
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from starlette.responses import Response
@@ -78,6 +79,7 @@ def page_routes(
         shown = span_shown(part, call, asked, progress, dispatcher.questions)
         if "status" in shown:
             shown |= recordings.shown(memory, part, call)
+            shown |= {"memory": named(memory)} if given.get("named") == "1" else {}
         if shown.get("mixed") and "path" in shown:
             window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
             shown |= recordings.paths(part, call, window)
@@ -122,6 +124,16 @@ def _chosen(recordings: Recordings, given: QueryParams, memory: Memory) -> Memor
     part = recordings.alone(memory, name) if name else memory
     topic = _short(given, "poses", _LONGEST_NAME)
     return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
+
+
+def named(memory: Memory) -> JsonObject:
+    """Returns the name of a memory for people, and where its folder is.
+
+    Of a robot that records here it is the machine's name, else the folder's.
+    """
+    folder = memory.index.bag_dir.resolve()
+    is_robot = memory.limits.kept is not None
+    return {"name": gethostname() if is_robot else folder.name, "folder": str(folder)}
 
 
 def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:

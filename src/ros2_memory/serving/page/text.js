@@ -49,6 +49,15 @@ function lasting(seconds) {
   return (s / 31557600).toFixed(1) + " years";
 }
 const ago = (seconds) => (seconds < 0.5 ? "now" : `${lasting(seconds)} ago`);
+/* How long ago a time is, which `countAgo` keeps right: everywhere from the same moment. */
+function agoOf(unix, now) {
+  const made = el("span", { class: "ago" }, ago(now - unix));
+  made.since = unix;
+  return made;
+}
+function countAgo(now) {
+  for (const each of document.querySelectorAll(".ago")) each.textContent = ago(now - each.since);
+}
 const counted = (number, noun) => `${number} ${noun}${number === 1 ? "" : "s"}`;
 const DAY = new Intl.DateTimeFormat(undefined, { weekday: "short", day: "numeric", month: "short" });
 const DATE = new Intl.DateTimeFormat(undefined,
@@ -57,12 +66,14 @@ const CLOCK = new Intl.DateTimeFormat(undefined,
   { hour: "2-digit", minute: "2-digit", second: "2-digit", hourCycle: "h23" });
 const MINUTE = new Intl.DateTimeFormat(undefined,
   { hour: "2-digit", minute: "2-digit", hourCycle: "h23" });
-const day = (unix) => DAY.format(unix * 1000);
+const MONTH = new Intl.DateTimeFormat(undefined, { month: "short", year: "numeric" });
+const yearOf = (unix) => new Date(unix * 1000).getFullYear();
+let hasYears = false;  // whether what is recorded is of several years
+const day = (unix) => (hasYears ? DATE : DAY).format(unix * 1000);
 const timeOfDay = (unix) => CLOCK.format(unix * 1000);
 const clock = (unix) => `${day(unix)}, ${timeOfDay(unix)}`;
-/* With the year, unless it is this one. */
-const date = (unix) => (new Date(unix * 1000).getFullYear() === new Date().getFullYear() ? DAY : DATE)
-  .format(unix * 1000);
+/* With the year, unless all is of this one. */
+const date = (unix) => (yearOf(unix) === new Date().getFullYear() ? day(unix) : DATE.format(unix * 1000));
 const dated = (unix) => `${date(unix)}, ${timeOfDay(unix)}`;
 function size(gb) {
   const [times, unit] = gb >= 1 ? [1, "GB"] : gb >= 0.001 ? [1e3, "MB"] : [1e6, "kB"];

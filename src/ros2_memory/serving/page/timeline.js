@@ -9,7 +9,8 @@ const BELOW = 38;  // times and dates
 const MOST_LABELS = 10;
 const SHORTEST_S = 1;
 const SPANS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
-  86400, 172800, 604800, 1209600, 2592000];
+  86400, 172800, 604800, 1209600, 2592000, 7776000, 15552000, 31536000, 63072000, 157680000, 315360000];
+const MONTH_S = 2592000;
 const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn",
   silence: "warn", drop: "warn", flip: "accent", goal: "good" };
 
@@ -266,7 +267,7 @@ class Timeline {
       c.moveTo(x, OVERVIEW + 4);
       c.lineTo(x, bottom);
       const isDay = (t + ahead) % 86400 === 0;
-      labels.push([x, isDay ? day(t) : by < 60 ? timeOfDay(t) : MINUTE.format(t * 1000)]);
+      labels.push([x, by > MONTH_S ? MONTH.format(t * 1000) : isDay ? DAY.format(t * 1000) : by < 60 ? timeOfDay(t) : MINUTE.format(t * 1000)]);
     }
     c.stroke();
     c.fillStyle = colour("soft");
