@@ -213,7 +213,7 @@ def test_a_number_is_plotted_below_the_timeline(page: Browser, served: Served) -
     field = "linear_velocity.x"
     number = f"[aria-label='Plot /odom {field}']"
     page.awaits("return document.querySelector(arguments[0]) !== null", number)
-    assert "1,200 messages" in page.text("#topics") or "1200 messages" in page.text("#topics")
+    assert "1,200 messages" in page.text("#topics")
     assert page.run("return [...document.querySelectorAll('.spoke')].every((each) => each.width)")
     page.press(number, 3, 3)
     page.awaits("return document.querySelector('.uplot canvas') !== null")
@@ -236,6 +236,19 @@ def test_each_label_has_a_row_of_the_timeline_and_its_sightings_are_listed(page:
     page.press("#timeline", 20, page.run("return line.lanes[2].top + 5"))
     page.awaits("return document.getElementById('moment').textContent.includes('sighting')")
     assert page.text("#moment-title") == page.run("return plain(line.lanes[2].label)")
+
+
+def test_of_more_sightings_than_are_events_those_of_each_label_are_listed(page: Browser) -> None:
+    page.awaits("return state.view.seen !== null")
+    page.run(
+        "state.view.counts.sightings = 900; state.view.events = state.view.events"
+        ".filter((each) => each.kind !== 'thing'); state.view.things = [];"
+        "state.view.seen.labels[0].sightings = 899;"
+        "showEvents(at('events'), state.view, chooseStretch, chooseLabel);"
+        "showThings(at('things'), state.view, chooseThing);"
+    )
+    assert "899 sightings" in page.text("#events")
+    assert "What was seen has no place" in page.text("#things")
 
 
 def test_of_many_labels_those_seen_longest_have_rows_and_the_rest_on_demand(page: Browser) -> None:

@@ -26,6 +26,7 @@ let isWholeOwed = false;
 let statusAt = 0;
 let pause = FILLING_MS;
 let lookedAt = 0;
+const running = new Map();  // by kind: cancels what is asked besides a look
 const closest = new Map();  // by path: what was asked of it last
 let lookLater = 0;
 let restLater = 0;
@@ -126,7 +127,7 @@ async function look(isMore = false, isPatient = false) {
     Object.assign(state.view, { recording, poses });
     // Of another span, or of more of it, the path is looked up anew; what came since goes on from it.
     const { start, path } = state.view;
-    state.view.of = isMore ? view.of : [recording, poses, start, path && path.whole].join();
+    state.view.of = isMore ? view.of : [recording, poses, start, path && path.whole, Boolean(state.view.filling)].join();
     show(reply, isMore);
     if (state.view.range.earliest === null) return;
     if (reply.status) lookAtTopics();
@@ -150,12 +151,18 @@ async function look(isMore = false, isPatient = false) {
     }
   }
 }
+/* Cancels the last question of a kind: another one takes its place. */
+function onlyLast(kind) {
+  if (running.has(kind)) running.get(kind).abort();
+  running.set(kind, new AbortController());
+  return running.get(kind).signal;
+}
 /* The topics of the span, after what else is shown of it. */
 async function lookAtTopics() {
   const { view, recording, span } = state;
   try {
     const reply = await asked("/page/topics", { start: span.start.toFixed(3), end: span.end.toFixed(3),
-      ...(recording ? { recording } : {}) });
+      ...(recording ? { recording } : {}) }, onlyLast("topics"));
     if (view.recording !== state.recording) return;
     showTopics(at("topics"), reply, plotAlso);
     state.placing = reply;
@@ -164,7 +171,7 @@ async function lookAtTopics() {
     else showKey();
   } catch (error) {
     if (error instanceof Locked) lock(error);
-    else at("topics").replaceChildren(soft(error.message));
+    else if (error.name !== "AbortError") at("topics").replaceChildren(soft(error.message));
   }
 }
 /* When each label was in view: all sightings, of which the events have the longest. */
@@ -172,7 +179,7 @@ async function lookAtLabels() {
   const { recording, span } = state;
   try {
     const { labels, labels_total, end } = await asked("/page/labels", { ...chosenPart(),
-      start: span.start.toFixed(3), end: span.end.toFixed(3) });
+      start: span.start.toFixed(3), end: span.end.toFixed(3) }, onlyLast("labels"));
     const { view } = state;
     if (recording !== state.recording || span.start !== state.span.start) return;
     view.seen = { labels, total: labels_total, until: Math.min(end, view.range.latest) };
@@ -196,7 +203,9 @@ function closer(path, box) {
   mine.timer = setTimeout(async () => {
     try {
       const reply = await asked("/page/path", given);
-      if (closest.get(path.name) === mine) map.enlarge(path, box, reply);
+      if (closest.get(path.name) !== mine) return;
+      map.enlarge(path, box, reply);
+      showKey();
     } catch (error) {
       if (error instanceof Locked) lock(error);  // else the path stays as the first look has it
     }
@@ -427,6 +436,8 @@ function showKey() {
   ...(map.paths.length ? [el("span", {}, "frame ", bdi(map.paths[0].frame || "without a name"))] : []),
   ...(map.paths.some((each) => !each.whole)
     ? [el("span", { class: "warn" }, "older path is being read")] : []),
+  ...(map.paths.some((each) => (map.exactly(each) || { exact: true }).exact === false)
+    ? [el("span", {}, "older parts to 5 cm")] : []),
   ...(view.no_path ? [el("span", { class: "warn" }, `${view.no_path}.`)] : []));
 }
 function pathKey(view, one) {

@@ -95,7 +95,7 @@ function showThings(host, view, choose) {
       each.state === MISSED ? el("span", { class: "warn" }, " not seen where expected") : ""),
     el("span", {}, `${metres(each)} \u00b7 `, seen(each))));
   host.replaceChildren(...(rows.length ? listing(rows, 10)
-    : [soft(view.events.some((each) => each.kind === "thing")
+    : [soft((view.counts || {}).sightings || (view.throughout || []).length
       ? "What was seen has no place on the map. The timeline shows when it was in view."
       : "Nothing was seen in this time.")]));
 }
@@ -104,7 +104,8 @@ function eventRows(events, point) {
     link(each.in ? `${each.text} in ${each.in}` : each.text, () => point(each)),
     `${when(each.t)}${each.end > each.t ? `, ${lasting(each.end - each.t)}` : ""}`));
 }
-/* The sightings that were counted, the newest first; first what was in view all the time. */
+/* The sightings that were counted, the newest first, or of many those of each label; first what was
+   in view all the time. */
 function sightingRows(view, point, choose) {
   const { counts = {}, throughout = [] } = view;
   const always = new Set(throughout);
@@ -112,10 +113,14 @@ function sightingRows(view, point, choose) {
     && !always.has(each.text.replace(IN_VIEW, ""))).reverse();
   const all = throughout.map((label) => pair(link(`${label} in view`, () => choose(label)), "all the time"));
   const rows = [...all, ...eventRows(some, point)];
-  const left = (counts.sightings || 0) - some.length;
-  if (!rows.length && !left) return [];
-  return [el("h3", {}, "Sightings"), ...listing(rows, 6),
-    ...(left > 0 ? [soft(`${counted(left, "shorter sighting")} are in the rows of the timeline.`)] : [])];
+  const isWhole = (counts.sightings || 0) <= some.length;
+  if (isWhole && !rows.length) return [];
+  const { labels, total } = view.seen || { labels: [], total: 0 };
+  const byLabel = labels.map((each) => pair(link(each.label, () => choose(each.label)),
+    `${counted(each.sightings, "sighting")}, ${lasting(each.seconds)}`));
+  const left = total - labels.length;
+  return [el("h3", {}, "Sightings"), ...listing(isWhole ? rows : byLabel, 6),
+    ...(isWhole || left <= 0 ? [] : [soft(`${counted(left, "more label")} not listed.`)])];
 }
 function showEvents(host, view, point, choose) {
   const shown = view.events.filter((each) => each.kind !== "thing").reverse();

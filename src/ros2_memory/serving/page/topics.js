@@ -32,7 +32,7 @@ function topicRow(topic, plot) {
   bar.spoke = topic.spoke;
   return el("li", {}, el("div", { class: "topic" },
     el("span", {}, bdi(topic.topic), " ", el("span", { class: "soft" }, bdi(topic.type))), bar,
-    el("span", { class: "soft" }, `${pace(topic.rate_hz)} \u00b7 ${counted(topic.count, "message")}`)),
+    el("span", { class: "soft" }, `${pace(topic.rate_hz)} \u00b7 ${topic.count.toLocaleString()} ${topic.count === 1 ? "message" : "messages"}`)),
   ...(topic.numbers.length ? chips(topic, plot) : []));
 }
 function spokeText(spoke) {
