@@ -679,6 +679,9 @@ def test_new_data_appears_without_a_reload(chromium: Browser, scratch: Path) -> 
         assert path["x"][0] == 0
         assert path["x"][-1] == 30
         assert path["begins"] == [0]
+        # The path through every pose goes on, too, without a gap.
+        chromium.awaits("return (map.exactly(map.paths[0]) || { x: [0] }).x.at(-1) === 30")
+        assert chromium.run("return map.exactly(map.paths[0]).begins") == [0]
         # Totals follow, as often as a hundredth of the time allows.
         label = "return document.getElementById('map').getAttribute('aria-label')"
         chromium.awaits(f"{label}.includes('30.0 m driven')")

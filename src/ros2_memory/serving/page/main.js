@@ -190,10 +190,10 @@ async function lookAtLabels() {
   }
 }
 /* The path as it was driven where the map shows it, once the map rests. */
-function closer(path, box) {
+function closer(path, box, since) {
   const { span, view } = state;
   const given = { ...chosenPart(), ...(path.name ? { recording: path.name } : {}), ...box,
-    start: span.start.toFixed(3), end: Math.max(span.end, view.end).toFixed(3) };
+    start: (since ?? span.start).toFixed(3), end: Math.max(span.end, view.end).toFixed(3) };
   const asking = `${new URLSearchParams(given)} ${view.of}`;
   const before = closest.get(path.name) || {};
   if (before.asking === asking) return;
@@ -204,7 +204,7 @@ function closer(path, box) {
     try {
       const reply = await asked("/page/path", given);
       if (closest.get(path.name) !== mine) return;
-      map.enlarge(path, box, reply);
+      map.enlarge(path, box, reply, since);
       showKey();
     } catch (error) {
       if (error instanceof Locked) lock(error);  // else the path stays as the first look has it

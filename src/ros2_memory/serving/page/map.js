@@ -3,7 +3,7 @@
 const NEAR_PX = 14;
 const BESIDE = 0.25;  // of the canvas, to each side, for which the exact path is asked, too
 const LARGER = 1.5;  // so much larger than asked for it is drawn until it is asked for anew
-const NEWER_S = 30;
+const NEWER_S = 4;  // what is newer is drawn as the look has it, until it is asked for
 const UNSEEN_S = 10;  // the robot may have moved since an older pose
 
 /* The number of the last time that is not after `t`; -1 before the first. */
@@ -22,12 +22,22 @@ function lastBefore(times, t) {
 const meet = (one, other) => one.x < other.x + other.w + 3 && other.x < one.x + one.w + 3
   && one.y < other.y + other.h && other.y < one.y + one.h;
 
+/* An exact path, and what came since. */
+function continuedBy(known, more) {
+  const first = more.t.findIndex((each) => each > known.until);
+  if (first < 0) return { ...known, until: Math.max(known.until, more.until || 0) };
+  const both = (name) => [...known[name], ...more[name].slice(first)];
+  return { ...more, exact: known.exact && more.exact, t: both("t"), x: both("x"), y: both("y"),
+    begins: [...known.begins, ...more.begins.filter((each) => each >= first)
+      .map((each) => each - first + known.t.length)] };
+}
+
 const ofPath = (n) => (n ? `path-${n + 1}` : "path");
 const apart = (view) => Boolean(view.paths && view.paths.length);
 
 class RobotMap {
-  /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(path, box): the path is to be
-     drawn more exactly. */
+  /* `told` has time(t, isChosen), thing(thing), stretch(event), closer(path, box, since): the path is
+     to be drawn more exactly; `since`: what is known of it reaches so far, else null. */
   constructor(canvas, told) {
     this.canvas = canvas;
     this.told = told;
@@ -92,8 +102,10 @@ class RobotMap {
   }
   /* What a path is drawn by. */
   shapeOf(path) { return this.exactly(path) || path; }
-  enlarge(path, box, reply) {
-    this.exact.set(path.name || "", { ...reply, box, of: path.of, name: path.name, starts: new Set(reply.begins) });
+  enlarge(path, box, reply, since) {
+    const known = since === null ? null : this.exact.get(path.name || "");
+    const found = known ? continuedBy(known, reply) : reply;
+    this.exact.set(path.name || "", { ...found, box, of: path.of, name: path.name, starts: new Set(found.begins) });
     if (this.t !== null) this.place(this.t);
     this.draw();
   }
@@ -102,7 +114,9 @@ class RobotMap {
     const box = this.box();
     for (const path of this.paths) {
       const found = this.exactly(path);
-      if (path.t.length > 1 && (!found || path.t.at(-1) - found.until > NEWER_S)) this.told.closer(path, box);
+      if (path.t.length < 2) continue;
+      if (!found) this.told.closer(path, box, null);
+      else if (path.t.at(-1) - found.until > NEWER_S) this.told.closer(path, found.box, found.until);
     }
   }
 

@@ -64,8 +64,6 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
         for type_name, census in [_newest_type(view, topic)]
     ]
     return {
-        "start": unix_from_ns(window.start),
-        "end": unix_from_ns(window.stop),
         "topics": rows,
         "topics_total": len(topics),
         "places_robot": _places_robot(view),
