@@ -136,7 +136,8 @@ function showEvents(host, view, point, choose) {
     ...listing(eventRows(others, point), problems.length ? 4 : 8),
     ...sightingRows(view, point, choose),
     ...(shown.length || seen ? [] : [soft(view.isWhole ? "No events." : "Not known yet.")]),
-    ...notesOf(view.notes));
+    // That of fixes is drawn all the same.
+    ...notesOf((view.notes || []).filter((each) => !view.path || !each.startsWith("the path is unknown"))));
 }
 /* Rows of events, the newest first; of a clock that was set often, one row for all. */
 function bundled(events, point) {

@@ -2,6 +2,7 @@
 
 const MOST_ROWS = 12;
 const MOST_CHIPS = 24;
+const MOST_HZ = 1e5;  // of messages whose times are counters
 
 /* The numbers of a topic, those of one message inside another together: `position` x y z. */
 function chips(topic, plot) {
@@ -24,6 +25,7 @@ function chips(topic, plot) {
 }
 function pace(rate) {
   if (rate === null) return "once";
+  if (rate > MOST_HZ) return "at once";
   if (rate >= 0.1) return `${Number(rate.toPrecision(3))} Hz`;
   return `every ${lasting(1 / (rate || 0.001))}`;
 }
