@@ -50,6 +50,8 @@ _ERROR_LEVELS: Final = {
     "diagnostic_msgs/msg/DiagnosticArray": _ERROR_LEVEL,
 }
 _MAX_TEXT_CHARS: Final = 160
+_BYTES: Final = 600
+"""About how much memory a toggle, an error or a level takes, and what each topic's events do."""
 _MEASURED_WITH_EVENTS: Final = frozenset({"sensor_msgs/msg/BatteryState"})
 _MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
 """Packages whose messages are measurements: they contain no events."""
@@ -124,6 +126,14 @@ class TopicEvents:
         """Whether there were only messages without an event."""
         has_events = self.visible.rows or self.known or self.errors or self.undecodable
         return not has_events and self.changes.is_empty
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        changes = self.changes
+        lists = (self.known, self.toggles, self.errors, changes.known, changes.changes)
+        more = sum(map(len, lists)) + len(changes.reports) + len(self.visible.labels)
+        return _BYTES * (1 + more) + len(self.visible.rows)
 
     @property
     def all_left_out(self) -> int:

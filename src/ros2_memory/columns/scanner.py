@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
-    from ros2_memory.analysis.topic_events import TopicEvents
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
@@ -102,7 +101,6 @@ class Scanner:
         large: the turn to hold much of a bag, which large columns need, too.
 
     Attributes:
-        events: by part, what happened in it; of parts of which all rows count.
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
@@ -124,7 +122,6 @@ class Scanner:
         self._known: ByteLru[Packed] = ByteLru(16 << 20)
         self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
-        self.events: ByteLru[TopicEvents] = ByteLru(24 << 20)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
         self.clock_steps: ByteLru[tuple[ClockStep, ...]] = ByteLru(1 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)

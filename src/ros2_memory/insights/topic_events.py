@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.analysis.stated import events_of, joined_stated, stated_by
-from ros2_memory.analysis.topic_events import TopicEvents, joined_events, state_of
+from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events, state_of
 from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.events import EVENTS
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
@@ -31,8 +35,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
-_BYTES: Final = 600
-"""About how much memory the events of a part take, and each of its toggles, errors and levels."""
 
 
 def toggled(topic: str, toggle: Change) -> str:
@@ -76,6 +78,22 @@ def events_back(
         yield from _events(view, columns, together, may_match)
 
 
+def make_events(view: View, window: TimeWindow) -> None:
+    """Makes the events of the parts in a window, of each topic that can have some.
+
+    Raises:
+        QueryTimeoutError: the deadline has passed.
+    """
+    columns, timeline = StatedColumns(view.memory.extractor), view.snapshot.timeline
+    for topic in timeline.topics():
+        if any(map(has_events, timeline.types_of(topic))):
+            # What a part has before or after is of it all the same.
+            around = window.widened(PART_NS)
+            for rows in scan(view, topic, around, newest_first=True, stored=True):
+                if rows.part is not None:
+                    deque(_events(view, columns, [rows], None), maxlen=0)
+
+
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
     """Returns what messages of one topic report; None without any."""
     return events_of(_stated_by(view, messages))
@@ -106,11 +124,12 @@ def _events(
     may_match: Callable[[Table], bool | Mask] | None,
 ) -> Iterator[TopicEvents]:
     """Yields the events of tables that overlap in time; those of a whole part are kept."""
-    part = together[0].part if len(together) == 1 else None
-    known = view.memory.columns.events
-    events = None if part is None else known.get(part)
-    if events is None and part is not None and may_match and not may_match(together[0].table):
-        events = TopicEvents(*together[0].span)
+    first, part = together[0], together[0].part if len(together) == 1 else None
+    known = view.memory.columns.fragments(EVENTS)
+    key = None if part is None else FragmentKey(first.first, "", (part,))
+    events = None if key is None else known.get(key)
+    if events is None and key is not None and may_match and not may_match(first.table):
+        events = TopicEvents(*first.span)
     if events is not None:
         yield events
         return
@@ -119,16 +138,9 @@ def _events(
     events = events_of(joined_stated(stated))
     if events is None:
         return
-    if part is not None and view.notes.added == noted:
-        known.put(part, events, _size(events))
+    if key is not None and view.notes.added == noted:
+        known.put(key, events)
     yield events
-
-
-def _size(events: TopicEvents) -> int:
-    changes = events.changes
-    lists = (events.known, events.toggles, events.errors, changes.known, changes.changes)
-    more = sum(map(len, lists)) + len(changes.reports) + len(events.visible.labels)
-    return _BYTES * (1 + more) + len(events.visible.rows)
 
 
 def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = False) -> Stated:

@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.insights.drive import slice_drive
+from ros2_memory.insights.topic_events import make_events
 from ros2_memory.places.region_visits import make_tracks
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
@@ -172,6 +173,7 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
             slice_drive(view, window)
             make_tracks(view, window)
             Watching(view).make(window)
+            make_events(view, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         memory.columns.write_fragments()

@@ -17,6 +17,8 @@ from ros2_memory.analysis.topic_events import (
     joined_events,
     state_of,
 )
+from ros2_memory.columns.events import EVENTS
+from ros2_memory.columns.fragments import Fragment
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
 
@@ -96,6 +98,14 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     parts = [events_of(messages[begin:end]) for begin, end in ends]
     whole = joined_events([part for part in parts if part is not None])
     assert _comparable(whole) == _comparable(events_of(messages))
+
+
+@given(histories())
+def test_events_come_back_from_their_bytes(history: tuple[Messages, list[int]]) -> None:
+    events = events_of(history[0])
+    assert events is not None
+    stored = EVENTS.store(events).to_bytes()
+    assert EVENTS.load(Fragment.from_bytes(stored)) == events
 
 
 @given(histories(), st.data())
