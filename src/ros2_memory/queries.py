@@ -95,6 +95,7 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
+from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
@@ -503,10 +504,12 @@ def trajectory_summary(
     topic: str | None = None,
     frame_id: str | None = None,
     max_waypoints: int = MAX_WAYPOINTS,
+    farthest: JsonValue = None,
 ) -> results.TrajectorySummary:
     """Returns the driven path in a window, from one pose topic in log-time order.
 
     Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
+    `farthest` is the point from which the farthest pose is wanted.
     """
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
@@ -526,6 +529,8 @@ def trajectory_summary(
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
         drawn = replace(drawn, waypoints=moved)
+    ends = [(window.start, window.stop - 1)]
+    away = None if farthest is None else farthest_from(view, farthest, name, ends, frame_id)
     return results.TrajectorySummary(
         name,
         frame_id or path.frames[0],
@@ -534,6 +539,7 @@ def trajectory_summary(
         drawn,
         elapsed.skipped_between(path.first, path.last),
         unrecorded,
+        away,
         notes=view.notes.sentences(),
     )
 

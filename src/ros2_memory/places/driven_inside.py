@@ -25,6 +25,7 @@ from ros2_memory.history.driven_path import note_known_since, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
+from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.places.scope import times_in_region
 from ros2_memory.places.where import parse_where
@@ -53,10 +54,12 @@ def driven_inside(
     topic: str | None = None,
     frame_id: str | None = None,
     max_waypoints: int = MAX_WAYPOINTS,
+    farthest: JsonValue = None,
 ) -> DrivenInside:
     """Returns what was driven inside of a region in a window, by one pose topic.
 
     Its waypoints are in the poses' own frame or in `frame_id`; 0 asks for none, 1 for the last.
+    `farthest` is the point from which the farthest pose inside is wanted.
 
     Raises:
         InvalidArgumentsError: the topic carries no position, or `where` is no region of a frame
@@ -81,6 +84,8 @@ def driven_inside(
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     require_one_robot(view, name, window)
+    spans = [(each.start, each.stop) for each in inside]
+    away = None if farthest is None else farthest_from(view, farthest, name, spans, frame_id)
     note_unread(view, window)
     note_edges(view, window)
     return DrivenInside(
@@ -95,6 +100,7 @@ def driven_inside(
         # Measured over a second, it is below the mean of a visit that hardly lasts as long.
         max(totals.max_speed, average),
         waypoints,
+        away,
         notes=view.notes.sentences(),
     )
 

@@ -88,7 +88,10 @@ class Where:
 
 
 def parse_where(
-    limits: QuerySettings, value: JsonValue, default_radius_m: float | None = None
+    limits: QuerySettings,
+    value: JsonValue,
+    default_radius_m: float | None = None,
+    what: str = "where",
 ) -> Where:
     """Returns what a value of the argument `where` means.
 
@@ -96,19 +99,20 @@ def parse_where(
         limits: have the named places.
         value: as the client gave it: a place, or several.
         default_radius_m: of a circle without a radius; None where it must have one.
+        what: the name of the argument.
 
     Raises:
         InvalidArgumentsError: it is no region, or no place has that name.
     """
     several = _several(limits, value)
     if several is None:
-        return _one(limits, value, default_radius_m)
+        return _one(limits, value, default_radius_m, what)
     if len(several) > _MOST_PLACES:
         raise InvalidArgumentsError(
-            f"where has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
+            f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
     found = tuple(
-        _called(name, _one(limits, each, default_radius_m, f"where: {abbreviate(name)}"))
+        _called(name, _one(limits, each, default_radius_m, f"{what}: {abbreviate(name)}"))
         for name, each in several.items()
     )
     if len(found) == 1:
@@ -152,10 +156,10 @@ def _frame_of(several: Sequence[Where]) -> str | None:
 
 
 def _one(
-    limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str = "where"
+    limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        return _named(limits, value)
+        return _named(limits, value, what)
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - _OF_REGION
@@ -193,14 +197,14 @@ def _place_named(limits: QuerySettings, name: str) -> Place | None:
     return next(same, None)
 
 
-def _named(limits: QuerySettings, name: str) -> Where:
+def _named(limits: QuerySettings, name: str, what: str) -> Where:
     place = _place_named(limits, name)
     if place is not None:
         return Where(place.region, place.frame_id, place.name)
     known = ", ".join(sorted(each.name for each in limits.places))
     none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
     listed = f"there are: {known}" if known else none
-    raise InvalidArgumentsError(f"where: no place is named {abbreviate(name)}; {listed}")
+    raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(name)}; {listed}")
 
 
 def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:

@@ -29,6 +29,7 @@ from ros2_memory.results.memory import (
 )
 from ros2_memory.results.motion import (
     DrivenInside,
+    FarthestPose,
     Frames,
     PlaceVisits,
     Position,
@@ -94,6 +95,7 @@ __all__ = [
     "Event",
     "Extremes",
     "FarFromOther",
+    "FarthestPose",
     "FiredRule",
     "Frames",
     "Gap",

@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.core.geometry import yaw
 from ros2_memory.core.reply import (
     AGO,
+    INSIDE,
     LOCAL,
     MINUTES,
     NAME,
     NAMES,
+    OBJECT,
     OBJECTS,
     PLAIN,
     POSE,
@@ -143,6 +145,29 @@ class Frames(AnswerWithNotes):
 
 
 @result(
+    digits(3)("distance_m"),
+    vector("xy", 3).spread("place"),
+    INSIDE("inside"),
+    TIME("timestamp", "time"),
+    LOCAL("local", "time", "time"),
+    NAME("frame_id"),
+    vector("xy", 3)("from", "origin"),
+)
+class FarthestPose:
+    """The robot's pose (m) that is farthest from a point, the `origin`, of the same frame.
+
+    `inside`: the named places that it is in, the smallest first.
+    """
+
+    origin: tuple[float, float]
+    frame_id: str
+    distance_m: float
+    time: Ns
+    place: tuple[float, float]
+    inside: tuple[str, ...]
+
+
+@result(
     digits(4)("distance_m", "known.totals.distance_m"),
     digits(4)("avg_speed", "known.avg_speed"),
     digits(4)("max_speed", "known.max_speed"),
@@ -157,13 +182,14 @@ class Frames(AnswerWithNotes):
     PLAIN("poses", "trajectory.poses"),
     digits(4)("path_sum_m", "trajectory.totals.path_sum_m").when("trajectory.is_noisy"),
     digits(4)("gap_m", "trajectory.totals.gap_m").when("trajectory.totals.gaps"),
+    OBJECT("farthest").if_known,
     span=("start", "end"),
 )
 class TrajectorySummary(AnswerWithNotes):
     """The driven path in a window, from one pose topic in log-time order.
 
     `skipped`: how much of the time from its first to its last pose the clock skipped. `unrecorded`:
-    for how much of the rest no poses were recorded.
+    for how much of the rest no poses were recorded. `farthest`: from a point that was asked for.
     """
 
     topic: str
@@ -173,6 +199,7 @@ class TrajectorySummary(AnswerWithNotes):
     trajectory: Trajectory
     skipped: Ns = 0
     unrecorded: Ns = 0
+    farthest: FarthestPose | None = None
 
     @property
     def known(self) -> Trajectory | None:
@@ -205,6 +232,7 @@ class TrajectorySummary(AnswerWithNotes):
     objects(_waypoints("entered"))("waypoints"),
     "topic",
     NAME("frame_id"),
+    OBJECT("farthest").if_known,
     span=("start", "end"),
 )
 class DrivenInside(AnswerWithNotes):
@@ -220,6 +248,7 @@ class DrivenInside(AnswerWithNotes):
         distance_m: metres driven inside.
         max_speed: over a second (m/s).
         waypoints: of the drawn path; `jump` marks the first of a visit.
+        farthest: the pose inside that is farthest from a point, where that was asked for.
     """
 
     topic: str
@@ -232,6 +261,7 @@ class DrivenInside(AnswerWithNotes):
     distance_m: float
     max_speed: float
     waypoints: tuple[Waypoint, ...]
+    farthest: FarthestPose | None = None
 
     @property
     def avg_speed(self) -> float:

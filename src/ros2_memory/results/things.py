@@ -101,6 +101,7 @@ def thing(most_stays: int) -> Keys:
         digits(2)("spread_m"),
         Unit(_other_frame)("frame_id").in_short,
         INSIDE("inside").in_short,
+        digits(2)("near_m").if_known,
         TIME("first_seen", "first"),
         TIME("last_seen", "last").in_short,
         AGO("ago_s", "last"),
@@ -132,6 +133,7 @@ class Thing:
         at_once: how many were seen at the same time: of what moves by itself, and of several things
             at one place; else None.
         moves: whether it moves by itself.
+        near_m: how far it is from what it is to be near, where that was asked for.
     """
 
     label: str
@@ -152,6 +154,7 @@ class Thing:
     labels: tuple[tuple[str, int], ...] = ()
     at_once: int | None = None
     moves: bool = False
+    near_m: float | None = None
 
     @property
     def yaw(self) -> float | None:

@@ -12,7 +12,8 @@ import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import places_at
+from ros2_memory.core.regions import Circle, places_at
+from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
@@ -26,19 +27,20 @@ from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.places.where import Where
     from ros2_memory.things.instances import Instance, Mover, PlacedStay
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
 _MOST_NAMES: Final = 5
+_NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
 """Detectors publish at their own times."""
 _MM: Final = 1000.0
@@ -50,6 +52,7 @@ def find_things(
     labels: Sequence[str] = (),
     *,
     where: JsonValue = None,
+    near: JsonValue = None,
     start_s: float | None = None,
     end_s: float | None = None,
     min_score: float | None = None,
@@ -58,16 +61,18 @@ def find_things(
     """Returns the things of some labels, or all, that were seen in a window, those seen last first.
 
     A thing counts where it was at the window's end. `where` takes those that are in a region then;
-    of what moves by itself, what was seen in it. Slices (10 s) count as a whole.
+    of what moves by itself, what was seen in it. Slices (10 s) count as a whole. `near` takes those
+    near a point, or near another thing of a label.
 
     Raises:
-        InvalidArgumentsError: the bounds make no window, `where` is no region, or `min_score` is
-            above 1.
+        InvalidArgumentsError: the bounds make no window, `where` or `near` is no region, or
+            `min_score` is above 1.
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
     limits = memory.limits
     region = None if where is None else parse_where(limits, where)
+    beside = None if near is None else parse_near(limits, near)
     span = TimeRange(start_s, end_s)
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
@@ -86,12 +91,18 @@ def find_things(
     places = places_asked(limits, region, known.frames)
     finder = _Finder(known, window, region, places)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
-    things = tuple(each.described() for each in found[:limit])
+    if beside is not None:
+        anywhere = replace(finder, where=None)
+        others = [*anywhere.find({known.labels.key(beside.label)})] if beside.label else []
+        found = [*beside.among(found, others)]
+        if beside.label and not others:
+            view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
+    things = tuple(replace(each.described(), near_m=each.near_m) for each in found[:limit])
     totals: Counter[str] = Counter()
     for each in found:
         totals[each.label] += each.at_once or 1
     is_bounded = start_s is not None or end_s is not None
-    bounds = [*["window"] * is_bounded, *([] if region is None else ["region"])]
+    bounds = [*["window"] * is_bounded, *["region"] * (region is not None or beside is not None)]
     question = Asked(
         labels=asked,
         found=frozenset(key for each in found for key in each.keys),
@@ -132,6 +143,50 @@ class _Found(NamedTuple):
     at_once: int | None
     is_vague: bool
     described: Callable[[], Thing]
+    thing: Instance | Mover
+    near_m: float | None = None
+
+
+class Near(NamedTuple):
+    """What things are to be near: the middle of a circle or, of a label, other things."""
+
+    circle: Circle
+    label: str = ""
+
+    def among(self, found: Iterable[_Found], others: Sequence[_Found]) -> Iterator[_Found]:
+        """Yields those near the circle's middle, or one of the others, each with its distance."""
+        for each in found:
+            x, y, _ = each.place
+            points = [(self.circle.x, self.circle.y)]
+            if self.label:
+                points = [
+                    one.place[:2]
+                    for one in others
+                    if one.thing is not each.thing and one.thing.epoch == each.thing.epoch
+                ]
+            near_m = min((math.dist((x, y), point) for point in points), default=math.inf)
+            if near_m <= self.circle.radius_m:
+                yield each._replace(near_m=near_m)
+
+
+def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
+    """Returns what a value of the argument `near` means: a label, or a point with a radius.
+
+    Raises:
+        InvalidArgumentsError: it is neither.
+    """
+    given: JsonValue = {"label": value} if isinstance(value, str) else value
+    label = given.get("label", "") if isinstance(given, dict) else None
+    if isinstance(given, dict) and given.keys() <= {"label", "radius_m"}:
+        label = label or None
+        given = {"x": 0, "y": 0, **{name: each for name, each in given.items() if name != "label"}}
+    region = parse_where(limits, given, _NEAR_M, "near").region
+    if not isinstance(region, Circle) or not isinstance(label, str):
+        raise InvalidArgumentsError(
+            f'near was {abbreviate(value)}; give {{"label": "table", "radius_m": 1.0}}, or '
+            '{"x": 1.0, "y": 2.0, "radius_m": 0.5} (m)'
+        )
+    return Near(region, label)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +224,7 @@ class _Finder:
         describe = partial(self._described, instance, parts, at_once)
         place = _place(last)
         is_vague = result.is_vague(np.concatenate([rows for _, rows in parts]))
-        yield _Found(instance.label, names, seen_last, place, at_once, is_vague, describe)
+        yield _Found(instance.label, names, seen_last, place, at_once, is_vague, describe, instance)
 
     def _described(
         self, instance: Instance, parts: Sequence[tuple[PlacedStay, Ints]], at_once: int | None
@@ -280,6 +335,7 @@ class _Finder:
             thing.at_once,
             result.is_vague(rows),
             lambda: thing,
+            mover,
         )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:

@@ -224,7 +224,7 @@ _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=F
 _Tolerance: TypeAlias = Annotated[
     _AtLeast0, Field(description="Oldest age, s, e.g. 2 for a topic of 1 Hz.")
 ]
-_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score of detections.")]
+_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score.")]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _Time: TypeAlias = Annotated[
     float,
@@ -300,6 +300,26 @@ _WhereOfBoth: TypeAlias = Annotated[
         {**_REGION_SCHEMA, "description": "Of robot and things; forms: trajectory_summary."}
     ),
 ]
+_Point: TypeAlias = Annotated[
+    _Region,
+    WithJsonSchema(
+        {
+            "type": [*REGION_KINDS],
+            "examples": [{"x": 1.5, "y": 0.5}],
+            "description": "Point {x, y} or place.",
+        }
+    ),
+]
+_Near: TypeAlias = Annotated[
+    _Region,
+    WithJsonSchema(
+        {
+            "type": ["object", "string"],
+            "examples": [{"label": "table", "radius_m": 1.0}],
+            "description": "{label: table, radius_m: 1} or {x, y, radius_m}.",
+        }
+    ),
+]
 _FrameId: TypeAlias = Annotated[_Name, Field(description="Frame of the reply.")]
 _Limit: TypeAlias = Annotated[
     Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
@@ -323,22 +343,19 @@ _SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path to test."
 
 _By: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place"],
-    Field(description="One row per local day, hour, weekday, or place (of where, else named)."),
+    Field(description="Rows by it, in local time; place: of where, else named."),
 ]
 
 
 _ByValue: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place", "value"],
-    Field(
-        description="One row per local day, hour, weekday, place (of where, else named), or value "
-        "that held."
-    ),
+    Field(description="Rows by it, in local time; place: of where, else named; value: that held."),
 ]
 _ByInMatches: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place", "label", "value"],
     Field(
-        description="One row per local day, hour, weekday, place (of where, else named), value "
-        'that held, or label seen (value "" for all).'
+        description="Rows by it, in local time; place: of where, else named; value: that held; "
+        'label: seen (value "" for all).'
     ),
 ]
 
@@ -534,6 +551,7 @@ class TrajectoryArguments(Arguments):
     max_waypoints: Annotated[
         Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
     ] = MAX_WAYPOINTS
+    farthest: _Point | None = Field(default=None, alias="farthest_from")
     by: _By | None = None
 
 
@@ -627,6 +645,7 @@ class ThingsArguments(Arguments):
 
     labels: _Labels = Field(default=(), alias="label", description="Whole labels.")
     where: _WhereOfThings | None = None
+    near: _Near | None = None
     start_s: _Start = None
     end_s: _End = None
     min_score: _MinScore | None = None

@@ -79,7 +79,10 @@ class Signature:
         return {name: _example(each) for name, each in self._properties.items() if name in needed}
 
     def json_schema(self) -> JsonObject:
-        """Returns the schema that `tools/list` shows: flat, closed, without empty defaults."""
+        """Returns the schema that `tools/list` shows: flat, without empty defaults.
+
+        It says nothing of other arguments: the reply to an unknown one names those that are close.
+        """
         properties: JsonObject = {}
         for name, schema in self._properties.items():
             shown: JsonObject = {
@@ -88,12 +91,10 @@ class Signature:
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
             properties[name] = _with_plain_times(shown) if self._plain_times else shown
-        closed: JsonObject = {"additionalProperties": False}
         # The specification's tools take one time; those beyond it take one of several forms.
         required = [*self._required, *(self._either[:1] if self._plain_times else ())]
-        if required:
-            closed["required"] = [*required]
-        return {"type": "object", "properties": properties, **closed}
+        whole: JsonObject = {"type": "object", "properties": properties}
+        return {**whole, "required": [*required]} if required else whole
 
     def parse(self, given: Mapping[str, object]) -> Arguments:
         """Returns the checked arguments. A null for an optional one counts as not given.

@@ -116,10 +116,19 @@ def _trajectory(
     where: JsonValue,
     frame_id: str | None,
     max_waypoints: int,
+    farthest: JsonValue,
 ) -> results.TrajectorySummary | results.DrivenInside:
     """Returns the whole way, or what was driven inside of a region."""
     query = queries.trajectory_summary if where is None else partial(driven_inside, where=where)
-    return query(memory, call, span, topic=topic, frame_id=frame_id, max_waypoints=max_waypoints)
+    return query(
+        memory,
+        call,
+        span,
+        topic=topic,
+        frame_id=frame_id,
+        max_waypoints=max_waypoints,
+        farthest=farthest,
+    )
 
 
 def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
@@ -227,7 +236,8 @@ _DECLARATIONS = (
         ),
         "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
-        "...}}; with where: only the path inside it, and visits.",
+        "...}}; with where: only the path inside it, and visits; with farthest_from {{farthest: "
+        "{{distance_m, x, y, in, timestamp, frame_id}}}}.",
         TrajectoryArguments,
         _trajectory,
         blocking=True,

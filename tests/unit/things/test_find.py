@@ -547,3 +547,65 @@ def test_the_median_score_is_known_to_a_twentieth(
     assert min(scores) - 0.05 <= cup["score"]["median"] <= max(scores)
     if len(scores) == 1:
         assert cup["score"]["median"] == scores[0]
+
+
+def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
+    seen = (("table", 3.0, 0.5), ("mug", 3.3, 0.9), ("mug", 5.0, -1.0), ("plate", 2.6, 0.5))
+    write(tmp_path, looked(0, 30, HERE, *seen))
+    by_label = ask(tmp_path, near={"label": "Tables", "radius_m": 0.6})
+    assert {(each["label"], each["near_m"]) for each in by_label["things"]} == {
+        ("mug", 0.5),
+        ("plate", 0.4),
+    }
+    assert by_label["labels"] == {"mug": 1, "plate": 1}
+    mugs = ask(tmp_path, label="mug", near="table")
+    assert [each["near_m"] for each in mugs["things"]] == [0.5]
+    by_point = ask(tmp_path, near={"x": 3.0, "y": 0.5, "radius_m": 0.45})
+    assert {each["label"]: each["near_m"] for each in by_point["things"]} == {
+        "table": 0.0,
+        "plate": 0.4,
+    }
+    assert ask(tmp_path, near='{"x": 5.0, "y": -1.0, "radius_m": 0.2}')["total"] == 1
+
+
+def test_a_thing_is_not_near_itself_but_near_another_of_its_label(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5), ("mug", 3.7, 0.5), ("cup", 5.0, 1.0)))
+    assert ask(tmp_path, label="cup", near={"label": "cup", "radius_m": 9})["total"] == 0
+    mugs = ask(tmp_path, label="mug", near="mug")
+    assert [each["near_m"] for each in mugs["things"]] == [0.7, 0.7]
+
+
+def test_what_is_near_a_thing_in_another_place_counts_where_it_is(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 30, HERE, ("table", 3.0, 0.5), ("mug", 3.3, 0.5)))
+    where = {"x": 3.4, "y": 0.5, "radius_m": 0.2}
+    found = ask(tmp_path, near="table", where=where)
+    assert [each["label"] for each in found["things"]] == ["mug"]
+
+
+def test_near_what_is_not_there_is_nothing_and_a_note_says_so(tmp_path: Path) -> None:
+    write(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5)))
+    reply = ask(tmp_path, near="sofa")
+    assert reply["total"] == 0
+    assert 'near: there is no thing "sofa" in this window' in reply["notes"]
+
+
+@pytest.mark.parametrize(
+    "near",
+    [
+        "",
+        {},
+        {"radius_m": 2},
+        {"label": 5},
+        {"label": "mug", "x": 1},
+        {"x": 1},
+        {"label": "mug", "radius_m": -1},
+        [1, 2],
+        {"x": [0, 1], "y": [0, 1]},
+    ],
+    ids=str,
+)
+def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path, near: Any) -> None:
+    write(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)))
+    reply = ask(tmp_path, near=near)
+    assert reply["error"] == "invalid_arguments"
+    assert "near" in reply["detail"]

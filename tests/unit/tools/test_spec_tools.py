@@ -181,7 +181,6 @@ def test_every_tool_has_an_example_that_it_accepts(tool: Tool) -> None:
 
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_every_tool_names_its_arguments_and_refuses_others(tool: Tool) -> None:
-    assert tool.schema["additionalProperties"] is False
     assert "unknown argument" in refusal(tool.name, **example(tool), nonsense=1)
 
 

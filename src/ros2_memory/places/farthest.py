@@ -1,0 +1,111 @@
+"""Where the robot was farthest from a point, by its poses."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ros2_memory.analysis.motion.robot_track import jumps
+from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.regions import places_at
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.region_visits import track_in
+from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.where import parse_where
+from ros2_memory.results import FarthestPose
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.analysis.frames import Floats, Mask, Times
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.history.view import View
+
+_ARGUMENT: Final = "farthest_from"
+_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+_OFF_TRACK_M: Final = 0.1
+"""No pose is as far from the line of a track."""
+_MOST_TRIED: Final = 20
+
+
+def farthest_from(
+    view: View,
+    value: JsonValue,
+    topic: str,
+    spans: Sequence[tuple[Ns, Ns]],
+    frame_id: str | None = None,
+) -> FarthestPose | None:
+    """Returns the pose in some times (both ends inclusive, in order) that is farthest from a point.
+
+    The point, of `value`, is in the frame of places or in `frame_id`. None where no pose could be
+    placed there.
+
+    Raises:
+        InvalidArgumentsError: `value` is no point, or the poses are not in its frame.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    place = parse_where(view.memory.limits, value, 1.0, _ARGUMENT)
+    if place.several:
+        raise InvalidArgumentsError(f"{_ARGUMENT} has several places; give one, or x and y")
+    if topic != (known := resolve_path_topic(view)):
+        raise InvalidArgumentsError(f"{_ARGUMENT} is measured along {known}: leave out topic")
+    own = pose_frame(view, topic)
+    frame = map_placement(view, own, topic, place.frame_id or frame_id).frame_id
+    min_x, max_x, min_y, max_y = place.region.bounds
+    x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
+    if not spans:
+        return None
+    window = TimeWindow(spans[0][0], spans[-1][1] + 1)
+    track, tracks = track_in(view, frame, window), RobotTracks(view, frame)
+    times, at_x, at_y = _along(track, np.array(spans, np.int64))
+    off_m = np.hypot(at_x - x, at_y - y)
+    best: tuple[float, Ns, float, float] | None = None
+    for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
+        if best is not None and off_m[nth] <= best[0] - _OFF_TRACK_M:
+            break
+        at = int(times[nth])
+        first, last = next(span for span in spans if span[0] <= at <= span[1])
+        around = TimeWindow(max(first, at - _AROUND_NS), min(last, at + _AROUND_NS) + 1)
+        poses = tracks.poses(around)
+        for time, pose_x, pose_y in zip(*(part.tolist() for part in poses[:3]), strict=True):
+            away_m = math.hypot(pose_x - x, pose_y - y)
+            is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
+            if is_near and (best is None or away_m > best[0]):
+                best = away_m, time, pose_x, pose_y
+    if best is None:
+        return None
+    away_m, time, *there = best
+    inside = places_at(view.memory.limits.places, frame, *there)
+    return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
+
+
+def _along(track: RobotTrack, spans: Times) -> tuple[Times, Floats, Floats]:
+    """Returns where the track was in some times: its vertices, and where each begins and ends.
+
+    Without those that the robot jumped to and from.
+    """
+    starts, stops = track.pieces
+    jumped = jumps(track)
+    vertices = track.times[~(jumped & np.roll(jumped, 1))]
+    ends = spans.ravel()
+    known = _is_in(ends, starts, stops)
+    times = np.concatenate([vertices[_is_in(vertices, *spans.T)], ends[known]])
+    since = times - track.times[:1]
+    own = track.times - track.times[:1]
+    if not len(times):
+        return times, np.zeros(0), np.zeros(0)
+    return times, np.interp(since, own, track.x), np.interp(since, own, track.y)
+
+
+def _is_in(times: Times, starts: Times, stops: Times) -> Mask:
+    """Returns which times are in one of some spans, which are in order."""
+    if not len(starts):
+        return np.zeros(len(times), np.bool_)
+    nth = np.searchsorted(starts, times, side="right") - 1
+    return (nth >= 0) & (times <= stops[nth])
