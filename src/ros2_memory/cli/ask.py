@@ -115,10 +115,9 @@ def ask(
             print_reply(stdout_console(), rows)
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return
-    known = tools[tool].arguments if tool in tools else {}
-    asked = parse_arguments([each for each in words if each not in of_settings], known)
-    arguments = with_times(asked, known, unix_from_ns(present(memory)))
-    arguments |= _newest_day(memory, tool, arguments)
+    arguments = question_for(
+        memory, tool, tools.get(tool), [each for each in words if each not in of_settings]
+    )
     with spinner(f"asking {tool}"):
         (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -132,6 +131,19 @@ def ask(
         typer.echo(f"tools: {', '.join(tools)}", err=True)
     if reply.is_error or is_error(answer):
         raise typer.Exit(EXIT_NEGATIVE)
+
+
+def question_for(
+    memory: Memory, name: str, tool: Tool | None, words: Sequence[str]
+) -> dict[str, object]:
+    """Returns the arguments for a tool, from the words of the command line.
+
+    Raises:
+        InvalidArgumentsError: a word is no argument, or a text is no time.
+    """
+    known = {} if tool is None else tool.arguments
+    arguments = with_times(parse_arguments(words, known), known, unix_from_ns(present(memory)))
+    return arguments | _newest_day(memory, name, arguments)
 
 
 def _newest_day(memory: Memory, tool: str, arguments: Mapping[str, object]) -> dict[str, object]:

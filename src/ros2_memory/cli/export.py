@@ -106,9 +106,9 @@ def export(
         messages = _reported(chain(earlier, first, within), report)
         undefined: list[str] = []
         if mcap is not None:
-            messages = _with_definitions(messages, memory.reader, undefined)
+            messages = with_definitions(messages, memory.reader, undefined)
             path, files = mcap, None
-            count = write_mcap(mcap, messages, _profile(view, topics, window, earlier))
+            count = write_mcap(mcap, messages, profile_of(view, topics, window, earlier))
         elif parquet is not None:
             path = parquet
             count, files = _write_parquet(parquet, messages, memory, robot)
@@ -179,7 +179,7 @@ def _child_frames(memory: Memory, stored: StoredMessage) -> set[str]:
     return {edge.child for edge in memory.extractor.transforms(message, stored.time, static=True)}
 
 
-def _profile(
+def profile_of(
     view: View, topics: Sequence[str], window: TimeWindow, earlier: Sequence[StoredMessage]
 ) -> str:
     """Returns the MCAP profile of all bags that hold the messages; empty if they differ."""
@@ -195,7 +195,7 @@ def _profile(
     return profiles.pop() if len(profiles) == 1 else ""
 
 
-def _with_definitions(
+def with_definitions(
     messages: Iterator[StoredMessage], reader: BagReader, undefined: list[str]
 ) -> Iterator[StoredMessage]:
     """Yields the messages with the definitions that their bags lack; collects unknown types."""

@@ -110,7 +110,7 @@ Verbose = Annotated[
     typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
 ]
 Command: TypeAlias = Callable[..., None]  # type: ignore[explicit-any]  # each its own options
-_LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
+LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
@@ -203,7 +203,7 @@ def _load_to_look(
     is_chosen = is_deployment_chosen(given)
     if by_words or not _is_of_others(loaded[0], of_path, is_chosen=is_chosen):
         return loaded
-    return load_with_sources(named, [*_LOOKING, *given])
+    return load_with_sources(named, [*LOOKING, *given])
 
 
 def settings_to_look(
@@ -225,7 +225,7 @@ def settings_to_look(
         path, recording = _folder_of(path, recording)
     named = bag_dir if path is None else path
     if named is not None and not is_deployment_chosen(given) and not _is_recorded_now(named):
-        given = [*_LOOKING, *given]
+        given = [*LOOKING, *given]
     if recording is not None:
         given.append(f"data.recording={quoted(recording)}")
     return named, given

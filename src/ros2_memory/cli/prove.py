@@ -1,0 +1,277 @@
+"""`ros2-memory prove`: what an answer rests on, as a file that gives the same answer."""
+
+import json
+import re
+from bisect import bisect_right
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Final, cast
+
+import typer
+
+from ros2_memory.bootstrap import build_dispatcher
+from ros2_memory.cli.ask import call_tools, question_for
+from ros2_memory.cli.export import profile_of, with_definitions, write_mcap
+from ros2_memory.cli.options import (
+    EXIT_NEGATIVE,
+    LOOKING,
+    AsJson,
+    Bags,
+    is_folder,
+    load_to_look,
+    open_memory,
+    print_line,
+    spinner,
+)
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.config import Settings
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import JsonObject
+from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.view import View
+from ros2_memory.storage.base import BagReader, Batch, Record
+
+_LONG: Final = "server.call_timeout_s=600"
+"""Bags are read without a store of columns, which takes longer."""
+_BESIDE: Final = frozenset(
+    {"notes", "bags", "incomplete", "damaged", "unread", "silences", "doubts", "budget"}
+)
+"""Keys that say how things lie in the files, which other files need not have."""
+_NEVER: Final[JsonObject] = {"timestamp": None, "value": None}
+"""What a reply of null says where it has notes."""
+_EVER: Final = [(MIN_NS, MAX_NS)]
+
+
+def prove(
+    question: Annotated[
+        str,
+        typer.Argument(
+            metavar="'TOOL key=value ...'", help="The question, in quotes, as `ask` takes it."
+        ),
+    ],
+    *,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="FILE.mcap|DIR",
+            help="Write this MCAP file, or a folder in which recordings stay apart.",
+        ),
+    ],
+    as_json: AsJson = False,
+    bags: Bags,
+) -> None:
+    """Write the messages that an answer rests on, so that others can look at them.
+
+    The same question is then asked over these alone, and both answers are compared. An answer on
+    times between recordings needs a folder: in one file there is nothing between them.
+    """
+    if output.exists() or not output.parent.is_dir():
+        raise InvalidArgumentsError(f"{output} must be new, in a folder that is there")
+    others = [each for each in bags.words or () if not is_folder(each)]
+    loaded = bags.settings(*LOOKING, _LONG)
+    memory = open_memory(loaded, verbose=bags.verbose)
+    reads = _Reads(memory.reader)
+    with spinner("asking"):
+        expected = _answer(loaded, replace(memory, reader=cast("BagReader", reads)), question)
+    view = View(memory, Call())
+    parts = _parts(view)
+    with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
+        for nth, spans in enumerate(_more_and_more(view, reads.spans(), parts)):
+            path = Path(folder) / str(nth) / output.name
+            path.parent.mkdir()
+            count = _write(path, view, spans, parts)
+            settings = load_to_look(None, [str(path), *LOOKING, _LONG, *others])
+            found = _answer(settings, open_memory(settings, verbose=bags.verbose), question)
+            beside, differing = _differing(expected, found)
+            if not differing:
+                break
+        path.replace(output)
+    if as_json:
+        done = {"path": str(output), "messages": count, "same": not differing}
+        print_line(json.dumps({**done, "differing": differing, "beside": beside}))
+    else:
+        print_line(f"{counted(count, 'message')} in {output}")
+    if beside:
+        typer.echo(f"note: only the bags themselves give the same {listed(beside)}", err=True)
+    if differing:
+        apart = len(parts) > 1 and output.suffix == ".mcap"
+        hint = f"; -o {output.with_suffix('')} keeps recordings apart" if apart else ""
+        typer.echo(f"over {output} the answer differs in {listed(differing)}{hint}", err=True)
+        raise typer.Exit(EXIT_NEGATIVE)
+    typer.echo(f"the same answer: ros2-memory ask {question} {output}", err=True)
+
+
+class _Reads:
+    """A reader that notes the times of the messages that are read, by topic."""
+
+    def __init__(self, reader: BagReader) -> None:
+        self._reader = reader
+        self._calls: list[dict[str, tuple[Ns, Ns]]] = []
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._reader, name)
+
+    def spans(self) -> dict[str, Spans]:
+        """Returns from when to when messages were read, by topic."""
+        topics = {topic for call in self._calls for topic in call}
+        return {
+            topic: united(call[topic] for call in self._calls if topic in call) for topic in topics
+        }
+
+    def records(
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
+    ) -> Iterator[Record]:
+        """Returns what the reader returns; so do the others."""
+        call = self._call()
+
+        def noted(record: Record) -> Record:
+            _widen(call, record.channel.topic, [record.log_time])
+            return record
+
+        # Mapped: it goes on behind what cannot be read.
+        return map(noted, self._reader.records(path, topics, window, newest_first=newest_first))
+
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        """As above."""
+        record = self._reader.newest(path, topic, window)
+        _widen(self._call(), topic, [] if record is None else [record.log_time])
+        return record
+
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """As above."""
+        call = self._call()
+
+        def noted(batch: Batch) -> Batch:
+            _widen(call, batch.channel.topic, batch.log_times.tolist())
+            return batch
+
+        return map(noted, self._reader.batches(path, topics, window, bare=bare))
+
+    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
+        """As above."""
+        times = self._reader.log_times(path, topic, window)
+        _widen(self._call(), topic, times)
+        return times
+
+    def _call(self) -> dict[str, tuple[Ns, Ns]]:
+        self._calls.append({})
+        return self._calls[-1]
+
+
+def _widen(call: dict[str, tuple[Ns, Ns]], topic: str, times: Sequence[Ns]) -> None:
+    if len(times):
+        start, stop = call.get(topic, (MAX_NS, MIN_NS))
+        call[topic] = min(start, *times), max(stop, max(times) + 1)
+
+
+def _parts(view: View) -> list[tuple[Path, TimeWindow]]:
+    """Returns the recordings, each from when to when there is no gap."""
+    reach: dict[Path, tuple[Ns, Ns]] = {}
+    for bag in view.snapshot.timeline.recorded:
+        start, stop = reach.get(bag.recording, (MAX_NS, MIN_NS))
+        reach[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)
+    gaps = [(before + 1, after) for before, after in view.snapshot.gaps]
+    return [
+        (recording, TimeWindow(*span))
+        for recording, whole in reach.items()
+        for span in without([whole], gaps)
+    ]
+
+
+def _more_and_more(
+    view: View, read: Mapping[str, Spans], parts: Sequence[tuple[Path, TimeWindow]]
+) -> Iterator[dict[str, Spans]]:
+    """Yields what an answer may rest on: what was read, then more where that is not all.
+
+    That is what lies between on the topics that were read, these as a whole, and everything. The
+    first and the last messages of each part say when "now" is, and what was recorded.
+    """
+    ends = [(at, at + 1) for _, window in parts for at in (window.start, window.stop - 1)]
+    every = view.snapshot.timeline.topics()
+    between: dict[str, Spans] = {
+        topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()
+    }
+    for found in (read, between, dict.fromkeys(read, _EVER), dict.fromkeys(every, _EVER)):
+        yield {topic: united([*found.get(topic, ()), *ends]) for topic in every}
+
+
+def _write(
+    path: Path, view: View, spans: Mapping[str, Spans], parts: Sequence[tuple[Path, TimeWindow]]
+) -> int:
+    """Writes the messages of these times by topic: a file, or one for each part in a folder.
+
+    Returns how many.
+    """
+    profile = profile_of(view, [*spans], TimeWindow.everything(), ())
+
+    def written(path: Path, messages: Iterator[StoredMessage]) -> int:
+        return write_mcap(path, with_definitions(messages, view.memory.reader, []), profile)
+
+    if path.suffix == ".mcap":
+        return written(path, _messages(view, spans, TimeWindow.everything()))
+    count = 0
+    for nth, (recording, window) in enumerate(parts):
+        folder = path / recording.relative_to(view.memory.index.bag_dir)
+        folder.mkdir(parents=True, exist_ok=True)
+        found = (each for each in _messages(view, spans, window) if each.bag.recording == recording)
+        with suppress(NoDataError):  # all that it has, another recording has too
+            count += written(folder / f"{recording.name}_{nth}.mcap", found)
+    return count
+
+
+def _messages(
+    view: View, spans: Mapping[str, Spans], within: TimeWindow
+) -> Iterator[StoredMessage]:
+    for first, last in united(span for some in spans.values() for span in some):
+        window = within.intersect(TimeWindow(first, last))
+        topics = [
+            topic
+            for topic, some in spans.items()
+            if any(start < window.stop and window.start < stop for start, stop in some)
+        ]
+        for each in view.stream.messages(topics, window) if topics else ():
+            some = spans[each.record.channel.topic]
+            nth = bisect_right(some, (each.time, MAX_NS)) - 1
+            if nth >= 0 and each.time < some[nth][1]:
+                yield each
+
+
+def _answer(settings: Settings, memory: Memory, question: str) -> JsonValue:
+    """Returns the reply to a question, from the bags themselves."""
+    memory = replace(memory, columns=Scanner(None, memory.index.bag_dir))
+    dispatcher = build_dispatcher(settings, memory)
+    tool, _, rest = question.strip().partition(" ")
+    tools = {each.name: each for each in dispatcher.tools}
+    if tool not in tools:
+        raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
+    words = [rest] if rest.lstrip().startswith("{") else re.split(r"\s+(?=\w+=)", rest.strip())
+    arguments = question_for(memory, tool, tools[tool], [each for each in words if each])
+    (reply,) = call_tools(dispatcher, {tool: arguments})
+    answer: JsonValue = json.loads(reply.text)
+    return answer
+
+
+def _differing(one: JsonValue, other: JsonValue) -> tuple[list[str], list[str]]:
+    """Returns the keys in which two replies differ: those on files, and the others."""
+    one, other = (_NEVER if each is None else each for each in (one, other))
+    if not isinstance(one, dict) or not isinstance(other, dict):
+        return [], [] if one == other else ["all"]
+    keys = [key for key in dict.fromkeys((*one, *other)) if one.get(key) != other.get(key)]
+    return [key for key in keys if key in _BESIDE], [key for key in keys if key not in _BESIDE]

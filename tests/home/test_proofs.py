@@ -1,0 +1,63 @@
+"""`ros2-memory prove`: over the messages that an answer rests on, the answer is the same."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import pytest
+
+from ros2_memory.history.context import QuerySettings
+from ros2_memory.tools.spec_tools import build_tools
+from tests.support.program import exits
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from tests.support.program import Program
+
+__all__ = ["exits"]
+
+pytestmark = pytest.mark.xdist_group("home")
+
+DAY: Final = "start=2026-03-02 end=2026-03-02"
+SEEN: Final = "topic=*/scene_objects condition_type=contains value=mug"
+QUESTIONS: Final = {
+    "list_recorded_topics": "",
+    "data_time_range": "",
+    "get_topic_at_time": "topic=/battery_state timestamp=2026-03-02T10:35 tolerance_s=5",
+    "get_topic_seconds_ago": "topic=/is_docked seconds_ago=20 tolerance_s=2",
+    "get_topic_in_range": f"topic=/bumper {DAY} max_samples=5",
+    "get_topic_in_last": "topic=/battery_state seconds=10m fields=percentage",
+    "get_position_at": 'timestamps=["2026-03-02T10:35", "2026-03-03T10:26"] tolerance_s=2',
+    "get_position_seconds_ago": "seconds_ago=60",
+    "get_velocity_at": "timestamp=2026-03-02T10:35 tolerance_s=2",
+    "get_velocity_seconds_ago": "seconds_ago=60",
+    "get_transform_at": "parent=map child=base_link timestamp=2026-03-02T10:35",
+    "get_transform_seconds_ago": "parent=odom child=base_link seconds_ago=60",
+    "list_frames": "",
+    "find_last_match": SEEN,
+    "get_value_when": f"value_topic=/odom condition_{SEEN}",
+    "trajectory_summary": f'{DAY} farthest_from={{"x": 0, "y": 0}}',
+    "recent_trajectory_summary": "seconds=10m where=kitchen",
+    "find_matches": f"{SEEN} limit=20",
+    "find_things": 'near={"label": "table", "radius_m": 2}',
+    "compare": f"{DAY} with_start=2026-03-03 with_end=2026-03-03",
+    "recap": DAY,
+    "visits": "where=kitchen",
+    "memory_status": "",
+}
+
+
+def test_there_is_a_question_for_every_tool_that_reads() -> None:
+    assert QUESTIONS.keys() == {tool.name for tool in build_tools(QuerySettings())}
+
+
+@pytest.mark.usefixtures("in_utc")
+@pytest.mark.parametrize("tool", QUESTIONS)
+def test_the_same_question_over_the_proof_has_the_same_answer(
+    home: Path, tmp_path: Path, exits: Program, tool: str
+) -> None:
+    settings = [f"data.{kind}_file={home / kind}.yaml" for kind in ("places", "labels")]
+    question, proof = f"{tool} {QUESTIONS[tool]}".strip(), tmp_path / "proof"
+    proved = exits(0, "prove", question, "-o", proof, "--json", home / "bags", *settings)
+    assert proved.json["same"]

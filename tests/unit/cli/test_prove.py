@@ -1,0 +1,144 @@
+"""`ros2-memory prove`: a file with what an answer rests on, which alone gives that answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from mcap.reader import make_reader
+
+from tests.support.bags import odom, text, write_mcap
+from tests.support.moving_map import BEGIN, S, write_moving_map
+
+if TYPE_CHECKING:
+    from tests.support.program import Program
+
+DAY_S = 86_400
+ABOVE = {"topic": "/odom", "condition_type": "above", "value": 0.1, "field": "position.x"}
+
+
+@pytest.fixture
+def bags(tmp_path: Path) -> Path:
+    """A robot with a map, for two minutes in splits of 10 s."""
+    write_moving_map(tmp_path / "bags", 3)
+    return tmp_path / "bags"
+
+
+@pytest.fixture
+def two_days(tmp_path: Path) -> Path:
+    """Ten seconds a day on two days, each a recording."""
+    for day in range(2):
+        start = BEGIN + day * DAY_S * S
+        poses = [odom(start + nth * S // 10, nth / 20, 0.0) for nth in range(100)]
+        words = [text(start + nth * S, f"word {nth}") for nth in range(10)]
+        write_mcap(tmp_path / "days" / f"rec_{day}" / f"rec_{day}_0.mcap", [*poses, *words])
+    return tmp_path / "days"
+
+
+def messages(path: Path) -> list[tuple[str, int, bytes]]:
+    with path.open("rb") as file:
+        return [
+            (channel.topic, message.log_time, message.data)
+            for _, channel, message in make_reader(file).iter_messages()
+        ]
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        "find_last_match topic=*/scene_objects condition_type=contains value=cup",
+        f"find_last_match {json.dumps(ABOVE)}",
+        "find_last_match topic=*/scene_objects condition_type=contains value=never",
+        'visits where={"x": 4.0, "y": 0.0, "radius_m": 1.0}',
+        "find_things",
+        "recap",
+        "get_position_seconds_ago seconds_ago=1m frame_id=map",
+        "get_topic_at_time topic=/tf_static timestamp=2026-07-14T03:34:00Z",
+        "get_topic_in_range topic=/nothing start=1784000000 end=1784000010",
+    ],
+)
+def test_the_file_alone_gives_the_answer(
+    bags: Path, tmp_path: Path, exits: Program, question: str
+) -> None:
+    proof = tmp_path / "proof.mcap"
+    proved = exits(0, "prove", question, "-o", proof, bags)
+    assert f"{len(messages(proof))} messages in {proof}" in proved.out
+    assert proved.err.endswith(f"ros2-memory ask {question} {proof}\n")
+    words = question.split(" ") if "{" not in question else question.split(" ", 1)
+    if question.startswith("visits"):
+        words = ["visits", question.removeprefix("visits ")]
+    code = 1 if "/nothing" in question else 0
+    asked = exits(code, "ask", *words, bags, "--json", "--set", "data.now=latest").json
+    assert exits(code, "ask", *words, proof, "--json").json == asked
+
+
+def test_it_has_what_was_read_and_what_says_when_now_is(
+    bags: Path, tmp_path: Path, exits: Program
+) -> None:
+    proof = tmp_path / "proof.mcap"
+    exits(0, "prove", "get_position_seconds_ago seconds_ago=60", "-o", proof, bags)
+    every = [row for path in sorted(bags.rglob("*.mcap")) for row in messages(path)]
+    found = messages(proof)
+    assert {*found} < {*every}
+    last = max(at for _, at, _ in every)
+    within = {(topic, at) for topic, at, _ in found}
+    poses = [at for topic, at, _ in every if topic == "/odom" and at <= last - 60 * S]
+    assert ("/odom", max(poses)) in within
+    assert {min(at for _, at, _ in every), last} <= {at for _, at in within}
+    assert len(found) < 10
+
+
+def test_what_lay_between_recordings_needs_a_folder(
+    two_days: Path, tmp_path: Path, exits: Program
+) -> None:
+    span = f"start={BEGIN // S} end={BEGIN // S + DAY_S + 60}"
+    question, proof = f"trajectory_summary {span}", tmp_path / "proof.mcap"
+    differs = exits(1, "prove", question, "-o", proof, two_days)
+    assert f"over {proof} the answer differs in avg_speed" in differs.err
+    assert f"-o {tmp_path / 'proof'} keeps recordings apart" in differs.err
+    folder = tmp_path / "proof"
+    proved = exits(0, "prove", question, "-o", folder, two_days, "--json").json
+    assert proved == {
+        "path": str(folder),
+        "messages": 202,
+        "same": True,
+        "differing": [],
+        "beside": [],
+    }
+    assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
+
+
+def test_a_key_on_files_is_named_and_is_no_other_answer(
+    bags: Path, tmp_path: Path, exits: Program
+) -> None:
+    proved = exits(0, "prove", "data_time_range", "-o", tmp_path / "proof.mcap", bags)
+    assert "note: only the bags themselves give the same bags\n" in proved.err
+
+
+def test_nothing_is_left_beside_the_proof_and_the_bags_stay(
+    bags: Path, tmp_path: Path, exits: Program
+) -> None:
+    before = sorted(bags.rglob("*"))
+    exits(0, "prove", "list_frames", "-o", tmp_path / "proof.mcap", bags)
+    assert sorted(bags.rglob("*")) == before
+    assert {each.name for each in tmp_path.iterdir()} == {"bags", "proof.mcap"}
+
+
+@pytest.mark.parametrize(
+    ("question", "name", "said"),
+    [
+        ("find_thing", "p.mcap", "there is no tool find_thing; the tools are"),
+        ("remember_moment label=x", "p.mcap", "there is no tool remember_moment"),
+        ("visits 5", "p.mcap", "is not an argument"),
+        ("visits", "none/p.mcap", "must be new, in a folder that is there"),
+        ("visits", "bags", "must be new, in a folder that is there"),
+    ],
+)
+def test_what_cannot_be_proved_is_refused(
+    bags: Path, tmp_path: Path, exits: Program, question: str, name: str, said: str
+) -> None:
+    refused = exits(2, "prove", question, "-o", tmp_path / name, bags)
+    assert said in refused.err
+    assert [*tmp_path.iterdir()] == [bags]
