@@ -135,7 +135,8 @@ class _FleetQuestions:
         if name is not None:
             return lambda _, call: self._of_one(self.fleet.named(name, call), asked, call)
         is_table = self.tool.name in TABLE_FOR_ALL and given.get("by") is not None
-        if self.tool.name not in ANSWER_FOR_ALL and not is_table:
+        is_of_all = self.tool.name in ANSWER_FOR_ALL or is_table
+        if not is_of_all or given.get("between") is not None:
             return lambda _, call: self._of_one(
                 self.fleet.the_one(self.tool.name, call), asked, call
             )
@@ -266,9 +267,11 @@ def _single(answer: Answer) -> OneAnswer:
 
 def _coordinates_in(given: Mapping[str, object]) -> str | None:
     """Returns the argument that has coordinates, if there is one."""
-    where = given.get("where")
-    if isinstance(where, dict) or (isinstance(where, str) and where.lstrip().startswith("{")):
-        return "where"
+    for name in ("where", "near"):
+        where = given.get(name)
+        is_object = isinstance(where, dict) or str(where).lstrip().startswith("{")
+        if is_object and not (name == "near" and "label" in str(where)):
+            return name
     if given.get("condition_type") == "near_position":
         return "value"
     return next((name for name in ("x", "y") if given.get(name) is not None), None)

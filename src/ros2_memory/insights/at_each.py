@@ -38,7 +38,7 @@ def at_each(
         if not isinstance(moment, AtTime) or not moment.each_s:
             return query(memory, call, *args, **given)
         reach = max(ns_argument("timestamps", at_s) for at_s in moment.each_s)
-        index = _OneSnapshot(memory.index, memory.index.snapshot(reach))
+        index = OneSnapshot(memory.index, memory.index.snapshot(reach))
         fixed = replace(memory, index=index)
         answers: list[MomentAnswer | NothingAt] = []
         failures: list[NoDataError] = []
@@ -57,7 +57,7 @@ def at_each(
     return answer
 
 
-class _OneSnapshot:
+class OneSnapshot:
     """An index that stays as it was: several answers are then of one and the same memory."""
 
     def __init__(self, index: SnapshotSource, snapshot: Snapshot) -> None:
@@ -67,13 +67,17 @@ class _OneSnapshot:
         self._snapshot = snapshot
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:  # noqa: ARG002 - of the protocol
+        """Returns the one."""
         return self._snapshot
 
     def refresh(self) -> Snapshot:
+        """Returns the one, too."""
         return self._snapshot
 
     def heartbeat(self) -> Heartbeat | None:
+        """Returns that of the index; so does the next."""
         return self._index.heartbeat()
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """As above."""
         return self._index.foreign(snapshot)

@@ -8,7 +8,7 @@ only. `now` is what ages count from. The keys of its reply, with their units (`c
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.reply import PLAIN, TIME, result
@@ -157,6 +157,21 @@ class AtEach(AnswerWithNotes):
     """The answers for several times, in the order given."""
 
     answers: tuple[MomentAnswer | NothingAt, ...]
+
+
+class InWindow(NamedTuple):
+    """The answer for one of several windows, half-open."""
+
+    start: Ns
+    stop: Ns
+    answer: OneAnswer
+
+
+@result()
+class InEach(AnswerWithNotes):
+    """The answers for several windows, in the order of time."""
+
+    windows: tuple[InWindow, ...]
 
 
 OneAnswer: TypeAlias = (

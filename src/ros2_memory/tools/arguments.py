@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from datetime import time
 from functools import partial
 from typing import Annotated, ClassVar, Final, Literal, TypeAlias
 
@@ -162,6 +163,18 @@ def _while_condition(parsed: object) -> WhileCondition:
     return WhileCondition(
         condition.topic, condition.condition_type, condition.value, condition.field
     )
+
+
+def _as_hours(value: object) -> object:
+    """Returns two local times of day, which planners also send as one text."""
+    parts = re.split(r"\s*(?:-|to|and|,)\s*", value) if isinstance(value, str) else value
+    if isinstance(value, str) and isinstance(parsed := _parse_json(value), list):
+        parts = parsed
+    try:
+        first, last = (time.fromisoformat(str(each)) for each in parts)  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise ValueError("is not two times of day") from None
+    return first, last
 
 
 def _as_integer(value: object) -> object:
@@ -317,6 +330,17 @@ _Near: TypeAlias = Annotated[
             "type": ["object", "string"],
             "examples": [{"label": "table", "radius_m": 1.0}],
             "description": "{label: table, radius_m: 1} or {x, y, radius_m}.",
+        }
+    ),
+]
+_Between: TypeAlias = Annotated[
+    tuple[time, time],
+    BeforeValidator(_as_hours),
+    WithJsonSchema(
+        {
+            "type": "string",
+            "description": "Only local hours, e.g. 19:00-22:00: a reply for each day.",
+            "examples": ["19:00-22:00"],
         }
     ),
 ]
@@ -485,6 +509,7 @@ class TopicRangeArguments(Arguments):
         Annotated[bool, Field(strict=True, description="One row per change of value.")] | None
     ) = None
     by: _ByValue | None = None
+    between: _Between | None = None
 
 
 class MotionArguments(Arguments):
@@ -553,6 +578,7 @@ class TrajectoryArguments(Arguments):
     ] = MAX_WAYPOINTS
     farthest: _Point | None = Field(default=None, alias="farthest_from")
     by: _By | None = None
+    between: _Between | None = None
 
 
 class RecapArguments(Arguments):
@@ -602,6 +628,7 @@ class VisitsArguments(Arguments):
     radius_m: Annotated[_Positive, Field(description="Radius around x, y, m.")] | None = None
     limit: _Limit = 10
     by: _By | None = None
+    between: _Between | None = None
 
 
 _While: TypeAlias = Annotated[
@@ -638,6 +665,7 @@ class MatchesArguments(ConditionArguments):
     where: _Where | None = None
     during: _While = Field(default=(), alias="while")
     frame_id: _FrameId | None = None
+    between: _Between | None = None
 
 
 class ThingsArguments(Arguments):

@@ -5,18 +5,21 @@ from __future__ import annotations
 import inspect
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.history.view import TimeRange
+from ros2_memory.insights.in_each import in_each
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.schema import Signature
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
+    from datetime import time
 
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Answer
+    from ros2_memory.results import Answer, OneAnswer
     from ros2_memory.tools.arguments import Arguments, TimeArgument
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
@@ -65,6 +68,16 @@ class Tool:
     def _described(self) -> tuple[str, JsonObject]:
         # Made when it is asked for: 20 ms for all tools, of which a program may call one.
         return self.describe()
+
+
+def _span_of(arguments: Mapping[str, object]) -> TimeRange:
+    """Returns the window of a call, whose bounds may be arguments of their own."""
+    span = arguments.get("span")
+    if isinstance(span, TimeRange):
+        return span
+    names = ("start_s", "end_s", "last_s")
+    start, end, last = (cast("float | None", arguments.get(name)) for name in names)
+    return TimeRange(start, end, last)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +148,31 @@ class ToolDeclaration:
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:
         arguments = dict(signature.parse(given))
-        if self.count is None:
-            return lambda memory, call: self.query(memory, call, **arguments)
-        by = arguments.pop("by")
-        if by is None:
-            return lambda memory, call: self.query(memory, call, **arguments)
-        count, taken = self.count, inspect.signature(self.count).parameters
+        between = cast("tuple[time, time] | None", arguments.pop("between", None))
+        query, chosen = self._bound(arguments)
+        if between is None:
+            return lambda memory, call: query(memory, call, **chosen)
+
+        def asked(memory: Memory, call: Call) -> Answer:
+            def ask(fixed: Memory, own: TimeRange) -> OneAnswer:
+                parts = {"span": own, "start_s": own.start_s, "end_s": own.end_s, "last_s": None}
+                bounds = {name: value for name, value in parts.items() if name in chosen}
+                return cast("OneAnswer", query(fixed, call, **{**chosen, **bounds}))
+
+            return in_each(memory, call, _span_of(chosen), between, ask)
+
+        return asked
+
+    def _bound(self, arguments: dict[str, object]) -> tuple[Query, dict[str, object]]:
+        """Returns the query that answers, or that counts, and its arguments.
+
+        Raises:
+            InvalidArgumentsError: one of them cannot be combined with `by`.
+        """
+        by = None if self.count is None else arguments.pop("by")
+        if self.count is None or by is None:
+            return self.query, arguments
+        taken = inspect.signature(self.count).parameters
         refused = [
             self.arguments.model_fields[name].alias or name
             for name, value in arguments.items()
@@ -149,4 +181,4 @@ class ToolDeclaration:
         if refused:
             raise InvalidArgumentsError(f"{', '.join(refused)} cannot be combined with by")
         chosen = {name: value for name, value in arguments.items() if name in taken}
-        return lambda memory, call: count(memory, call, by=by, **chosen)
+        return self.count, {"by": by, **chosen}

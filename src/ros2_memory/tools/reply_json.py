@@ -11,7 +11,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.core.reply import Scope, render, shown, with_notes
+from ros2_memory.core.reply import LocalTimes, Scope, render, shown, with_notes
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
 from ros2_memory.tools.reply_size import largest, to_json_text
@@ -30,6 +31,21 @@ FINE_PATH_M: Final = 0.05 + 1e-9
 """The deviation that a simplified path is expected to have; a larger one is noted."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
+_HEADERS: Final = ("columns", "fields")
+_OF_WINDOW: Final = ("start", "end", "local", "at", "notes", "now")
+"""Keys of a reply that the row of its window has, or has not."""
+_SUMMED: Final = (
+    "total",
+    "at_least",
+    "entries",
+    "exits",
+    "minutes",
+    "visits",
+    "distance_m",
+    "duration_s",
+    "unknown_s",
+)
+"""Numbers of the replies for several windows that are added up."""
 _COMPARISONS: Final = tuple(compared(most) for most in range(5, 0, -1))
 _THINGS: Final = tuple(listed_things(thing(most_stays)) for most_stays in (8, 5, 3, 2))
 _SHORT_THINGS: Final = listed_things(SHORT_THING)
@@ -50,6 +66,8 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
             reply = render(results.Match(None, notes=answer.notes), bag_dir)
         case results.AtEach():
             reply = _at_each(answer, bag_dir)
+        case results.InEach():
+            reply = _in_each(answer, bag_dir)
         case results.Comparison():
             reply = _shortest(answer, bag_dir, _COMPARISONS)
         case results.Things():
@@ -99,6 +117,41 @@ def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
                 del row["detail"]
             explained.add(row["reason"])
     return with_notes({**shared, "results": [*rows]}, common)
+
+
+def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
+    """Returns one row for each window, and what all have together."""
+    replies = [as_json(each.answer, bag_dir) for each in answer.windows]
+    bodies = [each for each in replies if isinstance(each, dict)]
+    known = [body for body in bodies if "error" not in body]
+    shared: JsonObject = {
+        key: value
+        for key, value in known[0].items()
+        if (isinstance(value, str) or key in _HEADERS)
+        and all(body.get(key) == value for body in known)
+    }
+    often = Counter(note for body in bodies for note in _notes_in(body))
+    common = [note for note, times in often.items() if times > 1]
+    rows: list[JsonValue] = []
+    for window, body in zip(answer.windows, bodies, strict=True):
+        row: JsonObject = {
+            "local": LocalTimes(MIN_NS, MAX_NS).text(window.start, window.stop),
+            "start": unix_rounded_up(window.start),
+            "end": unix_rounded_up(window.stop),
+        }
+        row |= {key: each for key, each in body.items() if key not in {*shared, *_OF_WINDOW}}
+        rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
+    whole: JsonObject = {}
+    for key in _SUMMED:
+        numbers = [each for body in known if isinstance(each := body.get(key), int | float)]
+        if numbers:
+            whole[key] = round(sum(numbers), 3)
+    return with_notes({"all": whole, **shared, "windows": rows}, [*answer.notes, *common])
+
+
+def _notes_in(reply: JsonObject) -> list[str]:
+    notes = reply.get("notes")
+    return [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
 
 
 def _shortest(

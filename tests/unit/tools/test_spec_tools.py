@@ -401,7 +401,8 @@ def test_a_query_has_a_parameter_for_each_argument(declaration: ToolDeclaration)
     memory, call, *parameters = inspect.signature(declaration.query).parameters
     assert (memory, call) == ("memory", "call")
     arguments = set(declaration.arguments.model_fields)
-    assert set(parameters) == arguments - ({"by"} if declaration.count else set())
+    of_declaration = {"between"} | ({"by"} if declaration.count else set())
+    assert set(parameters) == arguments - of_declaration
     if declaration.count is not None:
         memory, call, *counting = inspect.signature(declaration.count).parameters
         assert {"by"} <= set(counting) <= arguments

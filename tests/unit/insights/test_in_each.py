@@ -1,0 +1,147 @@
+"""`between`: one question about the same hours of each day, as if each were asked by itself."""
+
+from __future__ import annotations
+
+import time
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.insights.in_each import hours_of_days
+from ros2_memory.tools.arguments import _as_hours
+from tests.support.memories import asked
+from tests.support.rooms import S, asked_of, draw, write
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+DAYS = 3
+SECONDS = 400
+DAY_S = 86_400
+MIDNIGHT = 1_783_987_200
+BEGIN = MIDNIGHT + 86_400 - 120
+"""Two minutes before midnight, UTC; so on each of the days."""
+SPAN = {"start": MIDNIGHT, "end": MIDNIGHT + (DAYS + 2) * DAY_S}
+HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _in_utc() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("TZ", "UTC")
+        time.tzset()
+        yield
+    time.tzset()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bags = tmp_path_factory.mktemp("evenings")
+    for day in range(DAYS):
+        write(draw(day, SECONDS), bags / f"day_{day}", begin=BEGIN + day * DAY_S)
+    return bags
+
+
+@pytest.fixture(scope="module")
+def memory(folder: Path) -> Memory:
+    return asked_of(folder, stored=True)
+
+
+QUESTIONS: dict[str, dict[str, Any]] = {
+    "find_matches": {**HELLO, "where": "hall", "limit": 100},
+    "visits": {"where": "kitchen", "limit": 100},
+    "trajectory_summary": {"farthest_from": {"x": 0, "y": 0}},
+    "get_topic_in_range": {"topic": "/odom", "fields": ["position.x"], "by": "hour"},
+}
+
+
+@pytest.mark.parametrize("tool", QUESTIONS)
+@pytest.mark.parametrize(
+    ("hours", "first", "last"),
+    [("23:59-00:02", -60, 120), ("00:01 to 00:03:30", 60, 210), ("23:00-23:59", -3600, -60)],
+)
+def test_each_window_has_the_answer_that_it_has_alone(
+    memory: Memory, folder: Path, tool: str, hours: str, first: int, last: int
+) -> None:
+    given = QUESTIONS[tool]
+    reply = asked(memory, folder, tool, between=hours, **SPAN, **given)
+    assert len(reply["windows"]) == DAYS
+    shared = {key: each for key, each in reply.items() if key not in {"windows", "all", "notes"}}
+    sums = dict.fromkeys(reply["all"], 0.0)
+    for day, row in enumerate(reply["windows"]):
+        midnight = MIDNIGHT + (day + 1) * DAY_S
+        begin = midnight + first if day else max(midnight + first, BEGIN)
+        assert row["start"] == pytest.approx(begin, abs=1e-3)
+        assert row["end"] == pytest.approx(midnight + last, abs=1e-3)
+        alone = asked(memory, folder, tool, **given, start=row["start"], end=row["end"])
+        beside = {"start", "end", "local", "notes", "now", "quoted"}
+        expected = {key: each for key, each in alone.items() if key not in beside}
+        found = {key: each for key, each in {**shared, **row}.items() if key not in beside}
+        assert _without_ages(found) == _without_ages(expected)
+        for key in sums:
+            sums[key] += alone[key]
+    assert reply["all"] == pytest.approx(sums, abs=0.01)
+
+
+def _without_ages(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_without_ages(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _without_ages(each) for key, each in value.items() if key != "ago_s"}
+    return value
+
+
+def test_without_bounds_it_is_all_that_is_recorded(memory: Memory, folder: Path) -> None:
+    reply = asked(memory, folder, "visits", where="kitchen", between=["23:00", "01:00"])
+    assert [row["local"] for row in reply["windows"]] == [
+        "Tue 2026-07-14 23:58:00 - Wed 2026-07-15 01:00:00",
+        "Wed 2026-07-15 23:00:00 - Thu 2026-07-16 01:00:00",
+        "Thu 2026-07-16 23:00:00 - Fri 2026-07-17 00:04:39",
+    ]
+
+
+def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path) -> None:
+    reply = asked(memory, folder, "trajectory_summary", between="12:00-13:00", **SPAN)
+    assert (reply["error"], reply["reason"]) == ("no_data", "outside_range")
+
+
+@pytest.mark.parametrize(
+    ("tool", "given", "said"),
+    [
+        ("visits", {"between": "evening"}, 'between was "evening", which is not two times of day'),
+        ("visits", {"between": ["19:00"]}, "is not two times of day"),
+        ("visits", {"between": ["19:00", 99]}, "is not two times of day"),
+        ("visits", {"between": 19}, "is not two times of day"),
+        ("find_things", {"between": "19:00-22:00"}, 'unknown argument "between"'),
+    ],
+)
+def test_what_are_no_hours_is_named(
+    memory: Memory, folder: Path, tool: str, given: dict[str, Any], said: str
+) -> None:
+    reply = asked(memory, folder, tool, **given)
+    assert reply["error"] == "invalid_arguments"
+    assert said in reply["detail"]
+
+
+def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None:
+    for day in (0, 40):
+        write(draw(day, 20), tmp_path / f"day_{day}", begin=BEGIN + day * DAY_S)
+    memory = asked_of(tmp_path, stored=False)
+    reply = asked(memory, tmp_path, "visits", where="kitchen", between="19:00-22:00")
+    assert "between takes at most 31 days: ask about a shorter window" in reply["detail"]
+
+
+def test_hours_are_local_also_where_clocks_are_changed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patched:
+        patched.setenv("TZ", "Europe/Berlin")
+        time.tzset()
+        begin, end = (datetime(2026, 3, day).astimezone().timestamp() for day in (28, 31))
+        window = TimeWindow(round(begin) * S, round(end) * S)
+        found = hours_of_days(window, *_as_hours("22:00-04:00"))  # type: ignore[misc]
+    time.tzset()
+    assert [(each.stop - each.start) // (3600 * S) for each in found] == [4, 5, 6, 2]
