@@ -161,7 +161,7 @@ def topic_range(
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
     if len(chosen) < total:
         view.notes.add(f"{len(chosen)} of {total} samples, evenly spaced over the window")
-    note_unread(view, window)
+    note_unread(view, window, gaps=len(chosen) < total)
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()

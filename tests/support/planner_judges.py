@@ -173,7 +173,7 @@ def sighting_of(
 
     def judge(replies: Replies, asked: CallContext) -> None:
         found = at(replies[-1], "sightings", 0 if nth >= 0 else -1 - nth)
-        same("topic", text(found, "topic"), stream.topic)
+        same("topic", text(replies[-1], "topic"), stream.topic)
         row, of_thing = _rows(asked, stream, holds)[nth], stream is SEEN
         # A state lasts until a message says otherwise.
         later = [each for each in _messages(asked, stream) if each.log_time > row[-1].log_time]

@@ -193,7 +193,8 @@ def find_matches(
         end=end,
         now=now,
         unknown=elapsed.among(scope.unknown),
-        topic=topics[0] if is_spoken else "",
+        topic="" if topics[1:] else topics[0],
+        of_texts=is_spoken,
         episodes=episodes,
         notes=view.notes.sentences(),
     )

@@ -45,6 +45,7 @@ def _waypoints(mark: str) -> Keys:
     """Returns the keys of a waypoint; `mark` is that of those that no drawn way leads to."""
     return keys(
         TIME("timestamp", "time"),
+        LOCAL("local", "time", "time"),
         XYZ.spread("position"),
         YAW("yaw", "yaw_rad"),
         PLAIN(mark, "jump").if_any,

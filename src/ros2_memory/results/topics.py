@@ -20,6 +20,9 @@ from ros2_memory.core.reply import (
     TIME,
     TOTAL,
     XYZ,
+    Absent,
+    LocalTimes,
+    Unit,
     an_object,
     by_name,
     digits,
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
+    from ros2_memory.core.reply import Scope
     from ros2_memory.results.episodes import Episode, Spell
 
 _MINUTE_S: Final = 60
@@ -115,7 +119,10 @@ def _last_time(answer: TopicRange) -> Ns | None:
     "topic",
     "type",
     "total",
-    objects(keys(TIME("timestamp", "time"), MESSAGE("value")))("samples"),
+    objects(keys(TIME("timestamp", "time"), LOCAL("local", "time", "time"), MESSAGE("value")))(
+        "samples"
+    ),
+    span=(_first_time, _last_time),
     where=(
         "fields",
         keys(
@@ -147,21 +154,32 @@ class TopicRange(AnswerWithNotes):
     def columns(self) -> tuple[str, ...]:
         """The columns of the table: a field that holds an object has one for each of its parts."""
         names = dict.fromkeys(name for row in self._cells() for name in row)
-        return ("timestamp", *map(named, names))
+        return ("timestamp", *map(named, names), *(["local"] if any(self._locals()) else ()))
 
     @property
     def rows(self) -> list[JsonValue]:
         """A row for each sample: its time and cells; null where a sample has no such part."""
-        _, *names = self.columns
+        names = dict.fromkeys(name for row in self._cells() for name in row)
         return [
-            [moment(sample.time), *(quote(cells.get(name), name) for name in names)]
-            for sample, cells in zip(self.samples, self._cells(), strict=True)
+            [
+                moment(sample.time),
+                *(quote(cells.get(name), name) for name in names),
+                *([] if local is None else [local]),
+            ]
+            for sample, cells, local in zip(
+                self.samples, self._cells(), self._locals(), strict=True
+            )
         ]
 
     @property
     def extremes_by_field(self) -> list[tuple[str, Extremes]]:
         """The extremes, with the name of their field."""
         return [(found.field, found) for found in self.extremes]
+
+    def _locals(self) -> list[str | None]:
+        """Returns the local time of each sample, where they span so much that it is shown."""
+        times = LocalTimes(_first_time(self), _last_time(self))
+        return [times.text(sample.time) for sample in self.samples]
 
     def _cells(self) -> list[dict[str, JsonValue]]:
         return [
@@ -246,8 +264,13 @@ class LabelledPlace:
     frame_id: str
 
 
+def _other_topic(topic: str, scope: Scope) -> JsonValue | Absent:
+    """Returns a topic that is not that of the whole reply."""
+    return Absent.ABSENT if topic == getattr(scope.answer, "topic", None) else topic
+
+
 @result(
-    "topic",
+    Unit(_other_topic)("topic"),
     TIME("first_seen", "first"),
     TIME("last_seen", "last"),
     LOCAL("local", "first", "last"),
@@ -323,11 +346,12 @@ _SEARCHED: Final = (
 
 
 @result(
+    PLAIN("topic").if_any,
     OBJECTS("sightings").along("last_seen"),
     *_SEARCHED,
     span=("oldest", "now"),
     where=(
-        "topic",
+        "of_texts",
         keys(
             "topic",
             OBJECTS("episodes").along("end"),
@@ -339,7 +363,8 @@ _SEARCHED: Final = (
 class Sightings(AnswerWithNotes):
     """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
 
-    With a `topic` there are `episodes` in their place: of its texts, which hold until the next.
+    `topic` is that of all, where one alone was searched. With `of_texts` there are `episodes` in
+    their place: of its texts, which hold until the next.
 
     `total` is how many there are; None if the search ended before it had counted all. `unknown` is
     for how long something was recorded, and it is not known whether matches count.
@@ -353,6 +378,7 @@ class Sightings(AnswerWithNotes):
     now: Ns
     unknown: Ns = 0
     topic: str = ""
+    of_texts: bool = False
     episodes: tuple[Episode, ...] = ()
 
     @property

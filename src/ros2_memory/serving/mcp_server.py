@@ -352,7 +352,7 @@ def _listed(tool: Tool) -> ListedTool:
     )
     return ListedTool(
         name=tool.name,
-        title=f"{tool.title} (blocking)" if tool.blocking else tool.title,
+        title=tool.title,
         description=tool.description,
         input_schema=dict(tool.schema),
         annotations=annotations,

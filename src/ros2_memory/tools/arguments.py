@@ -46,6 +46,8 @@ MOST_CONDITIONS: Final = 8
 MOST_TIMES: Final = 20
 """Moments that one call asks about."""
 MOST_WAYPOINTS: Final = 200
+_INCLUSIVE: Final = "Inclusive."
+_OF_THE_OTHER: Final = "Of the other."
 FORMS_OF_TIME: Final = "Unix s or 2026-11-20T14:05."
 TIME_KINDS: Final = ("number", "string")
 """The JSON types of a time: Unix seconds, or ISO 8601 text."""
@@ -234,9 +236,7 @@ def _check_condition_value(value: JsonValue, info: ValidationInfo[object]) -> Js
 _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name)]
 _AtLeast0: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
-_Tolerance: TypeAlias = Annotated[
-    _AtLeast0, Field(description="Oldest age, s, e.g. 2 for a topic of 1 Hz.")
-]
+_Tolerance: TypeAlias = Annotated[_AtLeast0, Field(description="Oldest age, s, e.g. 2 at 1 Hz.")]
 _MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score.")]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _Time: TypeAlias = Annotated[
@@ -255,10 +255,10 @@ _Until: TypeAlias = Annotated[
     WithJsonSchema({"type": [*TIME_KINDS]}),
 ]
 _Start: TypeAlias = Annotated[_Time | None, Field(alias="start", description=FORMS_OF_TIME)]
-_End: TypeAlias = Annotated[_Until | None, Field(alias="end")]
+_End: TypeAlias = Annotated[_Until | None, Field(alias="end", description=_INCLUSIVE)]
 _Before: TypeAlias = Annotated[_Until | None, Field(alias="before", description="Up to this time.")]
 _Times: TypeAlias = Annotated[tuple[_Until, ...], BeforeValidator(_as_times)]
-_Topic: TypeAlias = Annotated[_Name, Field(examples=["/odom"])]
+_Topic: TypeAlias = Annotated[_Name, Field(description="E.g. /odom.", examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
     _Name,
@@ -267,7 +267,7 @@ _SearchTopic: TypeAlias = Annotated[
 _Fields: TypeAlias = Annotated[
     tuple[_Name, ...],
     BeforeValidator(_as_names),
-    Field(description='Only these, e.g. ["position.x"].'),
+    Field(description='Only these: ["position.x"].'),
 ]
 _Labels: TypeAlias = Annotated[
     tuple[_Name, ...],
@@ -339,18 +339,20 @@ _Between: TypeAlias = Annotated[
     WithJsonSchema(
         {
             "type": "string",
-            "description": "Only local hours, e.g. 19:00-22:00: a reply for each day.",
+            "description": "Local, e.g. 19:00-22:00; a reply a day.",
             "examples": ["19:00-22:00"],
         }
     ),
 ]
-_FrameId: TypeAlias = Annotated[_Name, Field(description="Frame of the reply.")]
+_FrameId: TypeAlias = Annotated[_Name, Field(description="Of the reply.")]
 _Limit: TypeAlias = Annotated[
-    Annotated[int, Field(strict=True, ge=1, le=100)], BeforeValidator(_as_integer)
+    Annotated[int, Field(strict=True, ge=1, le=100)],
+    BeforeValidator(_as_integer),
+    Field(description="Rows."),
 ]
 _ConditionType: TypeAlias = Annotated[
     Literal["contains", "contains_word", "equals", "above", "below", "near_position"],
-    Field(examples=["contains"]),
+    Field(description="How to test.", examples=["contains"]),
 ]
 _ConditionValue: TypeAlias = Annotated[
     JsonValue,
@@ -358,6 +360,7 @@ _ConditionValue: TypeAlias = Annotated[
     WithJsonSchema(
         {
             "anyOf": [{"type": kind} for kind in ("string", "number", "boolean", "object")],
+            "description": "near_position: {x, y}.",
             "examples": ["scissors"],
         }
     ),
@@ -367,18 +370,18 @@ _SearchField: TypeAlias = Annotated[_Name, Field(description="Dot-path to test."
 
 _By: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place"],
-    Field(description="Rows by it, in local time; place: of where, else named."),
+    Field(description="Rows, local; place: of where, else named."),
 ]
 
 
 _ByValue: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place", "value"],
-    Field(description="Rows by it, in local time; place: of where, else named; value: that held."),
+    Field(description="Rows, local; place: of where, else named; value: that held."),
 ]
 _ByInMatches: TypeAlias = Annotated[
     Literal["day", "hour", "weekday", "place", "label", "value"],
     Field(
-        description="Rows by it, in local time; place: of where, else named; value: that held; "
+        description="Rows, local; place: of where, else named; value: that held; "
         'label: seen (value "" for all).'
     ),
 ]
@@ -416,7 +419,9 @@ class At(TimeArgument):
     replaces = "moment"
     text = "at a time"
     either = ("timestamp", "timestamps")
-    at_s: _Until | None = Field(default=None, alias="timestamp", examples=[1784023200.5])
+    at_s: _Until | None = Field(
+        default=None, alias="timestamp", description=FORMS_OF_TIME, examples=[1784023200.5]
+    )
     each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES} times.")] = Field(
         default=(), alias="timestamps"
     )
@@ -427,7 +432,7 @@ class Ago(TimeArgument):
 
     replaces = "moment"
     text = "some seconds ago"
-    extra_reply = "with age_s (before now)"
+    extra_reply = "age_s"
     ago_s: Annotated[_AtLeast0, Field(examples=[10], alias="seconds_ago")]
 
 
@@ -439,7 +444,7 @@ class Between(TimeArgument):
     start_s: Annotated[
         _Time, Field(examples=[1784023200], alias="start", description=FORMS_OF_TIME)
     ]
-    end_s: Annotated[_Until, Field(examples=[1784023260], alias="end")]
+    end_s: Annotated[_Until, Field(examples=[1784023260], alias="end", description=_INCLUSIVE)]
 
 
 class RecapTime(TimeArgument):
@@ -448,15 +453,17 @@ class RecapTime(TimeArgument):
     replaces = "span"
     text = "in the last_s seconds, between two times, or around a moment"
     either = ("last_s", "start", "around")
-    last_s: Annotated[_Positive, Field(examples=[60])] | None = None
+    last_s: Annotated[_Positive, Field(description="Up to now.", examples=[60])] | None = None
     start_s: _Time | None = Field(
         default=None, alias="start", description=FORMS_OF_TIME, examples=[1784023200]
     )
-    end_s: _Until | None = Field(default=None, alias="end", examples=[1784023260])
+    end_s: _Until | None = Field(
+        default=None, alias="end", description=_INCLUSIVE, examples=[1784023260]
+    )
     around_s: _Until | None = Field(
         default=None,
         alias="around",
-        description="A moment: what changed shortly before and after it.",
+        description="What changed just before and after it.",
         examples=[1784023230],
     )
     before_s: Annotated[
@@ -481,10 +488,7 @@ class NoArguments(Arguments):
 class TopicListArguments(Arguments):
     """Which topics are listed."""
 
-    pattern: (
-        Annotated[_Name, Field(description="Only topics that match this glob, e.g. /vision/*.")]
-        | None
-    ) = None
+    pattern: Annotated[_Name, Field(description="A glob, e.g. /vision/*.")] | None = None
 
 
 class TopicAtArguments(Arguments):
@@ -502,7 +506,9 @@ class TopicRangeArguments(Arguments):
     topic: _Topic
     span: TimeRange
     max_samples: Annotated[
-        Annotated[int, Field(strict=True, ge=1, le=10_000)], BeforeValidator(_as_integer)
+        Annotated[int, Field(strict=True, ge=1, le=10_000)],
+        BeforeValidator(_as_integer),
+        Field(description="Rows."),
     ] = 100
     fields: _Fields = ()
     changes: (
@@ -554,9 +560,7 @@ class LastMatchArguments(ConditionArguments):
 class ValueWhenArguments(Arguments):
     """A condition on one topic, and another topic to read at the match."""
 
-    value_topic: Annotated[
-        _Name, Field(description="Topic to read at the match.", examples=["/odom"])
-    ]
+    value_topic: Annotated[_Name, Field(description="Topic to read then.", examples=["/odom"])]
     condition_topic: _SearchTopic
     condition_type: _ConditionType
     value: _ConditionValue
@@ -574,7 +578,9 @@ class TrajectoryArguments(Arguments):
     where: _WhereInFull | None = None
     frame_id: _FrameId | None = None
     max_waypoints: Annotated[
-        Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)], BeforeValidator(_as_integer)
+        Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)],
+        BeforeValidator(_as_integer),
+        Field(description="Corners."),
     ] = MAX_WAYPOINTS
     farthest: _Point | None = Field(default=None, alias="farthest_from")
     by: _By | None = None
@@ -594,12 +600,20 @@ class SaveMomentArguments(Arguments):
     """A label, and how many seconds before and after now to save."""
 
     label: Annotated[
-        str, Field(strict=True, examples=["charger found"]), AfterValidator(_check_label)
+        str,
+        Field(strict=True, description="A few words.", examples=["charger found"]),
+        AfterValidator(_check_label),
     ]
-    seconds_before: Annotated[_AtLeast0, AfterValidator(partial(_check_most, LONGEST_BEFORE_S))] = (
-        30
-    )
-    seconds_after: Annotated[_AtLeast0, AfterValidator(partial(_check_most, LONGEST_AFTER_S))] = 0
+    seconds_before: Annotated[
+        _AtLeast0,
+        AfterValidator(partial(_check_most, LONGEST_BEFORE_S)),
+        Field(description="Before now."),
+    ] = 30
+    seconds_after: Annotated[
+        _AtLeast0,
+        AfterValidator(partial(_check_most, LONGEST_AFTER_S)),
+        Field(description="After now."),
+    ] = 0
 
 
 class TypeArguments(Arguments):
@@ -649,7 +663,7 @@ class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
     fields: _Fields = ()
-    last_s: Annotated[_Positive, Field(description="Only the last seconds.")] | None = Field(
+    last_s: Annotated[_Positive, Field(description="The last seconds.")] | None = Field(
         default=None, alias="seconds"
     )
     start_s: _Start = None
@@ -686,7 +700,11 @@ class CompareArguments(Arguments):
     start_s: Annotated[
         _Time, Field(alias="start", description=FORMS_OF_TIME, examples=[1784023200])
     ]
-    end_s: Annotated[_Until, Field(alias="end", examples=[1784023260])]
-    with_start_s: Annotated[_Time, Field(alias="with_start", examples=[1783936800])]
-    with_end_s: Annotated[_Until, Field(alias="with_end", examples=[1783936860])]
+    end_s: Annotated[_Until, Field(alias="end", description=_INCLUSIVE, examples=[1784023260])]
+    with_start_s: Annotated[
+        _Time, Field(alias="with_start", description=_OF_THE_OTHER, examples=[1783936800])
+    ]
+    with_end_s: Annotated[
+        _Until, Field(alias="with_end", description=_OF_THE_OTHER, examples=[1783936860])
+    ]
     where: _WhereOfBoth | None = None

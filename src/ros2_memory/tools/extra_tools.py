@@ -32,16 +32,15 @@ _SIGHTINGS = ToolDeclaration(
     "Consecutive matches are one sighting; in a log each message is one, on /_action/status each "
     "goal: failed, aborted, "
     "succeeded. contains_word: whole "
-    "words (pot, not potato; knife -butter: knife without butter). Texts such as /task hold until "
+    "words (pot, not potato; knife -butter). Texts such as /task hold until "
     "the next, an empty one ends them: {{topic, episodes: [{{start, end, seconds, value, previous, "
     "next: {{value, start}}, with, robot}}]}}. "
-    "Reply: {{sightings: [{{topic, first_seen, last_seen, "
+    "Reply: {{topic, sightings: [{{first_seen, last_seen, "
     "duration_s, ago_s, count, matched: texts at last_seen, or value: its fields, robot: its "
     "position (at when), place: of the thing, score}}], total, unknown_s}}.",
     MatchesArguments,
     find_matches,
     blocking=True,
-    shows_example=True,
     count=count_matches,
 )
 _RECAP = ToolDeclaration(
@@ -55,14 +54,14 @@ _RECAP = ToolDeclaration(
     blocking=True,
 )
 _STATUS = ToolDeclaration(
-    (ToolName("memory_status", "State of the memory"),),
+    (ToolName("memory_status", "Memory state"),),
     "Whether the recorder runs, the age of the newest data, topics that fell silent, "
     "damaged files, how many days the disk budget holds, newest saved moments.",
     NoArguments,
     memory_status,
 )
 _VISITS = ToolDeclaration(
-    (ToolName("visits", "Visits to a place"),),
+    (ToolName("visits", "Visits"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
     "{map_frame} if transforms lead there, else {pose_topic}'s; without a place, "
     "all named ones. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "

@@ -148,15 +148,15 @@ _DECLARATIONS = (
         _list_topics,
     ),
     ToolDeclaration(
-        (ToolName("data_time_range", "Recorded time range"),),
+        (ToolName("data_time_range", "Recorded times"),),
         "The time range that is recorded, gaps in it, and the current time. "
-        "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, times "
-        "in Unix s and local ISO, null if nothing is recorded.",
+        "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, null "
+        "if nothing is recorded.",
         NoArguments,
         queries.data_time_range,
     ),
     ToolDeclaration(
-        _at_and_ago("topic", "A topic's value", at="at_time"),
+        _at_and_ago("topic", "Topic", at="at_time"),
         "A topic's value {when}: its newest message at or before then, at most tolerance_s old "
         "(default {tolerance}, too little for slow topics; latched: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
@@ -165,11 +165,11 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (
-            ToolName("get_topic_in_range", "A topic over a window", Between),
-            ToolName("get_topic_in_last", "A topic over the last seconds", Last),
+            ToolName("get_topic_in_range", "Topic over a window", Between),
+            ToolName("get_topic_in_last", "Topic over the last seconds", Last),
         ),
-        "A topic's messages {when}: all if total is at most max_samples, else so many, evenly "
-        "spaced, first and last included. start and end alike: that minute or day. changes: what "
+        "A topic's messages {when}: all up to max_samples, else so many, evenly spaced, "
+        "ends included. start and end alike: that minute or day. changes: what "
         "held, [{{start, seconds, value}}]. Reply: {{topic, type, total, samples: [{{timestamp, "
         "value}}]}}; "
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
@@ -181,8 +181,8 @@ _DECLARATIONS = (
     ToolDeclaration(
         _at_and_ago("position", "Robot position"),
         "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-        "(counter-clockwise from x), timestamp, topic, frame_id}}; for NavSatFix latitude, "
-        "longitude and altitude, and x, y, z are null.",
+        "(counter-clockwise from x), timestamp, topic, frame_id}}; of NavSatFix latitude, "
+        "longitude, altitude; x, y, z null.",
         PositionArguments,
         at_each(queries.position),
     ),
@@ -221,7 +221,7 @@ _DECLARATIONS = (
         shows_example=True,
     ),
     ToolDeclaration(
-        (ToolName("get_value_when", "A topic when another matched"),),
+        (ToolName("get_value_when", "Topic when another matched"),),
         "The value of value_topic when condition_topic last met a condition, "
         "e.g. where the robot was when it last saw scissors. Reply: {{timestamp, matched, value, "
         "value_timestamp, condition_topic, value_topic, frame_id}}, or null as find_last_match.",
@@ -236,8 +236,7 @@ _DECLARATIONS = (
         ),
         "How far and where the robot drove {when}, from {pose_topic}. Reply: {{distance_m, "
         "avg_speed, max_speed (m/s), duration_s, waypoints: [{{timestamp, x, y, z, yaw_deg}}], "
-        "...}}; with where: only the path inside it, and visits; with farthest_from {{farthest: "
-        "{{distance_m, x, y, in, timestamp, frame_id}}}}.",
+        "...}}; with where: only the path inside it, and visits.",
         TrajectoryArguments,
         _trajectory,
         blocking=True,

@@ -21,6 +21,7 @@ TIME_S: Final = 1e-6
 _MESSAGE: Final = frozenset({"value", "samples", "matched"})
 """Below these keys lie whole messages, or fields of them, which are exact."""
 _UNORDERED: Final = frozenset({"notes", "problems", "lines"})
+_BRACKETS: Final = re.compile(r" \([^()]*\)")
 _NUMBER: Final = re.compile(r"(?<![\w:.])-?\d+\.\d+(?![\w:.]*[-:])")
 """A number with decimals in a sentence, and no part of a time or a version."""
 
@@ -169,6 +170,18 @@ def _tells_unknown_time(recorded: Any, got: Any) -> bool:
     )
 
 
+def _explains_otherwise(recorded: Any, got: Any) -> bool:
+    """Whether sentences differ in brackets alone."""
+    return _BRACKETS.sub("", str(recorded)) == _BRACKETS.sub("", str(got))
+
+
+def _notes_no_gaps(recorded: Any, got: Any) -> bool:
+    """Whether sentences on gaps are all that is gone."""
+    kept = got if isinstance(got, list) else []
+    gone = [each for each in recorded if each not in kept] if isinstance(recorded, list) else []
+    return bool(gone) and all("nothing was recorded" in each for each in gone)
+
+
 _MOVING_MAPS: Final = ("moving_map", "robot_day_*", "drifting_map_*", "noisy_robot", "home_*")
 _NOISY: Final = (*_MOVING_MAPS, "mobrob_odom_mcap", "rerun_sensors_mcap")
 _UNKNOWN_TIME: Final = ("silent_odometry", "two_at_once", "two_robots_*")
@@ -241,6 +254,50 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         )
         for name in ("visits", "find_matches")
         for path in ("*unknown_s", "/columns", "/notes")
+    ),
+    *(
+        KnownWrong(
+            "*",
+            f"tool {name}",
+            "*/local",
+            "rows of several days have no local time",
+            only=lambda recorded, _got: bool(recorded == "(absent)"),
+        )
+        for name in ("get_topic_in_*", "*trajectory_summary")
+    ),
+    KnownWrong(
+        "*",
+        "*",
+        "*detail",
+        "what an argument is, is said otherwise or not at all",
+        only=_explains_otherwise,
+    ),
+    *(
+        KnownWrong(
+            "*",
+            "tool get_topic_in_*",
+            path,
+            "a table of several days has no local time",
+            only=lambda recorded, got: isinstance(got, list) and got[:-1] == recorded,
+        )
+        for path in ("/fields", "/rows/*")
+    ),
+    KnownWrong(
+        "*",
+        "tool get_topic_in_*",
+        "/notes",
+        "gaps are noted of a reply that has all messages",
+        only=_notes_no_gaps,
+    ),
+    *(
+        KnownWrong(
+            "*",
+            "tool find_matches",
+            path,
+            "each row repeats the one topic",
+            only=lambda recorded, got: "(absent)" in (recorded, got),
+        )
+        for path in ("/topic", "/sightings/*/topic")
     ),
     KnownWrong(
         "*",

@@ -291,6 +291,20 @@ class TestMaps:
         assert "error" not in reply(fleet_over(folder, NAMES), name, {**given, "robot": "r1"})
         assert "error" not in reply(fleet_over(folder, NAMES, shared_map=True), name, given)
 
+    def test_things_near_a_point_are_asked_of_one_robot_and_near_a_thing_of_all(
+        self, folder: Path
+    ) -> None:
+        fleet = fleet_over(folder, NAMES)
+        point = reply(fleet, "find_things", {"near": {"x": 1, "y": 2, "radius_m": 1}})
+        assert "near has coordinates" in point["detail"]
+        assert "error" not in reply(fleet, "find_things", {"near": {"label": "table"}})
+
+    def test_the_same_hours_of_each_day_are_asked_of_one_robot(self, folder: Path) -> None:
+        fleet = fleet_over(folder, NAMES)
+        asked = {"x": 1, "y": 0, "between": "00:00-23:59"}
+        assert "robot" in reply(fleet, "visits", asked)["detail"]
+        assert reply(fleet, "visits", {**asked, "robot": "r1"})["windows"]
+
     def test_a_place_is_that_of_each_robots_own_map(self, folder: Path) -> None:
         centre = {"r1": 1.0, "r2": 500.0}
 

@@ -103,7 +103,7 @@ def test_a_window_in_a_gap_within_a_bag_was_not_recorded(stalled: Memory) -> Non
     [
         ("find_matches", FLAG),
         ("recap", {}),
-        ("get_topic_in_range", {"topic": "/chatter"}),
+        ("get_topic_in_range", {"topic": "/chatter", "max_samples": 10}),
         ("trajectory_summary", {}),
         ("visits", {"x": 0.0, "y": 0.0}),
     ],
@@ -117,6 +117,14 @@ def test_a_reply_whose_window_touches_a_gap_names_it(
     assert named in reply["notes"]
     later = ask(memory, tool, start=BEGIN + 12, end=BEGIN + 19, **more)
     assert not [note for note in later.get("notes", []) if "nothing was recorded" in note]
+
+
+def test_a_gap_is_not_named_where_all_messages_are_returned(tmp_path: Path) -> None:
+    memory = memory_with(tmp_path, at_rates(20, STALLS[:1]))
+    window = {"start": BEGIN + 6, "end": BEGIN + 13}
+    for more in ({}, {"fields": ["data"]}, {"changes": True}):
+        reply = ask(memory, "get_topic_in_range", topic="/chatter", **window, **more)
+        assert not [note for note in reply.get("notes", []) if "nothing was recorded" in note]
 
 
 def test_a_step_of_the_clock_within_a_bag_is_no_gap(tmp_path: Path) -> None:

@@ -114,7 +114,7 @@ async def test_tools_are_listed_as_read_only_and_with_nothing_that_says_nothing(
     hints = [each.annotations and each.annotations.model_dump(exclude_none=True) for each in listed]
     # What is read-only cannot destroy; each hint is paid for by every planner that lists it.
     assert hints == 2 * [{"read_only_hint": True, "open_world_hint": False}]
-    assert [each.title for each in listed] == ["Quick", "Slow (blocking)"]
+    assert [each.title for each in listed] == ["Quick", "Slow"]
 
 
 async def test_the_server_says_its_name_its_version_and_how_to_ask() -> None:

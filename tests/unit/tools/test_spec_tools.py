@@ -140,9 +140,10 @@ def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
 
 @pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
 def test_arguments_of_a_form_of_their_own_show_it(tool: Tool) -> None:
-    """`where` does so where it is in full, and elsewhere names that tool."""
-    if tool.description.partition("Blocking. ")[2].startswith("As ") or "_seconds_ago" in tool.name:
+    """`where` does so where it is in full, and elsewhere names that tool. Each says what it is."""
+    if tool.description.removeprefix("Blocking. ").startswith("As "):
         return  # what the tool that it refers to says
+    assert all(each.get("description") for each in tool.arguments.values())
     shown = {
         "start": "2026-11-20T14:05",
         "tolerance_s": "e.g. 2",
@@ -158,7 +159,7 @@ def test_arguments_of_a_form_of_their_own_show_it(tool: Tool) -> None:
 def test_examples_of_descriptions_are_calls_without_what_is_optional() -> None:
     shown = {name: tool.description.partition(" Example: ")[2] for name, tool in TOOLS.items()}
     assert {name: json.loads(text) for name, text in shown.items() if text} == {
-        name: example(TOOLS[name]) for name in ("find_last_match", "find_matches")
+        name: example(TOOLS[name]) for name in ("find_last_match",)
     }
 
 
@@ -271,6 +272,7 @@ def test_milliseconds_and_nanoseconds_are_recognised(value: int) -> None:
 
 
 TIMES = {"timestamp", "start", "end", "before"}
+A_TIME = "Unix seconds or ISO 8601 text (Unix s or 2026-11-20T14:05), e.g. 1784023200.5"
 TWO_KINDS = {"type": ["number", "string"]}
 
 
@@ -315,7 +317,7 @@ def test_several_moments_may_be_a_list_or_its_json_text(times: Any) -> None:
 
 
 def test_one_moment_or_several_are_given() -> None:
-    expected = "timestamp is missing: Unix seconds or ISO 8601 text, e.g. 1784023200.5"
+    expected = f"timestamp is missing: {A_TIME}"
     assert refusal("get_position_at") == f"{expected}; or timestamps"
     assert refusal("get_position_at", timestamp=None) == f"{expected}; or timestamps"
     assert refusal("get_position_at", timestamps=[]) == f"{expected}; or timestamps"
@@ -328,7 +330,7 @@ def test_what_is_no_time_is_told() -> None:
     assert told == (
         'timestamp was "yesterday", which is not a valid time in ISO 8601, such as '
         "2026-11-20T14:05:00; give the date, too: now_local of data_time_range has today's; "
-        "expected Unix seconds or ISO 8601 text, e.g. 1784023200.5"
+        "expected Unix seconds or ISO 8601 text (Unix s or 2026-11-20T14:05), e.g. 1784023200.5"
     )
     for text in ("14:05", "yesterday 14:05", "9:30"):
         assert "give the date, too" in refusal("get_position_at", timestamp=text)

@@ -1,0 +1,90 @@
+"""Rows of a reply over more than half a day have local time beside Unix time; others do not."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.support.memories import asked
+from tests.support.rooms import BEGIN, SEEN, asked_of, draw, write
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
+
+DAY_S = 86_400
+TIMES = ("timestamp", "first_seen", "arrived")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    bags = tmp_path_factory.mktemp("days")
+    for day in range(2):
+        write(draw(3, 120), bags / f"day_{day}", begin=BEGIN + day * DAY_S)
+    return bags
+
+
+@pytest.fixture(scope="module")
+def memory(folder: Path) -> Memory:
+    return asked_of(folder, stored=False)
+
+
+def rows_of(value: Any) -> Iterator[dict[str, Any]]:
+    """The objects with a Unix time."""
+    if isinstance(value, list):
+        for each in value:
+            yield from rows_of(each)
+    elif isinstance(value, dict):
+        if not value.keys().isdisjoint(TIMES):
+            yield value
+        for each in value.values():
+            yield from rows_of(each)
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("get_topic_in_range", {"topic": "/chatter"}),
+        ("trajectory_summary", {}),
+        ("find_matches", {"topic": SEEN, "condition_type": "contains", "value": "cup"}),
+        ("visits", {"where": "kitchen"}),
+    ],
+)
+def test_local_time_stands_beside_unix_time_where_days_must_be_told_apart(
+    memory: Memory, folder: Path, tool: str, given: dict[str, Any]
+) -> None:
+    both = asked(memory, folder, tool, start=BEGIN, end=BEGIN + 2 * DAY_S, **given)
+    rows = [*rows_of(both)]
+    assert rows
+    for row in rows:
+        assert row.get("local"), row
+        key = next(key for key in TIMES if key in row)
+        if row[key] is not None:
+            local = datetime.fromtimestamp(row[key], UTC).astimezone()
+            assert row["local"].startswith(f"{local:%a %Y-%m-%d}")
+
+
+def test_a_table_has_it_as_its_last_column(memory: Memory, folder: Path) -> None:
+    given = {"topic": "/odom", "fields": ["position.x"], "max_samples": 4}
+    long = asked(memory, folder, "get_topic_in_range", start=BEGIN, end=BEGIN + 2 * DAY_S, **given)
+    assert long["fields"] == ["timestamp", "position.x", "local"]
+    first, *_, last = long["rows"]
+    assert [len(row) for row in long["rows"]] == [3] * 4
+    assert first[2][:14] != last[2][:14]
+    short = asked(memory, folder, "get_topic_in_range", start=BEGIN, end=BEGIN + 60, **given)
+    assert short["fields"] == ["timestamp", "position.x"]
+
+
+def test_the_topic_of_all_rows_is_said_once(memory: Memory, folder: Path) -> None:
+    given = {"condition_type": "contains", "value": "cup", "limit": 3}
+    one = asked(memory, folder, "find_matches", topic="*/scene_objects", **given)
+    assert one["topic"] == SEEN
+    assert len(one["sightings"]) == 3
+    assert not [row for row in one["sightings"] if "topic" in row]
+    several = asked(memory, folder, "find_matches", topic="*", **given)
+    assert "topic" not in several
+    assert {row["topic"] for row in several["sightings"]} == {SEEN}
