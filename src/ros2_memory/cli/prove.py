@@ -2,6 +2,7 @@
 
 import json
 import re
+import shlex
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -28,7 +29,7 @@ from ros2_memory.cli.options import (
 )
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, united, without
@@ -78,20 +79,23 @@ def prove(
     if output.exists() or not output.parent.is_dir():
         raise InvalidArgumentsError(f"{output} must be new, in a folder that is there")
     others = [each for each in bags.words or () if not is_folder(each)]
+    words = _words(question)
     loaded = bags.settings(*LOOKING, _LONG)
     memory = open_memory(loaded, verbose=bags.verbose)
     reads = _Reads(memory.reader)
     with spinner("asking"):
-        expected = _answer(loaded, replace(memory, reader=cast("BagReader", reads)), question)
+        expected = _answer(loaded, replace(memory, reader=cast("BagReader", reads)), words)
     view = View(memory, Call())
     parts = _parts(view)
+    if not parts:
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing is recorded: see ros2-memory info")
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
         for nth, spans in enumerate(_more_and_more(view, reads.spans(), parts)):
             path = Path(folder) / str(nth) / output.name
             path.parent.mkdir()
             count = _write(path, view, spans, parts)
             settings = load_to_look(None, [str(path), *LOOKING, _LONG, *others])
-            found = _answer(settings, open_memory(settings, verbose=bags.verbose), question)
+            found = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
             beside, differing = _differing(expected, found)
             if not differing:
                 break
@@ -108,7 +112,7 @@ def prove(
         hint = f"; -o {output.with_suffix('')} keeps recordings apart" if apart else ""
         typer.echo(f"over {output} the answer differs in {listed(differing)}{hint}", err=True)
         raise typer.Exit(EXIT_NEGATIVE)
-    typer.echo(f"the same answer: ros2-memory ask {question} {output}", err=True)
+    typer.echo(f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}", err=True)
 
 
 class _Reads:
@@ -253,16 +257,22 @@ def _messages(
                 yield each
 
 
-def _answer(settings: Settings, memory: Memory, question: str) -> JsonValue:
+def _words(question: str) -> list[str]:
+    """Returns the tool and its arguments: one JSON object, or `key=value` each."""
+    tool, _, rest = question.strip().partition(" ")
+    given = [rest] if rest.lstrip().startswith("{") else re.split(r"\s+(?=\w+=)", rest.strip())
+    return [tool, *(each for each in given if each)]
+
+
+def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonValue:
     """Returns the reply to a question, from the bags themselves."""
     memory = replace(memory, columns=Scanner(None, memory.index.bag_dir))
     dispatcher = build_dispatcher(settings, memory)
-    tool, _, rest = question.strip().partition(" ")
+    tool, *given = words
     tools = {each.name: each for each in dispatcher.tools}
     if tool not in tools:
         raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
-    words = [rest] if rest.lstrip().startswith("{") else re.split(r"\s+(?=\w+=)", rest.strip())
-    arguments = question_for(memory, tool, tools[tool], [each for each in words if each])
+    arguments = question_for(memory, tool, tools[tool], given)
     (reply,) = call_tools(dispatcher, {tool: arguments})
     answer: JsonValue = json.loads(reply.text)
     return answer

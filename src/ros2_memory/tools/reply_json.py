@@ -142,6 +142,8 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
         row |= {key: each for key, each in body.items() if key not in {*shared, *_OF_WINDOW}}
         rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
     whole: JsonObject = {}
+    if any("at_least" in body for body in known):
+        known = [{"at_least": body.get("total"), **body, "total": None} for body in known]
     for key in _SUMMED:
         numbers = [each for body in known if isinstance(each := body.get(key), int | float)]
         if numbers:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -65,10 +66,10 @@ def test_the_file_alone_gives_the_answer(
     proof = tmp_path / "proof.mcap"
     proved = exits(0, "prove", question, "-o", proof, bags)
     assert f"{len(messages(proof))} messages in {proof}" in proved.out
-    assert proved.err.endswith(f"ros2-memory ask {question} {proof}\n")
-    words = question.split(" ") if "{" not in question else question.split(" ", 1)
-    if question.startswith("visits"):
-        words = ["visits", question.removeprefix("visits ")]
+    said, _, command = proved.err.splitlines()[-1].partition(": ros2-memory ask ")
+    assert said == "the same answer"
+    *words, last = shlex.split(command)
+    assert (" ".join(words), last) == (question, str(proof))
     code = 1 if "/nothing" in question else 0
     asked = exits(code, "ask", *words, bags, "--json", "--set", "data.now=latest").json
     assert exits(code, "ask", *words, proof, "--json").json == asked
@@ -124,6 +125,12 @@ def test_nothing_is_left_beside_the_proof_and_the_bags_stay(
     exits(0, "prove", "list_frames", "-o", tmp_path / "proof.mcap", bags)
     assert sorted(bags.rglob("*")) == before
     assert {each.name for each in tmp_path.iterdir()} == {"bags", "proof.mcap"}
+
+
+def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
+    (tmp_path / "bags").mkdir()
+    refused = exits(2, "prove", "visits x=1 y=1", "-o", tmp_path / "proof", tmp_path / "bags")
+    assert "nothing is recorded" in refused.err
 
 
 @pytest.mark.parametrize(

@@ -96,6 +96,16 @@ def _without_ages(value: Any) -> Any:
     return value
 
 
+def test_where_not_all_are_counted_in_each_there_are_at_least_so_many(
+    memory: Memory, folder: Path
+) -> None:
+    few = {**HELLO, "where": "den", "limit": 1, "between": "23:58-00:05"}
+    reply = asked(memory, folder, "find_matches", **SPAN, **few)
+    counts = [row.get("total", row.get("at_least")) for row in reply["windows"]]
+    assert any("at_least" in row for row in reply["windows"])
+    assert reply["all"] == {"at_least": sum(counts)}
+
+
 def test_without_bounds_it_is_all_that_is_recorded(memory: Memory, folder: Path) -> None:
     reply = asked(memory, folder, "visits", where="kitchen", between=["23:00", "01:00"])
     assert [row["local"] for row in reply["windows"]] == [
