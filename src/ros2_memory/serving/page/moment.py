@@ -133,7 +133,7 @@ def _sightings(memory: Memory, call: Call, label: str, start_s: float, end_s: fl
         )
         sightings = render(found, memory.index.bag_dir)["sightings"]
         if isinstance(sightings, list):
-            rows += [each for each in sightings if isinstance(each, dict)]
+            rows += [{"topic": topic, **row} for row in sightings if isinstance(row, dict)]
         total = None if total is None or found.total is None else total + found.total
         notes += found.notes
     rows.sort(key=_last_seen, reverse=True)
