@@ -99,6 +99,14 @@ def show(browser: Browser, served: Served, address: str = "") -> None:
     browser.awaits(READY)
 
 
+def rest(page: Browser) -> None:
+    """The page looks for nothing new from here on, so that what a test sets stays."""
+    page.run(
+        "asking.abort(); asking = new AbortController(); isLooking = true;"
+        "for (const each of running.values()) each.abort();"
+    )
+
+
 def test_a_first_look_is_four_requests(page: Browser) -> None:
     requests = page.run(REQUESTS)
     assert requests[:3] == ["/page/page.css", "/page/page.js", "/page/span"]
@@ -240,6 +248,7 @@ def test_each_label_has_a_row_of_the_timeline_and_its_sightings_are_listed(page:
 
 def test_of_more_sightings_than_are_events_those_of_each_label_are_listed(page: Browser) -> None:
     page.awaits("return state.view.seen !== null")
+    rest(page)
     page.run(
         "state.view.counts.sightings = 900; state.view.events = state.view.events"
         ".filter((each) => each.kind !== 'thing'); state.view.things = [];"
@@ -253,6 +262,7 @@ def test_of_more_sightings_than_are_events_those_of_each_label_are_listed(page: 
 
 def test_of_many_labels_those_seen_longest_have_rows_and_the_rest_on_demand(page: Browser) -> None:
     page.awaits("return state.view.seen !== null")
+    rest(page)
     page.run(
         "const { start } = state.span; const labels = Array.from({ length: 14 }, (_, n) =>"
         " ({ label: `thing ${n}`, bars: [[start, start + 1]] }));"
@@ -344,6 +354,7 @@ def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:
 
 def test_of_more_stops_than_are_drawn_the_key_has_the_number(page: Browser) -> None:
     assert " of " not in page.text("#map-key")
+    rest(page)
     page.run("state.view.counts.stops = 9; showKey()")
     assert "stops, 2 of 9" in page.text("#map-key")
 
@@ -369,6 +380,7 @@ def test_a_clock_that_was_set_often_takes_one_row(page: Browser) -> None:
 
 def test_where_no_pose_is_recorded_the_reason_stands_in_place_of_a_map(page: Browser) -> None:
     """No empty grid, and nothing is claimed of what was in view where nothing sees."""
+    rest(page)
     page.run(
         "state.view = { ...state.view, path: null, robot: null, places: [], things: [], events: [],"
         " throughout: [], counts: {}, no_path: 'poses are on /pose: set data.pose_topic=/pose' };"
@@ -527,6 +539,7 @@ def test_nothing_green_stands_above_something_red(page: Browser) -> None:
 
 
 def test_ago_counts_from_one_moment_in_header_and_footer(page: Browser) -> None:
+    rest(page)
     shown = page.run(
         "const { range, status } = state.view; range.now = range.latest + 42;"
         "state.view.status = { ...status, now: range.latest + 1, recorder_alive: true };"
