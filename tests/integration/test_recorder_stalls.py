@@ -50,7 +50,7 @@ PERIOD_S: Final = 0.02
 """Of the second most frequent topic."""
 EDGE_S: Final = 2 * PERIOD_S + 0.06
 NEVER: Final = {"condition_type": "above", "field": "position.x", "value": 1e12}
-BUSY_S: Final = 300.0
+BUSY_S: Final = 3600.0
 TOPICS: Final = ("/odom", "/scan", "/slow")
 ROBOTS: Final = {
     "best effort": ("/odom:200:best_effort", "/scan:50:best_effort", "/slow:2:best_effort"),
