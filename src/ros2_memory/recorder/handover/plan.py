@@ -1,8 +1,8 @@
 """Plans how one recording takes over from another: when each step is due, and the sidecars. Pure.
 
 The new recorder is started beside the old one, and waits until it has subscribed to all topics of
-the old one, but not for ever, since a publisher may be gone. Then both run for two more seconds.
-The cut lies in the middle of those: messages published around it are in both recordings, so that a
+the old one, but not for ever, since a publisher may be gone. Then both run for `BOTH_S`, since who
+has subscribed receives nothing before the publishers discovered that. The cut lies in the middle of those: messages published around it are in both recordings, so that a
 message in transit, or a clock that is off by less than a second, loses and doubles nothing. A
 recorder that stalled meanwhile lost what was published: `union` finds that in the other one.
 """
@@ -28,7 +28,8 @@ if TYPE_CHECKING:
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
 """A recorder that has not started to record after this time is given up."""
-BOTH_S: Final = 2.0
+BOTH_S: Final = 5.0
+"""Longer than the 3 s after which Fast DDS sends discovery again that was lost on the way."""
 STEP_NS: Final[Ns] = 100 * NS_PER_MS
 """A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
 

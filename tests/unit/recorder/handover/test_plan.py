@@ -38,13 +38,14 @@ def waited(plan: HandoverPlan, *seconds: float, ready: bool, missing: tuple[str,
 
 
 class TestSteps:
-    def test_two_seconds_after_everything_is_subscribed_the_handover_is_complete(self) -> None:
+    def test_five_seconds_after_everything_is_subscribed_the_handover_is_complete(self) -> None:
+        """Longer than the 3 s after which DDS sends discovery again that was lost."""
         plan = HandoverPlan(at(0))
         assert waited(plan, 0.2, 1.0, ready=True, missing=("/odom",)) is Step.WAIT
         assert plan.bounds(at(1)) is None
-        assert waited(plan, 3.0, 4.9, ready=True) is Step.WAIT
-        assert plan.bounds(at(5)) is not None
-        assert waited(plan, 5.0, ready=True) is Step.COMPLETE
+        assert waited(plan, 3.0, 7.9, ready=True) is Step.WAIT
+        assert plan.bounds(at(8)) is not None
+        assert waited(plan, 8.0, ready=True) is Step.COMPLETE
 
     def test_a_recorder_that_is_not_ready_is_waited_for(self) -> None:
         plan = HandoverPlan(at(0))
@@ -55,22 +56,22 @@ class TestSteps:
         plan = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(plan, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
         assert plan.bounds(at(100)) is None
-        assert waited(plan, 20.0, 21.9, ready=True, missing=("/gone",)) is Step.WAIT
-        assert waited(plan, 22.0, ready=True, missing=("/gone",)) is Step.COMPLETE
+        assert waited(plan, 20.0, 24.9, ready=True, missing=("/gone",)) is Step.WAIT
+        assert waited(plan, 25.0, ready=True, missing=("/gone",)) is Step.COMPLETE
 
     def test_a_publisher_that_appears_while_both_record_is_waited_for_again(self) -> None:
         plan = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(plan, 1.0, 2.5, ready=True) is Step.WAIT
         assert waited(plan, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
         assert plan.bounds(at(100)) is None
-        assert waited(plan, 4.0, 5.9, ready=True) is Step.WAIT
-        assert waited(plan, 6.0, ready=True) is Step.COMPLETE
+        assert waited(plan, 4.0, 8.9, ready=True) is Step.WAIT
+        assert waited(plan, 9.0, ready=True) is Step.COMPLETE
 
     def test_one_that_appears_after_the_timeout_is_not(self) -> None:
         plan = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(plan, 19.0, ready=True) is Step.WAIT
         assert waited(plan, 20.5, ready=True, missing=("/late",)) is Step.WAIT
-        assert waited(plan, 21.0, ready=True, missing=("/late",)) is Step.COMPLETE
+        assert waited(plan, 24.0, ready=True, missing=("/late",)) is Step.COMPLETE
 
     def test_the_clock_set_back_abandons_it(self) -> None:
         plan = HandoverPlan(at(0))
@@ -82,13 +83,13 @@ class TestSteps:
         plan = HandoverPlan(at(0))
         waited(plan, 0.2, ready=True)
         assert plan.advance(at(0.4, stepped_s=3600), ready=True, missing=()) is Step.WAIT
-        assert plan.advance(at(2.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
+        assert plan.advance(at(5.3, stepped_s=3600), ready=True, missing=()) is Step.COMPLETE
 
     def test_a_clock_that_is_slewed_does_not(self) -> None:
         plan = HandoverPlan(at(0))
-        moments = [at(t / 5, stepped_s=-t / 5 * 0.08) for t in range(1, 12)]
+        moments = [at(t / 5, stepped_s=-t / 5 * 0.08) for t in range(1, 27)]
         steps = [plan.advance(moment, ready=True, missing=()) for moment in moments]
-        assert steps == [*[Step.WAIT] * 10, Step.COMPLETE]
+        assert steps == [*[Step.WAIT] * 25, Step.COMPLETE]
 
     def test_the_cut_lies_in_the_middle_of_the_time_that_both_recorded(self) -> None:
         plan = HandoverPlan(at(0))
