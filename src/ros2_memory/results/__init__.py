@@ -53,6 +53,7 @@ from ros2_memory.results.things import (
     Thing,
     Things,
     ThingStay,
+    UsualPlace,
 )
 from ros2_memory.results.topics import (
     BinColumn,
@@ -128,6 +129,7 @@ __all__ = [
     "TypeFields",
     "Undecodable",
     "Usual",
+    "UsualPlace",
     "ValueWhen",
     "Velocity",
     "Visit",

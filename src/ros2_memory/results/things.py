@@ -29,6 +29,7 @@ from ros2_memory.core.reply import (
     moment,
     objects,
     result,
+    shown,
     unit,
     vector,
 )
@@ -63,6 +64,29 @@ class ThingStay:
     inside: tuple[str, ...] = ()
 
 
+@result(
+    _XY("place"),
+    INSIDE("inside"),
+    digits(2)("share"),
+    PLAIN("hours").if_any,
+    digits(2)("likely_now", "likely"),
+)
+class UsualPlace:
+    """A place (m) where a thing usually is.
+
+    Attributes:
+        share: of the hours in which it was seen, 0 to 1.
+        hours: of the local day at which it is there, as "07-09, 16-23": until 09:00 and 23:00.
+        likely: how likely it is there now, 0 to 1.
+    """
+
+    place: Vector3
+    inside: tuple[str, ...]
+    share: float
+    hours: str
+    likely: float
+
+
 @result(PAIRS.spread("state", "by_state"), PLAIN("looks").if_any)
 class StillThere:
     """The state of a thing since it was last seen, as in the reply.
@@ -81,6 +105,13 @@ class StillThere:
     def by_state(self) -> dict[str, JsonValue]:
         """The time under its state."""
         return {self.state: moment(self.at)}
+
+
+def _usual_places(places: tuple[UsualPlace, ...], scope: Scope) -> JsonValue:
+    return [shown(place, scope) for place in places] or "no pattern"
+
+
+_USUALLY: Final = Unit(_usual_places)
 
 
 def _other_frame(frame_id: str, scope: Scope) -> JsonValue | Absent:
@@ -113,6 +144,7 @@ def thing(most_stays: int) -> Keys:
         OBJECT("still_there").if_known,
         PLAIN("moved_times").if_known.in_short,
         OBJECTS("moved").last(most_stays, "").if_any,
+        _USUALLY("usually").if_known,
     )
 
 
@@ -134,6 +166,8 @@ class Thing:
             at one place; else None.
         moves: whether it moves by itself.
         near_m: how far it is from what it is to be near, where that was asked for.
+        usually: where it usually is, by the hour; None where too little is known to say, empty
+            where the hours say no more than the place where it was last.
     """
 
     label: str
@@ -155,6 +189,7 @@ class Thing:
     at_once: int | None = None
     moves: bool = False
     near_m: float | None = None
+    usually: tuple[UsualPlace, ...] | None = None
 
     @property
     def yaw(self) -> float | None:

@@ -20,10 +20,11 @@ from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import parse_where, places_asked
-from ros2_memory.results import StillThere, Thing, Things, ThingStay
+from ros2_memory.results import StillThere, Thing, Things, ThingStay, UsualPlace
 from ros2_memory.things.instances import most_at_once
 from ros2_memory.things.known import KnownThings, known_things
 from ros2_memory.things.presence import in_ranges
+from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, notes_on
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def find_things(
     known = known_things(view, lowest, limits.labels)
     asked = {known.labels.key(each): each for each in labels}
     places = places_asked(limits, region, known.frames)
-    finder = _Finder(known, window, region, places)
+    finder = _Finder(known, window, region, places, now)
     found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
@@ -197,6 +198,7 @@ class _Finder:
     window: TimeWindow
     where: Where | None
     places: tuple[Place, ...]
+    now: Ns
 
     def find(self, keys: Collection[str]) -> Iterator[_Found]:
         """Yields the things of these keys, or all where there are none."""
@@ -247,6 +249,7 @@ class _Finder:
             still_there=self._still_there(instance, last, newest),
             moved=tuple(stays) if len(stays) > 1 else (),
             at_once=at_once,
+            usually=self._usually(frame, every) if len(stays) > 1 else None,
         )
 
     def _thing(
@@ -334,8 +337,27 @@ class _Finder:
             place,
             thing.at_once,
             result.is_vague(rows),
-            lambda: thing,
+            lambda: replace(thing, usually=self._usually(frame, rows)),
             mover,
+        )
+
+    def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
+        """Returns where a thing usually is, by its spots."""
+        spots = self.known.estimate.sights.spots[rows]
+        spots = spots[np.argsort(spots[:, Spot.LAST], kind="stable")]
+        now = min(self.now, self.window.stop)
+        found = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
+        if found is None:
+            return None
+        return tuple(
+            UsualPlace(
+                (one.x / _MM, one.y / _MM, 0.0),
+                places_at(self.places, frame, one.x / _MM, one.y / _MM),
+                one.share,
+                _hours_text(one.hours),
+                one.likely,
+            )
+            for one in found
         )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
@@ -400,6 +422,13 @@ class _Finder:
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
         return StillThere("not_looked_at_since", last)
+
+
+def _hours_text(hours: Sequence[int]) -> str:
+    """Returns hours of the day as stretches: "07-09" is until 09:00."""
+    begins = [hour for hour in hours if hour - 1 not in hours]
+    ends = [hour + 1 for hour in hours if hour + 1 not in hours]
+    return ", ".join(f"{begin:02}-{end:02}" for begin, end in zip(begins, ends, strict=True))
 
 
 def _place(stay: PlacedStay) -> tuple[float, float, float]:

@@ -75,9 +75,9 @@ _VISITS = ToolDeclaration(
 _THINGS = ToolDeclaration(
     (ToolName("find_things", "Things"),),
     "Which things there are and where: how many chairs, what is in a place or near X, where X is, "
-    "since when, where before; as of end. Reply: {{things: [{{label, place, in, first_seen, "
-    "last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
-    "times}}]}}], total, labels}}.",
+    "since when, where before, likely now; as of end. Reply: {{things: [{{label, place, in, "
+    "first_seen, last_seen, ago_s, count, seen_from, still_there, moved: [{{from, to, place, "
+    "times}}], usually}}], total, labels}}.",
     ThingsArguments,
     find_things,
     blocking=True,

@@ -609,3 +609,37 @@ def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path, near: Any) -
     reply = ask(tmp_path, near=near)
     assert reply["error"] == "invalid_arguments"
     assert "near" in reply["detail"]
+
+
+def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
+    """Every morning on the table, every afternoon elsewhere, for two weeks."""
+    table, shelf = ("mug", 3.0, 0.5), ("mug", 3.0, -1.0)
+    messages: list[Msg] = []
+    first = -BEGIN % 86_400
+    for day in range(14):
+        for hour in (7, 8, 9, 15, 16, 17):
+            at = first + day * 86_400 + hour * 3600
+            messages += looked(at, at + 4, HERE, table if hour < 12 else shelf)
+    write(tmp_path, messages, split_s=86_400.0)
+    evening = BEGIN + first + 13 * 86_400 + 18 * 3600
+    [mug] = ask(tmp_path, label="mug", end=evening)["things"]
+    afternoon, morning = mug["usually"]
+    assert (morning["place"], morning["in"]) == ({"x": 3.0, "y": 0.5}, "kitchen")
+    assert (morning["share"], afternoon["share"]) == (0.5, 0.5)
+    assert (morning["hours"], afternoon["hours"]) == ("07-10", "15-18")
+    assert afternoon["likely_now"] > 0.9
+    assert morning["likely_now"] < 0.1
+    next_morning = evening - 86_400 + 13 * 3600 + 1800
+    [mug] = ask(tmp_path, label="mug", end=next_morning)["things"]
+    assert mug["usually"][0]["hours"] == "07-10"
+
+
+def test_a_thing_that_is_moved_without_a_routine_has_no_pattern(tmp_path: Path) -> None:
+    chance = Random(3)
+    messages: list[Msg] = []
+    for nth in range(84):
+        at = nth // 6 * 86_400 + (7 + nth % 6) * 3600
+        messages += looked(at, at + 4, HERE, ("mug", 3.0, chance.choice([0.5, -1.0])))
+    write(tmp_path, messages, split_s=86_400.0)
+    [mug] = ask(tmp_path, label="mug")["things"]
+    assert mug["usually"] == "no pattern"

@@ -1,0 +1,187 @@
+"""Where a thing that moves usually is: at which hours of the day, and how likely now.
+
+What is known is where it was last seen in each hour of each day. A place is the likelier, the more
+often the thing was there around the same hour of the day; the place where it was last seen counts
+by how often the thing was still there after as long a time. That is told only where it would have
+said before each of the hours that are known where the thing was, better than the last place did
+(by Brier's score, so that being sure and wrong costs most), and better than without hours.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
+
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.counts.time_bins import local_offset
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
+
+    from ros2_memory.analysis.sights import Ints
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.counts.time_bins import Offset
+
+    Floats = NDArray[np.float64]
+
+_HOUR_NS: Final = 3600 * NS_PER_S
+_DAY_H: Final = 24
+_ONE_PLACE_MM: Final = 1000.0
+_FEWEST_HOURS: Final = 24
+"""Fewer known hours make no routine."""
+_FEWEST_DAYS: Final = 4
+_LEARNED_DAYS: Final = 2
+"""The first days are learned from only."""
+_AROUND_H: Final = 1.0
+"""Standard deviation of the hour at which somebody does the same on another day."""
+_AGES_H: Final = (1.5, 3.0, 6.0, 12.0, 24.0)
+"""How long ago it was seen last, in classes: between them differs how often it is still there."""
+_SIGMAS: Final = 2.0
+_LEAST_SHARE: Final = 0.05
+_MOST_PLACES: Final = 4
+
+
+class UsualPlace(NamedTuple):
+    """A place where a thing usually is.
+
+    Attributes:
+        x, y: mean of where it was seen there (mm).
+        share: of the hours in which it was seen anywhere.
+        hours: of the local day (0 to 23) at which this is its likeliest place.
+        likely: how likely it is there now, 0 to 1.
+    """
+
+    x: float
+    y: float
+    share: float
+    hours: tuple[int, ...]
+    likely: float
+
+
+class _Known(NamedTuple):
+    """The last sighting in each hour: its local hours since the epoch, and its place of `size`."""
+
+    hours: Floats
+    places: Ints
+    size: int
+
+    def before(self, nth: int) -> _Known:
+        return _Known(self.hours[:nth], self.places[:nth], self.size)
+
+    def shares(self) -> Floats:
+        """Returns how often it was at each place; none is impossible."""
+        return _normalised(np.bincount(self.places, minlength=self.size) + 1.0 / self.size)
+
+    def around(self, hour: float) -> Floats:
+        """Returns how likely each place is at an hour of the day."""
+        apart = np.abs((self.hours - hour + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
+        weights = np.exp(-((apart / _AROUND_H) ** 2) / 2)
+        return _normalised(np.bincount(self.places, weights, self.size) + self.shares())
+
+    def still_there(self, age_h: float) -> float:
+        """Returns how likely it is where it was seen so long ago."""
+        ages = np.digitize(np.diff(self.hours), _AGES_H)
+        alike = ages == np.digitize(age_h, _AGES_H)
+        same = np.diff(self.places)[alike] == 0
+        return (float(same.sum()) + 1.0) / (len(same) + 2.0)
+
+    def likely(self, hour: float, *, by_hours: bool = True) -> Floats:
+        """Returns how likely each place is at a later hour."""
+        shares, last = self.shares(), int(self.places[-1])
+        stays = self.still_there(hour - float(self.hours[-1]))
+        others = 1.0 - shares[last]
+        prior = shares * ((1.0 - stays) / others if others > 0 else 0.0)
+        prior[last] = stays
+        return _normalised(prior * (self.around(hour) / shares) if by_hours else prior)
+
+
+def _normalised(weights: ArrayLike) -> Floats:
+    found = np.asarray(weights, np.float64)
+    found /= found.sum()
+    return found
+
+
+def usual_places(
+    times: Ints, xy_mm: Ints, now: Ns, offset: Offset = local_offset
+) -> tuple[UsualPlace, ...] | None:
+    """Returns where a thing usually is, the likeliest place now first; none without a routine.
+
+    None where it was seen at one place alone, or too rarely to say.
+
+    Args:
+        times: when it was seen (N, ns), ascending.
+        xy_mm: where (N x 2).
+        now: the time that is asked about.
+        offset: of local time.
+    """
+    last = np.flatnonzero(np.diff(times // _HOUR_NS, append=-1) != 0)
+    hours = np.array([_local_hour(at, offset) for at in times[last].tolist()])
+    places, centres = _places(xy_mm[last])
+    known = _Known(hours, places, len(centres))
+    days = hours // _DAY_H
+    learned = int(np.searchsorted(days, days[0] + _LEARNED_DAYS))
+    if known.size < 2 or len(days) - learned < _FEWEST_HOURS or days[-1] - days[0] < _FEWEST_DAYS:
+        return None
+    if not _has_routine(known, learned):
+        return ()
+    likely = known.likely(max(_local_hour(now, offset), float(hours[-1])))
+    shares = np.bincount(places, minlength=known.size) / len(places)
+    by_hour = np.array([known.around(at + 0.5) for at in range(_DAY_H)])
+    seen_at = np.isin(np.arange(_DAY_H), hours % _DAY_H // 1)
+    best = np.where(seen_at, by_hour.argmax(axis=1), -1)
+    order = [place for place in np.argsort(-likely).tolist() if shares[place] >= _LEAST_SHARE]
+    return tuple(
+        UsualPlace(
+            x=float(centres[place, 0]),
+            y=float(centres[place, 1]),
+            share=float(shares[place]),
+            hours=tuple(np.flatnonzero(best == place).tolist()),
+            likely=float(likely[place]),
+        )
+        for place in order[:_MOST_PLACES]
+    )
+
+
+def _local_hour(at: Ns, offset: Offset) -> float:
+    """Returns the hours of local time since the epoch."""
+    return (at + offset(at // NS_PER_S) * NS_PER_S) / _HOUR_NS
+
+
+def _places(xy_mm: Ints) -> tuple[Ints, Floats]:
+    """Returns the number of the place of each position, and the mean of each place."""
+    numbers = np.zeros(len(xy_mm), np.int64)
+    sums: list[Floats] = []
+    for nth, position in enumerate(xy_mm):
+        apart = [math.dist(one[:2] / one[2], position) for one in sums]
+        place = int(np.argmin(apart)) if apart and min(apart) <= _ONE_PLACE_MM else len(sums)
+        if place == len(sums):
+            sums.append(np.zeros(3))
+        sums[place] += (*position, 1.0)
+        numbers[nth] = place
+    every = np.array(sums)
+    return numbers, every[:, :2] / every[:, 2:]
+
+
+def _has_routine(known: _Known, learned: int) -> bool:
+    """Returns whether the hours say more of where it was than the last place, and than shares.
+
+    Of the first sightings, so many are `learned` from only.
+    """
+    gains = []
+    for nth in range(learned, len(known.hours)):
+        before, hour, place = known.before(nth), float(known.hours[nth]), int(known.places[nth])
+        stayed = 0.0 if place == before.places[-1] else 2.0
+        score = _brier(before.likely(hour), place)
+        unhoured = _brier(before.likely(hour, by_hours=False), place)
+        gains.append((stayed - score, unhoured - score))
+    mean = np.mean(gains, axis=0)
+    error = np.std(gains, axis=0) / math.sqrt(len(gains))
+    return bool((mean > _SIGMAS * error).all())
+
+
+def _brier(likely: Floats, place: int) -> float:
+    off = likely.copy()
+    off[place] -= 1.0
+    return float((off**2).sum())

@@ -1,0 +1,125 @@
+"""Where a thing that moves usually is: told where it is right more often than the last place."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, TypeAlias
+
+import numpy as np
+import pytest
+
+from ros2_memory.things.routine import usual_places
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.things.routine import UsualPlace
+
+HOUR: Final = 3600 * 10**9
+DAY: Final = 24 * HOUR
+PLACES: Final = np.array([[1000, 1000], [4000, 2000], [7000, 5000], [2000, 8000]])
+KNOWN_DAYS: Final = 20
+DAYS: Final = 30
+
+Drawn: TypeAlias = "tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]"
+Whereabouts: TypeAlias = "Callable[[np.random.Generator, int, int, int], int]"
+
+
+def by_routine(chance: np.random.Generator, day: int, hour: int, _: int) -> int:
+    """Mornings, working days and evenings have their places; a tenth of all hours have another."""
+    if chance.random() < 0.1:
+        return int(chance.integers(len(PLACES)))
+    if hour < 9:
+        return 3 if hour < 7 else 0
+    at_work = 2 if day % 7 >= 5 else 1
+    return at_work if hour < 17 else 2
+
+
+def at_random(chance: np.random.Generator, _day: int, _hour: int, before: int) -> int:
+    return int(chance.integers(len(PLACES))) if chance.random() < 0.15 else before
+
+
+def seldom_moved(chance: np.random.Generator, _day: int, _hour: int, before: int) -> int:
+    return int(chance.integers(len(PLACES))) if chance.random() < 0.01 else before
+
+
+def mostly_at_home(chance: np.random.Generator, _day: int, _hour: int, _before: int) -> int:
+    return 0 if chance.random() < 0.8 else int(chance.integers(len(PLACES)))
+
+
+def month(seed: int, whereabouts: Whereabouts) -> Drawn:
+    """Returns when (ns) and where (mm) a thing was seen, and its place in each hour."""
+    chance = np.random.default_rng(seed)
+    times, seen, places = [], [], [0]
+    for hour in range(DAYS * 24):
+        places.append(whereabouts(chance, hour // 24, hour % 24, places[-1]))
+        if 7 <= hour % 24 < 23 and chance.random() < 0.35:
+            times.append(hour * HOUR + int(chance.integers(HOUR)))
+            seen.append(PLACES[places[-1]] + chance.normal(0, 80, 2).astype(np.int64))
+    return np.array(times), np.array(seen), np.array(places[1:])
+
+
+def told(drawn: Drawn, at: int) -> tuple[UsualPlace, ...] | None:
+    times, seen, _ = drawn
+    return usual_places(times[times < at], seen[times < at], at, lambda _: 0)
+
+
+def place_of(x: float, y: float) -> int:
+    return int(np.hypot(*(PLACES - [x, y]).T).argmin())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_routine_says_better_than_the_last_place_where_it_is(seed: int) -> None:
+    """By Brier's score over hours that were not known then."""
+    drawn = month(seed, by_routine)
+    times, seen, places = drawn
+    chance = np.random.default_rng(seed)
+    scores, by_last_place = [], []
+    for hour in chance.integers(KNOWN_DAYS * 24, DAYS * 24, 30).tolist():
+        at = hour * HOUR
+        usual = told(drawn, at)
+        assert usual, "a routine is found"
+        likely = np.zeros(len(PLACES))
+        for each in usual:
+            likely[place_of(each.x, each.y)] = each.likely
+        likely[places[hour]] -= 1
+        scores.append((likely**2).sum())
+        last = place_of(*seen[times < at][-1])
+        by_last_place.append(0 if last == places[hour] else 2)
+    assert np.mean(scores) < 0.75 * np.mean(by_last_place)
+
+
+def test_its_places_have_their_hours_and_shares() -> None:
+    usual = told(month(1, by_routine), KNOWN_DAYS * DAY + 12 * HOUR)
+    assert usual is not None
+    hours = {place_of(each.x, each.y): each.hours for each in usual}
+    assert {10, 11, 12, 13, 14} <= set(hours[1])
+    assert {18, 19, 20, 21} <= set(hours[2])
+    assert all(7 <= hour < 23 for each in usual for hour in each.hours)
+    assert usual[0].likely == max(each.likely for each in usual)
+    assert sum(each.share for each in usual) <= 1.0
+
+
+@pytest.mark.parametrize("whereabouts", [at_random, seldom_moved, mostly_at_home])
+def test_without_a_routine_none_is_told(whereabouts: Whereabouts) -> None:
+    """A chance of one in forty for each that hours seem to say something is allowed for."""
+    found = [told(month(seed, whereabouts), DAYS * DAY) for seed in range(20)]
+    assert sum(bool(each) for each in found) <= 1
+
+
+def test_of_few_days_or_of_one_place_nothing_is_said() -> None:
+    drawn = month(2, by_routine)
+    assert told(drawn, 3 * DAY) is None
+    times, seen, _ = drawn
+    assert (
+        usual_places(times, np.broadcast_to(seen[0], seen.shape), DAYS * DAY, lambda _: 0) is None
+    )
+
+
+def test_hours_are_those_of_local_time() -> None:
+    times, seen, _ = month(1, by_routine)
+    here = usual_places(times, seen, DAYS * DAY, lambda _: 0)
+    west = usual_places(times + 5 * HOUR, seen, DAYS * DAY + 5 * HOUR, lambda _: -5 * 3600)
+    assert here
+    assert west == here
