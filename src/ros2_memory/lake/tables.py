@@ -301,9 +301,6 @@ TABLES: Final[Mapping[str, LakeTable]] = {
 }
 """The tables by name; `bags` is committed last, so that a bag with a row there is whole."""
 
-RETIRED: Final = ("digests",)
-"""Tables of earlier versions, from which nothing is read any more."""
-
 Row = tuple[object, ...]
 """The values of a table's own columns, in order."""
 

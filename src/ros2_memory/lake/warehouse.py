@@ -18,8 +18,8 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_MS
-from ros2_memory.lake.tables import NAMESPACE, RETIRED, open_tables
-from ros2_memory.lake.written_files import drop_with_files, file_properties
+from ros2_memory.lake.tables import NAMESPACE, open_tables
+from ros2_memory.lake.written_files import file_properties
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -124,16 +124,12 @@ class LakeLocation:
             return None if newest is None else newest.timestamp_ms * NS_PER_MS
 
     def tables(self, catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
-        """Returns tables by name, made where they are missing; drops those of earlier versions.
+        """Returns tables by name, made where they are missing.
 
         Raises:
             LakeError: they cannot be opened.
         """
         with self.translated("opening the lake's tables"):
-            for name in RETIRED:
-                identifier = f"{self.namespace}.{name}"
-                if catalog.table_exists(identifier):
-                    drop_with_files(self.state_dir, catalog, identifier)
             return open_tables(catalog, names, self.namespace)
 
 

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
 
-    from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
 WRITTEN_FILE: Final = "written.jsonl"
@@ -110,40 +109,13 @@ def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written
                 if file.startswith(below) and ".." not in file and at < written_before
             }
             for file in sorted(old - referenced_files(table)) if old else ():
-                _delete(table, file)
+                with suppress(FileNotFoundError):  # as after a kill
+                    table.io.delete(file)
                 gone.add(file)
     finally:
         if gone:
             _keep(state_dir, {file: at for file, at in recorded.items() if file not in gone})
     return len(gone)
-
-
-def drop_with_files(state_dir: Path, catalog: IcebergCatalog, identifier: str) -> None:
-    """Drops a table, with the files of it that were recorded.
-
-    Killed before the drop, it is done again; right after it, one file of metadata may stay, which
-    has no rows.
-
-    Raises:
-        OSError: a file cannot be deleted.
-    """
-    table = catalog.load_table(identifier)
-    below = f"{table.location().rstrip('/')}/"
-    recorded = recorded_files(state_dir)
-    own = {file for file in recorded if file.startswith(below) and ".." not in file}
-    # Last, since the table is opened by it.
-    for file in sorted(own - {table.metadata_location}):
-        _delete(table, file)
-    _keep(state_dir, {file: at for file, at in recorded.items() if file not in own})
-    catalog.drop_table(identifier)
-    _delete(table, table.metadata_location)
-
-
-def _delete(table: IcebergTable, file: str) -> None:
-    try:
-        table.io.delete(file)
-    except FileNotFoundError:
-        return  # as after a kill
 
 
 def _keep(state_dir: Path, recorded: Mapping[str, Ns]) -> None:

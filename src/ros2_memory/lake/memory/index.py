@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from bisect import bisect_left, bisect_right
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from itertools import groupby
@@ -72,12 +71,10 @@ class _Day(NamedTuple):
     Attributes:
         made_of: the files of its rows.
         bags: its bags, as what they are there, and as files.
-        unread: how many others were shipped by a version that shipped no messages.
     """
 
     made_of: tuple[str, ...]
     bags: Sequence[tuple[LakeBag, BagFile]]
-    unread: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +87,6 @@ class _Window:
         days: what is known of each.
         timeline: the bags of all.
         files: these by their paths, and what they are in the lake.
-        unread: how many bags of them are no files; see `_Day`.
     """
 
     since: date | None = None
@@ -98,7 +94,6 @@ class _Window:
     days: Mapping[date, _Day] = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     files: Mapping[str, tuple[LakeBag, BagFile]] = field(default_factory=dict)
-    unread: int = 0
 
 
 class LakeIndex:
@@ -192,12 +187,6 @@ class LakeIndex:
         self._asked.since = date.max
         return found if date.min < found < date.max else None
 
-    def take_unread(self) -> int:
-        """Returns how many bags without messages this thread was shown since it asked."""
-        found: int = getattr(self._asked, "unread", 0)
-        self._asked.unread = 0
-        return found
-
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
         return None
@@ -222,7 +211,6 @@ class LakeIndex:
     def _note(self, window: _Window) -> None:
         known: date = getattr(self._asked, "since", date.max)
         self._asked.since = min(known, window.since or date.min)
-        self._asked.unread = max(getattr(self._asked, "unread", 0), window.unread)
 
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
@@ -268,7 +256,6 @@ class LakeIndex:
                 [bag for file, bag in now.items() if before.get(file) is not bag],
             ),
             files=files,
-            unread=sum(each.unread for each in days.values()),
         )
 
     def _read(self, made_of: Mapping[date, tuple[str, ...]], paths: _Paths) -> dict[date, _Day]:
@@ -276,12 +263,8 @@ class LakeIndex:
         span = min(made_of), max(made_of)
         found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
         rows: dict[date, list[Mapping[str, object]]] = {day: [] for day in made_of}
-        unread = Counter[date]()
         for row in found.to_pylist():
-            if row["summary"] is None:
-                unread[row["day"]] += 1
-            else:
-                rows[row["day"]].append(row)
+            rows[row["day"]].append(row)
         schemas: dict[str, SummarySchema] = {}
         days: dict[date, _Day] = {}
         for day, of_day in rows.items():
@@ -295,7 +278,7 @@ class LakeIndex:
                     path = paths.of(f"{self.bag_dir}/{name}", bag_id)
                     bag = paths.known(_file(path, row, schemas))
                     bags.append((LakeBag(bag_id, day, states), bag))
-            days[day] = _Day(made_of[day], bags, unread[day])
+            days[day] = _Day(made_of[day], bags)
         return days
 
 
