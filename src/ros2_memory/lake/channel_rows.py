@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.lake.packed_messages import packed_messages
-from ros2_memory.lake.tables import topic_key
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -80,22 +79,21 @@ class ChannelRows:
             if each.payloads is not None and len(packed) > most and not self._is_whole(channel):
                 each.payloads = None
                 packed = packed_messages(each.log_times, each.publish_times, None)
-            yield (
-                channel.topic,
-                topic_key(channel.topic),
-                number,
-                schema.name,
-                channel.encoding,
-                channel.latched,
-                schema.encoding,
-                schema.text,
-                json.dumps(channel.metadata),
-                count,
-                each.log_times[0],
-                each.log_times[-1],
-                each.payloads is not None,
-                packed,
-            )
+            yield {
+                "topic": channel.topic,
+                "channel": number,
+                "type": schema.name,
+                "encoding": channel.encoding,
+                "latched": channel.latched,
+                "schema_encoding": schema.encoding,
+                "schema": schema.text,
+                "metadata": json.dumps(channel.metadata),
+                "messages": count,
+                "first_ns": each.log_times[0],
+                "last_ns": each.log_times[-1],
+                "has_payloads": each.payloads is not None,
+                "packed": packed,
+            }
 
     def _is_whole(self, channel: Channel) -> bool:
         return channel.topic in self._whole

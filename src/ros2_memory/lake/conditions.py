@@ -51,11 +51,6 @@ def of_topics(condition: BooleanExpression, topics: Collection[str]) -> BooleanE
     return And(condition, _one_of("topic", topics))
 
 
-def of_day(robot: str, day: date) -> BooleanExpression:
-    """Returns the condition on rows of one partition."""
-    return And(equal("robot", robot), equal("day", day.isoformat()))
-
-
 def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
     """Returns the condition on rows of one day of some robots."""
     return And(_one_of("robot", robots), equal("day", day.isoformat()))
@@ -67,7 +62,10 @@ def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpressio
     The bounds of the ids let Iceberg pass over the files of other times.
     """
     return any_of(
-        [And(of_day(robot, day), of_ids(robot, of_one)) for (robot, day), of_one in ids.items()]
+        [
+            And(of_robots([robot], day), of_ids(robot, of_one))
+            for (robot, day), of_one in ids.items()
+        ]
     )
 
 
@@ -79,11 +77,6 @@ def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
         _at_most("bag_id", max(ids)),
         _one_of("bag_id", ids),
     )
-
-
-def between(robot: str, column: str, start: Ns, stop: Ns) -> BooleanExpression:
-    """Returns the condition on rows of a robot whose time is in `[start, stop)`."""
-    return And(equal("robot", robot), _at_least(column, start), _below(column, stop))
 
 
 def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> BooleanExpression:

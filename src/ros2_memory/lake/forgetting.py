@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.lake.conditions import (
     any_of,
-    between,
     except_bags,
     of_bags,
     of_ids,
@@ -58,21 +57,22 @@ def forget_in_lake(
     """
     with location.translated("forgetting in the lake"):
         named = _named(tombstone)
-        reaching = named or _reaching(tombstone, "start_ns", "end_ns")
+        reaching = named or _reaching(tombstone, "bags")
         found = _bags(tables["bags"], reaching)
         spared: set[str] = set()
         if tombstone.topics:
             # What is in the lake of a bag shows in its channels.
-            holding = _reaching(tombstone, "first_ns", "last_ns")
-            of_these = _bags(tables["channels"], of_topics(holding, tombstone.topics))
+            holding = of_topics(_reaching(tombstone, "channels"), tombstone.topics)
+            of_these = _bags(tables["channels"], holding)
             spared = {*found["bag_id"].to_pylist()} - {*of_these["bag_id"].to_pylist()}
         ids: dict[tuple[str, date], set[str]] = {}
         for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):
             if bag_id not in spared:
                 ids.setdefault((tombstone.robot, day), set()).add(bag_id)
         # `bags` last: until then it lists the rows to delete.
-        for name in sorted(TABLES, key=lambda each: each == "bags"):
-            conditions = [named or except_bags(_in_window(tombstone, name), spared)]
+        for name in TABLES:
+            # By their own times, too: a killed process left rows without one in `bags`.
+            conditions = [named or except_bags(_reaching(tombstone, name), spared)]
             if ids:
                 conditions.append(of_bags(ids))
             table = tables[name]
@@ -105,18 +105,6 @@ def _named(tombstone: Tombstone) -> BooleanExpression | None:
     return of_ids(tombstone.robot, tombstone.bags) if tombstone.bags else None
 
 
-def _in_window(tombstone: Tombstone, name: str) -> BooleanExpression:
-    """Returns the condition on rows of a table that are of the window by their own times.
-
-    Such as those that a killed process left without a row in `bags`.
-    """
-    columns = TABLES[name].columns
-    if "time_ns" in columns:
-        return between(tombstone.robot, "time_ns", tombstone.start, tombstone.stop)
-    first = "start_ns" if name == "bags" else "first_ns"
-    last = "end_ns" if name == "bags" else "last_ns"
-    return _reaching(tombstone, first, last)
-
-
-def _reaching(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
-    return overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)
+def _reaching(tombstone: Tombstone, name: str) -> BooleanExpression:
+    """Returns the condition on rows of a table that reach into the window."""
+    return overlapping(tombstone.robot, TABLES[name].span, tombstone.start, tombstone.stop)

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
@@ -36,8 +34,8 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.lake.conditions import any_of, of_bags, overlapping
 from ros2_memory.lake.forgetting import forget_in_lake
-from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, end_of, to_arrow
+from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.tables import TABLES, day_of, end_of
 from ros2_memory.lake.tombstones import Tombstone, append_tombstone
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import quiet_deletes
@@ -47,6 +45,7 @@ if TYPE_CHECKING:
     from datetime import date
     from pathlib import Path
 
+    import pyarrow as pa
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
@@ -61,17 +60,6 @@ log = get_logger(__name__)
 MOST_BAGS: Final = 2_000
 MOST_ROWS: Final = 200_000
 """Of one batch: they are in memory until it is committed."""
-_KNOWN: Final = (
-    "bag_id",
-    "file",
-    "size",
-    "sha256",
-    "mtime_ns",
-    "made_of",
-    "start_ns",
-    "end_ns",
-    "day",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,20 +95,6 @@ class Shipped:
     problems: list[str] = field(default_factory=list)
 
 
-class _Known(NamedTuple):
-    """A bag that has a row in `bags`."""
-
-    bag_id: str
-    file: str
-    size: int
-    sha256: str
-    mtime_ns: Ns
-    made_of: str
-    start: Ns
-    end: Ns
-    day: date
-
-
 @dataclass(slots=True)
 class _OfRobot:
     """What is known of the bags that a robot has, and no longer of those that it had.
@@ -134,7 +108,7 @@ class _OfRobot:
     """
 
     days: frozenset[date] = frozenset()
-    known: dict[str, _Known] = field(default_factory=dict)
+    known: dict[str, ShippedBag] = field(default_factory=dict)
     ids: dict[str, tuple[tuple[int, Ns], str]] = field(default_factory=dict)
     forbidden: dict[str, bool] = field(default_factory=dict)
     receipts: dict[str, Receipt] | None = None
@@ -145,9 +119,9 @@ class _Ready:
     """A bag of a batch, its rows, and the days and ids under which older ones of it may lie."""
 
     robot: RobotBags
-    known: _Known
+    known: ShippedBag
     rows: Mapping[str, Sequence[Row]]
-    replaced: tuple[_Known, ...]
+    replaced: tuple[ShippedBag, ...]
 
 
 class Shipper:
@@ -271,7 +245,7 @@ class Shipper:
         known = self._known_of(robot.name, bags)
         by_file = {each.file: each for each in known.values()}
         seen: set[str] = set()
-        receipts: list[_Known] = []
+        receipts: list[ShippedBag] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
         for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
             self._alive()
@@ -331,13 +305,12 @@ class Shipper:
         self,
         robot: RobotBags,
         bag: BagFile,
-        now: _Known,
-        before: _Known | None,
-        other: _Known | None,
+        now: ShippedBag,
+        before: ShippedBag | None,
+        other: ShippedBag | None,
     ) -> _Ready:
         """Returns a bag with its rows; `other` was known under its path."""
-        content = BagContent(bag, now.bag_id, now.sha256, now.made_of)
-        rows = rows_of(robot.memory, content, self._messages)
+        rows = rows_of(robot.memory, bag, now, self._messages)
         older = [] if before is None else [before]
         if other is not None and other is not before and _holds(other, now):
             older.append(other)
@@ -362,17 +335,27 @@ class Shipper:
         return forbidden[key]
 
     def _described(
-        self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None
-    ) -> _Known:
+        self, robot: RobotBags, bag: BagFile, bag_id: str, before: ShippedBag | None
+    ) -> ShippedBag:
         """Returns what a bag would be known as."""
         made = made_of(robot.memory, bag, robot.config, self._messages)
         same = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and same else sha256_of(bag.path)
         file = relative(bag.file, str(robot.bag_dir))
-        day = day_of(bag.start)
-        return _Known(bag_id, file, bag.size, sha256, bag.mtime_ns, made, bag.start, bag.end, day)
+        return ShippedBag(
+            robot.name,
+            bag_id,
+            day_of(bag.start),
+            file,
+            bag.size,
+            sha256,
+            bag.mtime_ns,
+            made,
+            bag.start,
+            bag.end,
+        )
 
-    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, _Known]:
+    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, ShippedBag]:
         """Returns what the lake has of the days of some bags; of each day it is asked once.
 
         And of the days beside them: another first message of a bag that counts moves its begin.
@@ -387,12 +370,12 @@ class Shipper:
             of_robot.known = {
                 bag_id: each
                 for bag_id, each in of_robot.known.items()
-                if any(each.day <= day <= day_of(each.end) for day in days)
+                if any(each.day <= day <= day_of(each.end_ns) for day in days)
             }
             of_robot.days = days
         return of_robot.known
 
-    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[_Known]:
+    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[ShippedBag]:
         """Yields the bags of a robot in the lake that have something of some days.
 
         Raises:
@@ -401,13 +384,12 @@ class Shipper:
         spans = united(
             (end_of(day - timedelta(1)) + 1, min(end_of(day) + 1, MAX_NS)) for day in days
         )
-        reaching = [overlapping(robot, ("start_ns", "end_ns"), *span) for span in spans]
+        reaching = any_of([overlapping(robot, TABLES["bags"].span, *span) for span in spans])
         with self._location.translated("reading the lake's bags"):
-            scan = self._tables["bags"].refresh().scan(any_of(reaching), selected_fields=_KNOWN)
-            found = scan.to_arrow().select(_KNOWN)
-            columns = [found[name].to_pylist() for name in _KNOWN]
-        for row in zip(*columns, strict=True):
-            yield _Known(*row)
+            bags = self._tables["bags"].refresh()
+            found = bags.scan(reaching, selected_fields=ShippedBag._fields).to_arrow()
+        for row in found.to_pylist():
+            yield ShippedBag(**row)
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
         """Commits a batch.
@@ -417,21 +399,12 @@ class Shipper:
         """
         self._pause()
         condition = _rows_of(batch)
-        parts: dict[tuple[str, date], list[_Ready]] = {}
-        for each in batch:
-            parts.setdefault((each.robot.name, each.known.day), []).append(each)
         rows = 0
         try:
-            # `bags` last: a bag with a row there is whole.
-            for name in sorted(TABLES, key=lambda each: each == "bags"):
-                table = pa.concat_tables(
-                    to_arrow(
-                        TABLES[name], robot, day, {one.known.bag_id: one.rows[name] for one in part}
-                    )
-                    for (robot, day), part in parts.items()
-                )
-                rows += table.num_rows
-                self._overwrite(name, table, condition)
+            for name, table in TABLES.items():
+                filled = table.filled([row for each in batch for row in each.rows[name]])
+                rows += filled.num_rows
+                self._overwrite(name, filled, condition)
         except LakeError:
             self._look_again()
             raise
@@ -455,7 +428,7 @@ class Shipper:
         with self._location.translated(f"writing the lake's {name}"), quiet_deletes():
             self._tables[name].refresh().overwrite(rows, overwrite_filter=condition)
 
-    def _confirm(self, robot: RobotBags, bags: Iterable[_Known], done: Shipped) -> None:
+    def _confirm(self, robot: RobotBags, bags: Iterable[ShippedBag], done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
         if not has_recorded(robot.bag_dir):
             return
@@ -489,22 +462,17 @@ def _state_of(bag: BagFile, bag_id: str) -> str:
     return f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
 
 
-def _is_same(before: _Known, now: _Known) -> bool:
-    """Returns whether the rows of a bag would be the same."""
-    return before == _with_times(now, before)
+def _is_same(before: ShippedBag, now: ShippedBag) -> bool:
+    """Returns whether the rows of a bag would be the same; a copy has another path and mtime."""
+    return before == now._replace(mtime_ns=before.mtime_ns, file=before.file)
 
 
-def _with_times(now: _Known, before: _Known) -> _Known:
-    """Returns what is known with the path and mtime of before: a copy has others."""
-    return now._replace(mtime_ns=before.mtime_ns, file=before.file)
-
-
-def _holds(old: _Known, new: _Known) -> bool:
+def _holds(old: ShippedBag, new: ShippedBag) -> bool:
     """Returns whether a bag of the same path is an older state of another one.
 
     As where its first messages were deleted by request: what is left lies within it.
     """
-    return old.start <= new.start and new.end <= old.end
+    return old.start_ns <= new.start_ns and new.end_ns <= old.end_ns
 
 
 def _rows_of(batch: Sequence[_Ready]) -> BooleanExpression:
@@ -512,5 +480,5 @@ def _rows_of(batch: Sequence[_Ready]) -> BooleanExpression:
     ids: dict[tuple[str, date], set[str]] = {}
     for each in batch:
         for one in (each.known, *each.replaced):
-            ids.setdefault((each.robot.name, one.day), set()).add(one.bag_id)
+            ids.setdefault((one.robot, one.day), set()).add(one.bag_id)
     return of_bags(ids)

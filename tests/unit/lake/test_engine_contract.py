@@ -16,17 +16,18 @@ from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables, to_arrow
-from ros2_memory.lake.typed_values import MAPS, taken_apart
+from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables
+from ros2_memory.lake.typed_values import taken_apart
 
 DAY = date(2026, 11, 20)
+MAPS = ("flags", "integers", "numbers", "texts")
 ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
 
 
-def seen(label: str, second: int, score: float | None = 0.5) -> Row:
-    at = second * 10**9
-    where = (1.0, 2.0, None, None, None, None)
-    return ("/seen", "seen", "T", at, at // 1000, 0, label, score, "map", *where)
+def seen(robot: str, day: int, label: str, second: int, score: float | None = 0.5) -> Row:
+    keys = {"robot": robot, "bag_id": f"{robot}{day}", "day": DAY + timedelta(days=day)}
+    at = (100 * day + second) * 10**9
+    return {**keys, "topic": "/seen", "time_ns": at, "label": label, "score": score}
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +38,9 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> SqlCatalog:
     table = open_tables(catalog, ["sightings", "bags"])["sightings"]
     for robot in ("attic", "hall", "it's"):
         for day in (0, 1):
-            rows = [seen(label, 100 * day + nth) for nth, label in enumerate(ODD)]
-            rows.append(seen("unscored", 100 * day, None))
-            part = to_arrow(
-                TABLES["sightings"], robot, DAY + timedelta(days=day), {f"{robot}{day}": rows}
-            )
-            table.append(part)
+            rows = [seen(robot, day, label, nth) for nth, label in enumerate(ODD)]
+            rows.append(seen(robot, day, "unscored", 0, None))
+            table.append(TABLES["sightings"].filled(rows))
     return catalog
 
 
@@ -97,8 +95,9 @@ def test_two_tables_are_joined_and_one_may_be_empty(lake: Lake) -> None:
 
 def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) -> None:
     schema = TABLES["things"].arrow_schema()
-    rows: Row = ("/seen", "seen", "cup", 1, 0, 0, 0, "map", 1.0, 2.0, 0.0, 0.1, None)
-    old = to_arrow(TABLES["things"], "hall", DAY, {"a": [rows]}).drop_columns(["spread_m"])
+    row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
+    whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
+    old = whole.drop_columns(["spread_m"])
     pq.write_table(old, tmp_path / "old.parquet")
     files = DataFiles(schema, ((tmp_path / "old.parquet").as_uri(),), {})
     found = engine.select("SELECT label, spread_m FROM things", {"things": files}, {})
@@ -136,17 +135,15 @@ def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
     table = catalog.create_table(
         f"{NAMESPACE}.messages", before.schema(), partition_spec=before.partition()
     )
-    old: Row = ("/a", "a", "T", 1, 0, 1, 0, '{"x":1,"on":null}', None)
-    table.append(to_arrow(before, "hall", DAY, {"one": [old]}))
+    old = {"robot": "hall", "bag_id": "one", "day": DAY, "topic": "/a", "time_ns": 1}
+    table.append(before.filled([{**old, "value": '{"x":1,"on":null}'}]))
     value: JsonValue = {"x": 2, "on": True, "y": 0.5, "name": "ß", "list": [1]}
     apart = taken_apart(value)
-    new: Row = (*old[:7], apart.rest, None, *([*each.items()] for each in apart[1:]))
-    open_tables(catalog, ["messages"])["messages"].append(
-        to_arrow(now, "hall", DAY, {"two": [new]})
-    )
+    new = {**old, "bag_id": "two", **apart}
+    open_tables(catalog, ["messages"])["messages"].append(now.filled([new]))
     columns = ", ".join(("type", "time_ns", "publish_ns", "value", *MAPS))
     sql = f"SELECT {columns} FROM messages ORDER BY bag_id"  # noqa: S608 - of constants
     rows = Lake(catalog, engine).select(sql, ["messages"]).to_pylist()
-    assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart.rest]
-    for name, scalars in zip(MAPS, apart[1:], strict=True):
-        assert [row[name] and dict(row[name]) for row in rows] == [None, scalars]
+    assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart["value"]]
+    for name in MAPS:
+        assert [row[name] for row in rows] == [None, apart[name]]
