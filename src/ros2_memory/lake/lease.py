@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 from pyiceberg.io import load_file_io
 
 from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 
@@ -65,9 +66,7 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
                 f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file "
                 "system that supports locks"
             ) from error
-        text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-        with suppress(OSError):  # a full disk: the lock holds all the same
-            os.ftruncate(descriptor, os.pwrite(descriptor, text.encode(), 0))
+        write_holder(descriptor)
         yield
     finally:
         os.close(descriptor)
@@ -209,10 +208,5 @@ def leased(location: LakeLocation, clock: Clock) -> Iterator[WarehouseLease]:
 
 
 def _holder(descriptor: int) -> str:
-    try:
-        value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))
-    except (OSError, ValueError):
-        value = None
-    if not isinstance(value, dict):
-        return "another process"
-    return f"process {value.get('pid')} on {value.get('host')}"
+    pid, host = read_holder(descriptor)
+    return "another process" if pid is None else f"process {pid} on {host}"

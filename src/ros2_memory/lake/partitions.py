@@ -29,13 +29,14 @@ _LAST: Final = "\U0010ffff"
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file, and how many rows it has.
+    """A Parquet file, how many rows it has, and its size (bytes).
 
     No id of a bag in it is before `first`, nor after `last`.
     """
 
     location: str
     rows: int
+    size: int = 0
     first: str = ""
     last: str = _LAST
 
@@ -139,7 +140,9 @@ class Partitions:
                 bytes(bounds.get(bag_id) or b"").decode()
                 for bounds in (each.lower_bounds or {}, each.upper_bounds or {})
             )
-            file = LakeFile(each.file_path, each.record_count, first, last or _LAST)
+            file = LakeFile(
+                each.file_path, each.record_count, each.file_size_in_bytes, first, last or _LAST
+            )
             found.setdefault((str(each.partition[robot]), when), []).append(file)
         return found
 
