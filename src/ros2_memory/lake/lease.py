@@ -141,7 +141,7 @@ class WarehouseLease:
             self._require_mine(self._clock.now())
         self.renew()
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Ends the lease, if it is held; one that cannot be ended is over with its term."""
         if self._until:
             with suppress(LakeError), self._location.translated("ending the lease of the lake"):
@@ -192,19 +192,6 @@ def _id_in(state_dir: Path) -> str:
         return path.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
-
-
-@contextmanager
-def leased(location: LakeLocation, clock: Clock) -> Iterator[WarehouseLease]:
-    """Yields the lease of a lake, whose lock the caller holds, and ends it if it was taken.
-
-    It is taken with the first `renew`, which a service tries again where that fails.
-    """
-    lease = WarehouseLease(location, clock)
-    try:
-        yield lease
-    finally:
-        lease.release()
 
 
 def _holder(descriptor: int) -> str:

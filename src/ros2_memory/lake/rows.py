@@ -287,13 +287,16 @@ class _BagRows:
         for record in self._memory.reader.records(self._bag.path, every, window):
             channels.add(record)
             topic = record.channel.topic
+            nth = numbers[topic]
+            numbers[topic] += 1
+            if topic not in whole and topic not in seen:
+                continue
             row = {
                 "topic": topic,
                 "type": record.channel.type,
                 "time_ns": record.log_time,
-                "message": numbers[topic],
+                "message": nth,
             }
-            numbers[topic] += 1
             if topic in whole:
                 self._rows["messages"].append({**row, **self._content(record)})
             if topic in seen:

@@ -96,21 +96,31 @@ class Shipped:
 
 
 @dataclass(slots=True)
+class _Seen:
+    """A state of a bag: of its file, and of what says which of its messages count.
+
+    `is_forgotten`: whether it has messages that were forgotten; None before it was read for that.
+    """
+
+    state: tuple[int, Ns, Ns]
+    bag_id: str
+    is_forgotten: bool | None = None
+
+
+@dataclass(slots=True)
 class _OfRobot:
     """What is known of the bags that a robot has, and no longer of those that it had.
 
     Attributes:
         days: of which the lake was asked, with those beside them.
         known: the bags of these days that are in the lake, by their ids.
-        ids: by path, with the size and time of the file.
-        forbidden: whether a state of a bag has messages that were forgotten.
+        seen: the newest state of each, by its path.
         receipts: by path; None before they were read.
     """
 
     days: frozenset[date] = frozenset()
     known: dict[str, ShippedBag] = field(default_factory=dict)
-    ids: dict[str, tuple[tuple[int, Ns], str]] = field(default_factory=dict)
-    forbidden: dict[str, bool] = field(default_factory=dict)
+    seen: dict[str, _Seen] = field(default_factory=dict)
     receipts: dict[str, Receipt] | None = None
 
 
@@ -223,7 +233,9 @@ class Shipper:
     def _look_again(self) -> None:
         """Has the lake asked again what it has, and bags whether they were forgotten."""
         for each in self._of.values():
-            each.days, each.known, each.forbidden = frozenset(), {}, {}
+            each.days, each.known = frozenset(), {}
+            for seen in each.seen.values():
+                seen.is_forgotten = None
 
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
@@ -244,7 +256,7 @@ class Shipper:
         bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
         known = self._known_of(robot.name, bags)
         by_file = {each.file: each for each in known.values()}
-        seen: set[str] = set()
+        ids: set[str] = set()
         receipts: list[ShippedBag] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
         for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
@@ -255,15 +267,15 @@ class Shipper:
                 if not is_settled(bag, robot.bag_dir, robot.memory.clock.now()):
                     done.waiting += 1
                     continue
-                bag_id = self._id_of(robot, bag)
-                before = known.get(bag_id)
+                seen = self._look(robot, bag)
+                before = known.get(seen.bag_id)
                 is_again = before is not None and self._is_moment(robot, bag)
-                if bag_id in seen or is_again or self._is_forgotten(robot, bag, bag_id, done):
+                if seen.bag_id in ids or is_again or self._is_forgotten(robot, bag, seen, done):
                     continue
-                seen.add(bag_id)
-                now = self._described(robot, bag, bag_id, before)
+                ids.add(seen.bag_id)
+                now = self._described(robot, bag, seen.bag_id, before)
                 if before is not None and _is_same(before, now):
-                    known[bag_id] = now
+                    known[now.bag_id] = now
                     receipts.append(now)
                 else:
                     yield self._made(robot, bag, now, before, by_file.get(now.file))
@@ -275,15 +287,10 @@ class Shipper:
     def _drop_gone(self, robot: RobotBags, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer: a hub runs for years."""
         of_robot, root = self._of[robot.name], str(robot.bag_dir)
-        present = {each.file: each for each in bags}
-        ids = {file: each for file, each in of_robot.ids.items() if file in present}
-        states = {_state_of(present[file], bag_id) for file, (_, bag_id) in ids.items()}
-        names = {relative(file, root) for file in present}
-        of_robot.ids = ids
-        of_robot.forbidden = {
-            state: each for state, each in of_robot.forbidden.items() if state in states
-        }
+        files = {each.file for each in bags}
+        of_robot.seen = {file: each for file, each in of_robot.seen.items() if file in files}
         if of_robot.receipts is not None:
+            names = {relative(file, root) for file in files}
             of_robot.receipts = {
                 name: each for name, each in of_robot.receipts.items() if name in names
             }
@@ -292,14 +299,14 @@ class Shipper:
     def _is_moment(robot: RobotBags, bag: BagFile) -> bool:
         return relative(bag.file, str(robot.bag_dir)).startswith(f"{MOMENTS_FOLDER}/")
 
-    def _id_of(self, robot: RobotBags, bag: BagFile) -> str:
-        stat = (bag.size, bag.mtime_ns)
-        ids = self._of[robot.name].ids
-        found = ids.get(bag.file)
-        if found is None or found[0] != stat:
-            found = stat, bag_id_of(robot.name, bag, robot.first_in(bag.path))
-            ids[bag.file] = found
-        return found[1]
+    def _look(self, robot: RobotBags, bag: BagFile) -> _Seen:
+        """Returns a state of a bag, which is read once."""
+        state, known = (bag.size, bag.mtime_ns, bag.sidecar_ns), self._of[robot.name].seen
+        seen = known.get(bag.file)
+        if seen is None or seen.state != state:
+            seen = _Seen(state, bag_id_of(robot.name, bag, robot.first_in(bag.path)))
+            known[bag.file] = seen
+        return seen
 
     def _made(
         self,
@@ -316,23 +323,19 @@ class Shipper:
             older.append(other)
         return _Ready(robot, now, rows, tuple(older))
 
-    def _is_forgotten(self, robot: RobotBags, bag: BagFile, bag_id: str, done: Shipped) -> bool:
-        """Returns, and reports, whether a bag has a message that was forgotten.
-
-        Each state of a bag is read once.
-        """
-        key, forbidden = _state_of(bag, bag_id), self._of[robot.name].forbidden
-        if key not in forbidden:
+    def _is_forgotten(self, robot: RobotBags, bag: BagFile, seen: _Seen, done: Shipped) -> bool:
+        """Returns, and reports, whether a bag has a message that was forgotten."""
+        if seen.is_forgotten is None:
             reader = robot.memory.reader
-            forbidden[key] = any(
-                each.forbids(reader, robot.name, bag, bag_id) for each in self._tombstones
+            seen.is_forgotten = any(
+                each.forbids(reader, robot.name, bag, seen.bag_id) for each in self._tombstones
             )
-        if forbidden[key]:
+        if seen.is_forgotten:
             done.problems.append(
                 f"{robot.name}: {bag.file} has messages that were forgotten in the lake; it is "
                 "not shipped: delete it, or the messages, with ros2-memory forget"
             )
-        return forbidden[key]
+        return seen.is_forgotten
 
     def _described(
         self, robot: RobotBags, bag: BagFile, bag_id: str, before: ShippedBag | None
@@ -455,11 +458,6 @@ class Shipper:
                 log.warning("receipts_not_written", robot=robot.name, reason=str(error))
                 self._refused.add(robot.name)
             done.problems.append(problem)
-
-
-def _state_of(bag: BagFile, bag_id: str) -> str:
-    """Returns what names a state of a bag."""
-    return f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

@@ -29,10 +29,6 @@ if TYPE_CHECKING:
     from ros2_memory.lake.partitions import Days
     from ros2_memory.retention.foreign import Foreign
 
-_BAGS: Final = (
-    "SELECT bag_id, day, file, size, sha256, made_of, mtime_ns, start_ns, end_ns, summary, counts"
-    " FROM bags ORDER BY start_ns, end_ns, bag_id"
-)
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""
 _FEWEST_DAYS: Final = 2
@@ -43,6 +39,30 @@ _TOGETHER: Final = 64
 """Bags of a day whose messages are read together."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
+
+
+class _Row(NamedTuple):
+    """A row of `bags`, as far as it is read; the fields are its columns."""
+
+    bag_id: str
+    day: date
+    file: str
+    size: int
+    sha256: str
+    made_of: str
+    mtime_ns: Ns
+    start_ns: Ns
+    end_ns: Ns
+    summary: str
+    counts: bytes
+
+    @property
+    def state(self) -> int:
+        """Tells states of a bag apart: one as large and as old may have other messages."""
+        return crc32(f"{self.bag_id} {self.sha256} {self.made_of}".encode())
+
+
+_BAGS: Final = f"SELECT {', '.join(_Row._fields)} FROM bags ORDER BY start_ns, end_ns, bag_id"  # noqa: S608 - constants
 
 
 class LakeBag(NamedTuple):
@@ -262,22 +282,21 @@ class LakeIndex:
         """Returns what the lake has of days between which there is no other; known bags stay."""
         span = min(made_of), max(made_of)
         found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
-        rows: dict[date, list[Mapping[str, object]]] = {day: [] for day in made_of}
-        for row in found.to_pylist():
-            rows[row["day"]].append(row)
+        rows: dict[date, list[_Row]] = {day: [] for day in made_of}
+        for row in (_Row(**each) for each in found.to_pylist()):
+            rows[row.day].append(row)
         schemas: dict[str, SummarySchema] = {}
         days: dict[date, _Day] = {}
         for day, of_day in rows.items():
             bags: list[tuple[LakeBag, BagFile]] = []
             for begin in range(0, len(of_day), _TOGETHER):
                 some = of_day[begin : begin + _TOGETHER]
-                states = {str(row["bag_id"]): _state(row) for row in some}
+                states = {row.bag_id: row.state for row in some}
                 for row in some:
-                    bag_id = str(row["bag_id"])
-                    name = str(row["file"]).removesuffix(COMPRESSED)
-                    path = paths.of(f"{self.bag_dir}/{name}", bag_id)
+                    name = row.file.removesuffix(COMPRESSED)
+                    path = paths.of(f"{self.bag_dir}/{name}", row.bag_id)
                     bag = paths.known(_file(path, row, schemas))
-                    bags.append((LakeBag(bag_id, day, states), bag))
+                    bags.append((LakeBag(row.bag_id, day, states), bag))
             days[day] = _Day(made_of[day], bags)
         return days
 
@@ -305,26 +324,16 @@ class _Paths:
         return known[1] if known is not None and known[1] == bag else bag
 
 
-def _file(path: str, row: Mapping[str, object], schemas: dict[str, SummarySchema]) -> BagFile:
-    text, counts = str(row["summary"]), row["counts"]
-    if text not in schemas:
-        schemas[text] = SummarySchema.from_json(text)
+def _file(path: str, row: _Row, schemas: dict[str, SummarySchema]) -> BagFile:
+    if row.summary not in schemas:
+        schemas[row.summary] = SummarySchema.from_json(row.summary)
     return BagFile(
         path,
-        _whole(row["size"]),
-        _whole(row["mtime_ns"]),
+        row.size,
+        row.mtime_ns,
         BagState.CLOSED,
-        BagSummary.decoded(schemas[text], counts if isinstance(counts, bytes) else b""),
-        _whole(row["start_ns"]),
-        _whole(row["end_ns"]),
-        _state(row),
+        BagSummary.decoded(schemas[row.summary], row.counts),
+        row.start_ns,
+        row.end_ns,
+        row.state,
     )
-
-
-def _state(row: Mapping[str, object]) -> int:
-    """Returns what tells states of a bag apart: one as large and as old may have other messages."""
-    return crc32(f"{row['bag_id']} {row['sha256']} {row['made_of']}".encode())
-
-
-def _whole(value: object) -> int:
-    return value if isinstance(value, int) else 0
