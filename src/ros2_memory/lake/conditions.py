@@ -17,7 +17,7 @@ from pyiceberg.expressions import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from datetime import date
 
     from pyiceberg.expressions import BooleanExpression
@@ -56,16 +56,16 @@ def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
     return And(_one_of("robot", robots), equal("day", day.isoformat()))
 
 
-def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpression:
-    """Returns the condition on rows of bags, given by robot and day.
+def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
+    """Returns the condition on rows of bags, at least one, given by robot, day and id.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
+    ids: dict[tuple[str, date], set[str]] = {}
+    for robot, day, bag_id in bags:
+        ids.setdefault((robot, day), set()).add(bag_id)
     return any_of(
-        [
-            And(of_robots([robot], day), of_ids(robot, of_one))
-            for (robot, day), of_one in ids.items()
-        ]
+        [And(of_robots([robot], day), of_ids(robot, some)) for (robot, day), some in ids.items()]
     )
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from pyiceberg.exceptions import NoSuchTableError
 
 from ros2_memory.lake.engines.base import DataFiles
-from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions, locations
+from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
@@ -146,4 +146,5 @@ class Lake:
         if bags is not None:
             files = [each for each in files if each.first <= bags[1] and bags[0] <= each.last]
         store = {} if table is None else dict(table.io.properties)
-        return DataFiles(TABLES[name].arrow_schema(), locations(files), store)
+        locations = tuple(each.location for each in files)
+        return DataFiles(TABLES[name].arrow_schema(), locations, store)

@@ -17,7 +17,7 @@ from pyiceberg.transforms import IdentityTransform
 from ros2_memory.core.errors import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from pyiceberg.manifest import ManifestFile
     from pyiceberg.partitioning import PartitionSpec
@@ -155,8 +155,3 @@ class Partitions:
             f"the lake's table {self._name} has files that are not of one {column}, which another "
             "program wrote: partition it by robot and day again"
         )
-
-
-def locations(files: Iterable[LakeFile]) -> tuple[str, ...]:
-    """Returns the URIs of files."""
-    return tuple(each.location for each in files)

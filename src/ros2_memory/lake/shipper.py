@@ -401,7 +401,12 @@ class Shipper:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
         self._pause()
-        condition = _rows_of(batch)
+        # Few files have to be looked at for it.
+        condition = of_bags(
+            (one.robot, one.day, one.bag_id)
+            for each in batch
+            for one in (each.known, *each.replaced)
+        )
         rows = 0
         try:
             for name, table in TABLES.items():
@@ -471,12 +476,3 @@ def _holds(old: ShippedBag, new: ShippedBag) -> bool:
     As where its first messages were deleted by request: what is left lies within it.
     """
     return old.start_ns <= new.start_ns and new.end_ns <= old.end_ns
-
-
-def _rows_of(batch: Sequence[_Ready]) -> BooleanExpression:
-    """Returns the condition on rows of a batch's bags, so that few files have to be looked at."""
-    ids: dict[tuple[str, date], set[str]] = {}
-    for each in batch:
-        for one in (each.known, *each.replaced):
-            ids.setdefault((one.robot, one.day), set()).add(one.bag_id)
-    return of_bags(ids)

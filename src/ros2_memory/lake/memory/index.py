@@ -17,7 +17,6 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.partitions import locations
 from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.partitions import Days
+    from ros2_memory.lake.partitions import Days, LakeFile
     from ros2_memory.retention.foreign import Foreign
 
 MOST_BAGS: Final = 45_000
@@ -93,7 +92,7 @@ class _Day(NamedTuple):
         bags: its bags, as what they are there, and as files.
     """
 
-    made_of: tuple[str, ...]
+    made_of: Sequence[LakeFile]
     bags: Sequence[tuple[LakeBag, BagFile]]
 
 
@@ -251,9 +250,7 @@ class LakeIndex:
         begin, end = bisect_left(known_days.known, span[0]), bisect_right(known_days.known, span[1])
         older = end_of(known_days.known[begin - 1]) if begin else None
         bounds = replace(known, since=span[0] if begin else None, older=older)
-        made_of = {
-            day: locations(known_days.files(day, day)) for day in known_days.known[begin:end]
-        }
+        made_of = {day: known_days.files(day, day) for day in known_days.known[begin:end]}
         days = {
             day: known.days[day]
             for day, files in made_of.items()
@@ -278,7 +275,7 @@ class LakeIndex:
             files=files,
         )
 
-    def _read(self, made_of: Mapping[date, tuple[str, ...]], paths: _Paths) -> dict[date, _Day]:
+    def _read(self, made_of: Mapping[date, Sequence[LakeFile]], paths: _Paths) -> dict[date, _Day]:
         """Returns what the lake has of days between which there is no other; known bags stay."""
         span = min(made_of), max(made_of)
         found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
