@@ -6,7 +6,7 @@ import threading
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
@@ -259,9 +259,7 @@ class LakeIndex:
         if days.keys() == made_of.keys() == known.days.keys():
             return bounds
         paths = _Paths(known.files)
-        for is_known, run in groupby(made_of, key=days.keys().__contains__):
-            if not is_known:
-                days |= self._read({day: made_of[day] for day in run}, paths)
+        days |= self._read({day: each for day, each in made_of.items() if day not in days}, paths)
         files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
         before = {file: bag for file, (_, bag) in known.files.items()}
         now = {file: bag for file, (_, bag) in files.items()}
@@ -276,9 +274,8 @@ class LakeIndex:
         )
 
     def _read(self, made_of: Mapping[date, Sequence[LakeFile]], paths: _Paths) -> dict[date, _Day]:
-        """Returns what the lake has of days between which there is no other; known bags stay."""
-        span = min(made_of), max(made_of)
-        found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
+        """Returns what the lake has of some days; known bags stay."""
+        found = self._lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
         rows: dict[date, list[_Row]] = {day: [] for day in made_of}
         for row in (_Row(**each) for each in found.to_pylist()):
             rows[row.day].append(row)

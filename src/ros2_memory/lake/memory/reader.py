@@ -222,17 +222,12 @@ class LakeReader(BagReader):
     def _select(
         self, sql: str, bag: LakeBag, bags: list[str], topics: Sequence[str] = ()
     ) -> pa.Table:
-        asked = {
-            "bags": bags,
-            "first": min(bags),
-            "last": max(bags),
-            "topics": topics,
-            "keys": [*map(topic_key, topics)],
-        }
-        days = (bag.day, bag.day)
-        return self._lake.select(
-            sql, ["channels"], asked, robots=[self._robot], days=days, bags=(min(bags), max(bags))
-        )
+        first, last = min(bags), max(bags)
+        of_day = self._lake.days("channels", self._robot).files(bag.day, bag.day)
+        files = [each for each in of_day if each.first <= last and first <= each.last]
+        keys = [*map(topic_key, topics)]
+        asked = {"bags": bags, "first": first, "last": last, "topics": topics, "keys": keys}
+        return self._lake.select(sql, "channels", files, asked)
 
     def _shared(self, channel: Channel) -> Channel:
         """Returns the first channel that was equal: bags of one robot declare the same."""
