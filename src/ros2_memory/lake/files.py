@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from pyiceberg.exceptions import NoSuchTableError
 
 from ros2_memory.lake.engines.base import DataFiles
-from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions
+from ros2_memory.lake.partitions import Partitions
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
-    from ros2_memory.lake.partitions import LakeFile
+    from ros2_memory.lake.partitions import Days, LakeFile
 
 _MESSAGE_BYTES: Final = 64 << 20
 
@@ -61,7 +61,7 @@ class Lake:
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
-        self._partitions = {name: Partitions(name) for name in TABLES}
+        self._partitions = {name: Partitions() for name in TABLES}
 
     def refresh(self, within_s: float = 0.0) -> None:
         """Looks for what was committed since, unless that was done within so many seconds.
@@ -95,7 +95,7 @@ class Lake:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            return self._days(name).get(robot, NO_DAYS)
+            return self._days(name).get(robot, {})
 
     def select(
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None

@@ -50,7 +50,7 @@ def compact(
     for name, table in tables.items():
         with location.translated(f"putting together the lake's {name}"):
             order = [(each, "ascending") for each in TABLES[name].order]
-            for day, robots in _to_compact(name, table.refresh(), closed):
+            for day, robots in _to_compact(table.refresh(), closed):
                 alive()
                 condition = of_robots(robots, day)
                 whole = table.refresh().scan(row_filter=condition).to_arrow()
@@ -62,12 +62,12 @@ def compact(
     return done
 
 
-def _to_compact(name: str, table: IcebergTable, closed: date) -> list[tuple[date, list[str]]]:
+def _to_compact(table: IcebergTable, closed: date) -> list[tuple[date, list[str]]]:
     """Returns what to put together of the days before `closed`: a day, and some of its robots."""
     parts = {
-        (day, robot): days.files(day, day)
-        for robot, days in Partitions(name).look(table).items()
-        for day in days.known
+        (day, robot): files
+        for robot, days in Partitions().look(table).items()
+        for day, files in days.items()
         if day < closed
     }
     found: list[tuple[date, list[str]]] = []

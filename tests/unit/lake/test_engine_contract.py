@@ -102,7 +102,7 @@ def test_only_files_of_one_robot_and_day_are_read(catalog: SqlCatalog, engine: L
     lake = Lake(catalog, engine)
     sql = "SELECT robot, day FROM sightings GROUP BY robot, day ORDER BY robot, day"
     for robot in ROBOTS:
-        files = lake.days("sightings", robot).files(DAY, DAY)
+        files = lake.days("sightings", robot)[DAY]
         one = lake.select(sql, "sightings", files)
         assert one.to_pylist() == [{"robot": robot, "day": DAY}]
     assert lake.select(sql, "sightings", []).num_rows == 0
@@ -166,7 +166,7 @@ def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
     columns = ", ".join(("type", "time_ns", "publish_ns", "value", *MAPS))
     sql = f"SELECT {columns} FROM messages ORDER BY bag_id"  # noqa: S608 - of constants
     lake = Lake(catalog, engine)
-    files = lake.days("messages", "hall").files(DAY, DAY)
+    files = lake.days("messages", "hall")[DAY]
     rows = lake.select(sql, "messages", files).to_pylist()
     assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart["value"]]
     for name in MAPS:

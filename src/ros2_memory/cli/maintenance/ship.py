@@ -154,7 +154,7 @@ def _forget(
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.opened() as catalog:
         tables = location.tables(catalog, TABLES)
-        known = {*Partitions("bags").look(tables["bags"]), *(each.name for each in robots)}
+        known = {*Partitions().look(tables["bags"]), *(each.name for each in robots)}
         if robot not in known:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
@@ -17,6 +16,7 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from ros2_memory.lake.partitions import newest
 from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
@@ -185,8 +185,8 @@ class LakeIndex:
         with self._lock:
             self._lake.refresh(self._refresh_s / _LOOKS)
             days = self._lake.days("bags", self._robot)
-            span = days.newest(date.max, self._most_bags, self._fewest_days)
-            self._newest = self._window(days, span, self._newest)
+            own, before = newest(days, date.max, self._most_bags, self._fewest_days)
+            self._newest = self._window(own, before, self._newest)
             timeline = self._newest.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
@@ -235,22 +235,25 @@ class LakeIndex:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
         with self._lock:
             days = self._lake.days("bags", self._robot)
-            span = days.newest(day + timedelta(days=1), self._most_bags, _FEWEST_DAYS)
-            last = day if span is None else span[1]
-            window = self._window(days, span, self._older.get(last, _Window()))
+            after = day + timedelta(days=1)
+            own, before = newest(days, after, self._most_bags, _FEWEST_DAYS)
+            last = max(own, default=day)
+            window = self._window(own, before, self._older.get(last, _Window()))
             # A new dict: other threads look for the bags of their answers in the old one.
             others = [each for each in self._older.items() if each[0] != last]
             self._older = dict([*others[1 - _MOST_WINDOWS :], (last, window)])
             return window
 
-    def _window(self, known_days: Days, span: tuple[date, date] | None, known: _Window) -> _Window:
-        """Returns what the lake has of some days; only those are read of which a file is new."""
-        if span is None:
+    def _window(self, made_of: Days, older_day: date | None, known: _Window) -> _Window:
+        """Returns what the lake has of some days; only those are read of which a file is new.
+
+        `older_day` is the newest one before them.
+        """
+        if not made_of:
             return _Window()
-        begin, end = bisect_left(known_days.known, span[0]), bisect_right(known_days.known, span[1])
-        older = end_of(known_days.known[begin - 1]) if begin else None
-        bounds = replace(known, since=span[0] if begin else None, older=older)
-        made_of = {day: known_days.files(day, day) for day in known_days.known[begin:end]}
+        bounds = replace(known, since=None, older=None)
+        if older_day is not None:
+            bounds = replace(known, since=min(made_of), older=end_of(older_day))
         days = {
             day: known.days[day]
             for day, files in made_of.items()
@@ -273,7 +276,7 @@ class LakeIndex:
             files=files,
         )
 
-    def _read(self, made_of: Mapping[date, Sequence[LakeFile]], paths: _Paths) -> dict[date, _Day]:
+    def _read(self, made_of: Days, paths: _Paths) -> dict[date, _Day]:
         """Returns what the lake has of some days; known bags stay."""
         found = self._lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
         rows: dict[date, list[_Row]] = {day: [] for day in made_of}

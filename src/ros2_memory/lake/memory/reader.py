@@ -223,7 +223,7 @@ class LakeReader(BagReader):
         self, sql: str, bag: LakeBag, bags: list[str], topics: Sequence[str] = ()
     ) -> pa.Table:
         first, last = min(bags), max(bags)
-        of_day = self._lake.days("channels", self._robot).files(bag.day, bag.day)
+        of_day = self._lake.days("channels", self._robot).get(bag.day, ())
         files = [each for each in of_day if each.first <= last and first <= each.last]
         keys = [*map(topic_key, topics)]
         asked = {"bags": bags, "first": first, "last": last, "topics": topics, "keys": keys}
