@@ -16,6 +16,7 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory.index import MOST_BAGS
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
@@ -60,6 +61,9 @@ def lake_robots(
     names: Sequence[str],
     limits: QuerySettings | None = None,
     stores: Path | None = None,
+    *,
+    days: int = 31,
+    most_bags: int = MOST_BAGS,
 ) -> dict[str, LakeRobot]:
     """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
     lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
@@ -76,6 +80,8 @@ def lake_robots(
             else ColumnStore([stores / name / FILE], decoder.definition),
             refresh_s=0,
             large=LargeReads(),
+            days=days,
+            most_bags=most_bags,
         )
         for name in names
     }
