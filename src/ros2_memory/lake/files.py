@@ -109,7 +109,7 @@ class Lake:
             table = self._table(name)
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(each.location for each in files)
-        found = DataFiles(TABLES[name].arrow_schema(), locations, store)
+        found = DataFiles(TABLES[name].arrow_schema, locations, store)
         return self._engine.select(sql, {name: found}, parameters or {})
 
     def _table(self, name: str) -> IcebergTable | None:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import pyarrow as pa
@@ -78,7 +79,7 @@ def _map(field_id: int, kind: IcebergType) -> MapType:
     return MapType(field_id, _TEXT, field_id + 1, kind, value_required=False)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class LakeTable:
     """One table.
 
@@ -121,14 +122,15 @@ class LakeTable:
         """Returns its order, which `filled` keeps."""
         return SortOrder(*(SortField(self._id(name), IdentityTransform()) for name in self.order))
 
+    @cached_property
     def arrow_schema(self) -> pa.Schema:
-        """Returns its columns for Arrow."""
+        """Its columns for Arrow."""
         # Without ids: those of a table in a catalogue are others.
         return schema_to_pyarrow(self.schema(), include_field_ids=False)
 
     def filled(self, rows: Sequence[Row]) -> pa.Table:
         """Returns rows, sorted as the table is."""
-        schema = self.arrow_schema()
+        schema = self.arrow_schema
         columns = {
             field.name: _array([row.get(field.name) for row in rows], field.type)
             for field in schema

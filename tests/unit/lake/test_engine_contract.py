@@ -62,7 +62,7 @@ def select(catalog: SqlCatalog, engine: LakeEngine) -> Select:
             if catalog.table_exists(identifier):
                 plan = catalog.load_table(identifier).scan().plan_files()
                 found = tuple(task.file.file_path for task in plan)
-            files[name] = DataFiles(TABLES[name].arrow_schema(), found, {})
+            files[name] = DataFiles(TABLES[name].arrow_schema, found, {})
         return engine.select(sql, files, parameters or {})
 
     return run
@@ -116,7 +116,7 @@ def test_two_tables_are_joined_and_one_may_be_empty(select: Select) -> None:
 
 
 def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) -> None:
-    schema = TABLES["things"].arrow_schema()
+    schema = TABLES["things"].arrow_schema
     row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
     whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
     old = whole.drop_columns(["spread_m"])
@@ -129,7 +129,7 @@ def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) 
 def test_a_file_that_is_gone_is_reported_without_its_path(
     tmp_path: Path, engine: LakeEngine
 ) -> None:
-    schema = TABLES["things"].arrow_schema()
+    schema = TABLES["things"].arrow_schema
     files = DataFiles(schema, ((tmp_path / "gone.parquet").as_uri(),), {})
     with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
         engine.select("SELECT label FROM things", {"things": files}, {})
