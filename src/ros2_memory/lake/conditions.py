@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Predicate = Callable[[str, object], BooleanExpression]
 
 # Their constructors are not those that Pydantic's plugin for mypy takes them to have.
-equal: Final = cast("Predicate", EqualTo)
+_equal: Final = cast("Predicate", EqualTo)
 _at_least: Final = cast("Predicate", GreaterThanOrEqual)
 _at_most: Final = cast("Predicate", LessThanOrEqual)
 _below: Final = cast("Predicate", LessThan)
@@ -53,7 +53,7 @@ def of_topics(condition: BooleanExpression, topics: Collection[str]) -> BooleanE
 
 def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
     """Returns the condition on rows of one day of some robots."""
-    return And(_one_of("robot", robots), equal("day", day.isoformat()))
+    return And(_one_of("robot", robots), _equal("day", day.isoformat()))
 
 
 def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
@@ -72,7 +72,7 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
 def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
     """Returns the condition on rows of bags of a robot, of any day."""
     return And(
-        equal("robot", robot),
+        _equal("robot", robot),
         _at_least("bag_id", min(ids)),
         _at_most("bag_id", max(ids)),
         _one_of("bag_id", ids),
@@ -86,4 +86,4 @@ def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> Bo
     """
     first, last = columns
     ends = Or(_at_least(last, start), And(_is_null(last), _at_least(first, start)))
-    return And(equal("robot", robot), _below(first, stop), ends)
+    return And(_equal("robot", robot), _below(first, stop), ends)
