@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bootstrap import (
     build_columns_of_lake,
     build_memory,
-    places_of,
     query_settings_of,
     reading_of,
     shared_parts,
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import Settings
     from ros2_memory.fleet.robots import Fleet, Robot
-    from ros2_memory.history.context import Memory
+    from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.memory.robot import LakeRobot
 
@@ -65,12 +64,10 @@ def build_fleet(settings: Settings) -> Fleet | None:
     robots = []
     for name, bag_dir in fleet.robots.items():
         own = robot_settings(settings, name)
-        has_places = _has_places(settings, own)
-        if has_places:
-            # Here, so that a file that is refused keeps the server from starting.
-            places_of(own)
-        build = partial(_memory_of, own, shared, has_places=has_places)
-        source = None if lake is None else _source_of(lake, name, settings, own, shared)
+        # Here, so that a file of places that is refused keeps the server from starting.
+        limits = _limits_of(settings, own)
+        build = partial(_memory_of, own, shared, limits)
+        source = None if lake is None else _source_of(lake, name, own, shared, limits)
         is_mounted = lake is None or bag_dir.is_dir()
         robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))
     join = None if lake is None else partial(_only_in, lake, settings, shared)
@@ -96,27 +93,35 @@ def _only_in(
     for name in lake.robots():
         if name in known or not is_robot_name(name):
             continue
-        source = _source_of(lake, name, settings, robot_settings(settings, name), shared)
+        own = robot_settings(settings, name)
+        source = _source_of(lake, name, own, shared, _limits_of(settings, own))
         yield Robot(name, Path(name), partial(_lake_of, source), lake=source, is_mounted=False)
 
 
-def _has_places(settings: Settings, own: Settings) -> bool:
-    """Returns whether named places are those of one robot's map."""
-    return settings.fleet.shared_map or own.data.places_file != settings.data.places_file
+def _limits_of(settings: Settings, own: Settings) -> QuerySettings:
+    """Returns the settings of queries to a robot; with named places only if they are of its map.
+
+    Raises:
+        ConfigError: their file is refused.
+    """
+    limits = query_settings_of(own)
+    if settings.fleet.shared_map or own.data.places_file != settings.data.places_file:
+        return limits
+    # `data.places_file` is about some other map.
+    return replace(limits, places=(), places_file="")
 
 
 def _source_of(
-    lake: Lake, name: str, settings: Settings, own: Settings, shared: SharedParts
+    lake: Lake, name: str, own: Settings, shared: SharedParts, limits: QuerySettings
 ) -> LakeRobot:
     """Returns what a lake has of a robot."""
     from ros2_memory.lake.memory.robot import LakeRobot
 
-    limits = query_settings_of(own)
     return LakeRobot(
         lake,
         name,
         WallClock(),
-        limits if _has_places(settings, own) else replace(limits, places=(), places_file=""),
+        limits,
         extractor=shared.extractor,
         decoder=shared.reader,
         large=shared.large,
@@ -148,12 +153,8 @@ def robot_settings(settings: Settings, name: str) -> Settings:
     )
 
 
-def _memory_of(own: Settings, shared: SharedParts, *, has_places: bool) -> Memory:
-    memory = build_memory(own, shared, setting=ROBOTS_SETTING)
-    if has_places:
-        return memory
-    # `data.places_file` is about some other map.
-    return replace(memory, limits=replace(memory.limits, places=(), places_file=""))
+def _memory_of(own: Settings, shared: SharedParts, limits: QuerySettings) -> Memory:
+    return replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
 
 
 def _require_only_reading(settings: Settings) -> None:

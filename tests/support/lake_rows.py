@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from datetime import date
 from functools import partial
 from pathlib import Path
 
@@ -12,13 +11,15 @@ from pyiceberg.catalog.sql import SqlCatalog
 from ros2_memory.columns.fill import Filling, StoreLimits
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.model import BagFile
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory.index import MOST_BAGS
 from ros2_memory.lake.memory.robot import LakeRobot
-from ros2_memory.lake.rows import BagContent, bag_id_of, rows_of
-from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables, to_arrow
+from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
+from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.clocks import FixedClock
@@ -36,15 +37,22 @@ def fill(catalog: SqlCatalog, robots: Mapping[str, Memory], messages: Sequence[s
     """Writes the rows of all bags of robots' memories."""
     tables = open_tables(catalog, TABLES)
     for name, memory in robots.items():
-        found: dict[tuple[str, date], dict[str, list[Row]]] = {}
+        found: dict[str, list[Row]] = {table: [] for table in TABLES}
         for bag in memory.index.snapshot().bags:
-            content = BagContent(bag, bag_id_of(name, bag, bag.start), "0" * 64, "made")
-            for table, rows in rows_of(memory, content, messages).items():
-                found.setdefault((table, day_of(bag.start)), {})[content.bag_id] = rows
-        for (table, day), of_bags in found.items():
-            part = to_arrow(TABLES[table], name, day, of_bags)
-            if part.num_rows:
-                tables[table].append(part)
+            for table, rows in rows_of(memory, bag, shipped(name, bag), messages).items():
+                found[table] += rows
+        for table, rows in found.items():
+            if rows:
+                tables[table].append(TABLES[table].filled(rows))
+
+
+def shipped(robot: str, bag: BagFile) -> ShippedBag:
+    """What names a bag of a robot in a lake, without a look at its file."""
+    bag_id, day, name = bag_id_of(robot, bag, bag.start), day_of(bag.start), bag.path
+    file = f"{name.parent.name}/{name.name}"
+    return ShippedBag(
+        robot, bag_id, day, file, bag.size, "0" * 64, bag.mtime_ns, "made", bag.start, bag.end
+    )
 
 
 def lake_robots(
@@ -53,6 +61,9 @@ def lake_robots(
     names: Sequence[str],
     limits: QuerySettings | None = None,
     stores: Path | None = None,
+    *,
+    days: int = 31,
+    most_bags: int = MOST_BAGS,
 ) -> dict[str, LakeRobot]:
     """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
     lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
@@ -69,6 +80,8 @@ def lake_robots(
             else ColumnStore([stores / name / FILE], decoder.definition),
             refresh_s=0,
             large=LargeReads(),
+            days=days,
+            most_bags=most_bags,
         )
         for name in names
     }

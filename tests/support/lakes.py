@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -103,7 +104,8 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
         lake = Lake(catalog, engine, where.namespace, where.translated)
         assert lake.robots() == ["hall"]
         sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
-        found = lake.select(sql, ["sightings"], robots=["hall"]).to_pylist()
+        files = chain.from_iterable(lake.days("sightings", "hall").values())
+        found = lake.select(sql, "sightings", files).to_pylist()
         engine.close()
     assert [row["label"] for row in found] == ["cup", "cup"]
     assert len({row["bag_id"] for row in found}) == 2

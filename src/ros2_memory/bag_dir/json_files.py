@@ -124,6 +124,28 @@ class JsonLog(Generic[_T]):
         except FileNotFoundError:
             return []
 
+    def all_rows(self, bag_dir: Path) -> Iterator[tuple[int, _T]]:
+        """Yields every row with the number of its line, of a log that is of no use without one.
+
+        A line that a crash cut short is left out: what it announces was not begun.
+
+        Raises:
+            OSError: the file cannot be read.
+            ValueError: a line is damaged, which the sentence names, or the file is too large.
+        """
+        try:
+            lines = [*self.lines(bag_dir)]
+        except FileNotFoundError:
+            return
+        for line in lines:
+            if line.row is not None:
+                yield line.number, line.row
+            elif not isinstance(line.error, json.JSONDecodeError):
+                raise ValueError(f"line {line.number}: {line.error}")
+            # A whole line ends with its check, or before there was one with a list.
+            elif not line.text.startswith(b"{") or line.text.endswith((b"]}", b'"}')):
+                raise ValueError(f"line {line.number}: it is damaged: {line.error}")
+
     def text(self, rows: Iterable[_T]) -> str:
         """Returns rows as lines."""
         dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)

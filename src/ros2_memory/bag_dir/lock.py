@@ -58,7 +58,7 @@ class BagDirLock:
         except BaseException:
             os.close(descriptor)
             raise
-        _write_holder(descriptor)
+        write_holder(descriptor)
         return cls(descriptor, path)
 
     def renew(self) -> bool:
@@ -87,7 +87,7 @@ class BagDirLock:
             os.dup2(descriptor, self.descriptor, inheritable=False)
         finally:
             os.close(descriptor)
-        _write_holder(self.descriptor)
+        write_holder(self.descriptor)
         return True
 
     def release(self) -> None:
@@ -102,7 +102,7 @@ def _lock(descriptor: int, path: Path, patience_s: float) -> None:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            pid, host = _read_holder(descriptor)
+            pid, host = read_holder(descriptor)
             # A restarted container: the process before had the number that this one has.
             is_before = pid == os.getpid()
             alive = host != socket.gethostname() or pid is None or (not is_before and runs(pid))
@@ -128,7 +128,7 @@ def _refusal(path: Path, pid: int | None, host: str | None, *, alive: bool) -> s
     )
 
 
-def _write_holder(descriptor: int) -> None:
+def write_holder(descriptor: int) -> None:
     """Writes into the file who holds the lock; a full disk must not stop a recorder."""
     text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
     with suppress(OSError):
@@ -137,7 +137,7 @@ def _write_holder(descriptor: int) -> None:
         os.ftruncate(descriptor, written)
 
 
-def _read_holder(descriptor: int) -> tuple[int | None, str | None]:
+def read_holder(descriptor: int) -> tuple[int | None, str | None]:
     """Returns the process id and host in the file; None for both if there are none."""
     try:
         value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))

@@ -15,7 +15,6 @@ What is about to be deleted is written before it is, so a kill hides nothing. El
 
 from __future__ import annotations
 
-import json
 from bisect import bisect_right
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -332,22 +331,10 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
         ValueError: a line is damaged, or the file too large: what was deleted is unknown.
     """
     found: dict[Forgetting, None] = {}
-    try:
-        lines = [*FORGOTTEN.lines(bag_dir)]
-    except FileNotFoundError:
-        return []
-    for line in lines:
-        if isinstance(line.error, json.JSONDecodeError):
-            # A whole line ends with its check, or before there was one with the list of bags; of
-            # one that was cut, nothing was deleted.
-            if line.text.startswith(b"{") and not line.text.endswith((b"]}", b'"}')):
-                continue
-            raise ValueError(f"line {line.number}: it is damaged: {line.error}")
-        if line.row is None:
-            raise ValueError(f"line {line.number}: {line.error}")
-        if not (line.row.topics or line.row.bags):
-            raise ValueError(f"line {line.number}: it names no topics and no bags")
-        found[line.row] = None
+    for number, row in FORGOTTEN.all_rows(bag_dir):
+        if not (row.topics or row.bags):
+            raise ValueError(f"line {number}: it names no topics and no bags")
+        found[row] = None
     return [*found]
 
 

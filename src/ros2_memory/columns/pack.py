@@ -459,13 +459,13 @@ def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
     for nth, (column, which) in enumerate(zip(columns, bits.argmin(axis=0).tolist(), strict=True)):
         start, stop = int(lie.starts[nth]), int(lie.stops[nth])
         if column.greatest - column.least >= _FAR_APART:
-            arrangement, data = "plain 8", _planes(flat[start:stop], 8)
+            arrangement, data = "plain 8", byte_planes(flat[start:stop], 8)
         else:
             width = (most[which][nth].bit_length() + 7) // 8
             arrangement = f"{_ARRANGEMENTS[which]} {width}"
             first = steps[start + 1] if which == 3 else slopes[nth]
             data = struct.pack("<q", first) if which else b""
-            data += _planes(numbers[which][start + max(0, which - 1) : stop], width)
+            data += byte_planes(numbers[which][start + max(0, which - 1) : stop], width)
         codec = f"{column.form} {arrangement}"
         found.append(Packed(codec, stop - start, column.error, column.zone, column.head + data))
     return found
@@ -483,20 +483,20 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     """Returns the whole numbers that were arranged; the least of them is `least`."""
     name, _, width = arrangement.partition(" ")
     if name in {"plain", "flat"}:
-        return np.add(_from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
+        return np.add(from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
     first: int = struct.unpack_from("<q", data)[0]
     if name == "line":
         numbers = np.arange(count)
         numbers *= first
-        numbers += _from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
+        numbers += from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
     elif name == "delta":
         numbers = np.zeros(count, np.int64)
-        numbers[1:] = _signed(_from_planes(data, 8, count - 1, int(width)))
+        numbers[1:] = _signed(from_planes(data, 8, count - 1, int(width)))
         numbers[1:] += first
     elif name == "curve":
         numbers = np.zeros(count, np.int64)
         numbers[1] = first
-        numbers[2:] = _signed(_from_planes(data, 8, count - 2, int(width)))
+        numbers[2:] = _signed(from_planes(data, 8, count - 2, int(width)))
         np.cumsum(numbers[1:], out=numbers[1:])
     else:
         raise ValueError(f"packed columns are not arranged {name!r}")
@@ -520,18 +520,19 @@ def _wrapped(number: int) -> np.int64:
     return np.int64(number - (1 << 64) if number >= 1 << 63 else number)
 
 
-def _planes(numbers: IntArray, width: int) -> bytes:
+def byte_planes(numbers: IntArray, width: int) -> bytes:
+    """Returns numbers in planes: the lowest byte of each, then the next; so many of their bytes."""
     short = numbers.astype(_CONTAINERS[width], copy=False)
     return short.view(np.uint8).reshape(-1, short.itemsize).T[:width].tobytes()
 
 
-def _from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
-    """The numbers as unsigned ones of the least width that numpy has."""
+def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
+    """Returns the numbers as unsigned ones of the least width that numpy has."""
     dtype = _CONTAINERS[width]
-    planes = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
-    numbers = planes[0].astype(dtype) if width else np.zeros(count, dtype)
+    rows = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
+    numbers = rows[0].astype(dtype) if width else np.zeros(count, dtype)
     for nth in range(1, width):
-        numbers |= planes[nth].astype(dtype) << (8 * nth)
+        numbers |= rows[nth].astype(dtype) << (8 * nth)
     return numbers
 
 

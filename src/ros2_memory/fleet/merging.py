@@ -16,6 +16,7 @@ from heapq import merge
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.core.reply import with_notes
 from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.results import (
@@ -63,6 +64,11 @@ class RobotReply:
     latest: Ns | None = None
     is_ahead: bool = False
     lake: FromLake | None = None
+
+    @property
+    def body(self) -> JsonObject:
+        """The reply as an object; an empty one where it is something else."""
+        return self.value if isinstance(self.value, dict) else {}
 
 
 class MergedRows(NamedTuple):
@@ -140,8 +146,7 @@ def merged(
         max_chars: where the reply would be longer, rows for each robot are given shortly.
     """
     order = sorted(replies, key=lambda each: (each.is_ahead, -(each.latest or 0), each.name))
-    tables = [_table(each) for each in order]
-    if any(table is not None for table in tables):
+    if any("columns" in each.body for each in order):
         reply = _one_table(order)
     elif tool == "list_recorded_topics":
         reply = {TOPICS: _by_topic(order)}
@@ -149,7 +154,7 @@ def merged(
         reply = _rows(MERGED_ROWS[tool], order, limit, oldest_first=oldest_first)
     else:
         return _robot_rows(tool, order, failures, max_chars)
-    return _with_notes(reply, [*_notes_of(order), *_notes_on(order, failures)])
+    return with_notes(reply, [*_notes_of(order), *_notes_on(order, failures)])
 
 
 def _rows(
@@ -190,7 +195,7 @@ def _as_rows(reply: RobotReply) -> JsonObject:
         return {MATCHES: []}
     if isinstance(value, dict) and "timestamp" in value:
         return {MATCHES: [] if value["timestamp"] is None else [_without(value, {"notes"})]}
-    return value if isinstance(value, dict) else {}
+    return reply.body
 
 
 def _named_row(rule: MergedRows, name: str, reply: JsonObject, row: JsonObject) -> JsonObject:
@@ -283,32 +288,23 @@ def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
     return [*sorted(topics.values(), key=lambda row: (-_number(row["last_ts"]), str(row["topic"])))]
 
 
-def _table(reply: RobotReply) -> list[JsonValue] | None:
-    """Returns the columns of a reply that counts (the argument `by`)."""
-    columns = reply.value.get("columns") if isinstance(reply.value, dict) else None
-    return columns if isinstance(columns, list) else None
-
-
 def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
     """Returns the tables of robots as one, whose first column is the robot.
 
     A column that one of them lacks is null there.
     """
-    columns = [*dict.fromkeys(str(name) for each in replies for name in _table(each) or ())]
+    headers = [[str(name) for name in _items(each.body, "columns")] for each in replies]
+    columns = [*dict.fromkeys(name for own in headers for name in own)]
     rows: list[JsonValue] = []
-    values = [each.value if isinstance(each.value, dict) else {} for each in replies]
     every: JsonObject = {}
-    for each, value in zip(replies, values, strict=True):
-        own = [str(name) for name in _table(each) or ()]
-        lists = value.get("rows")
-        for row in lists if isinstance(lists, list) else ():
+    for each, own in zip(replies, headers, strict=True):
+        for row in _items(each.body, "rows"):
             cells = dict(zip(own, row if isinstance(row, list) else (), strict=True))
             rows.append([each.name, *(cells.get(name) for name in columns)])
-        total = value.get("all")
-        if isinstance(total, list):
+        if total := _items(each.body, "all"):
             cells = dict(zip(own[1:], total, strict=True))
             every[each.name] = [cells.get(name) for name in columns[1:]]
-    rest = [_without(value, {"columns", "rows", "all"}) for value in values]
+    rest = [_without(each.body, {"columns", "rows", "all"}) for each in replies]
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": every}
     return table | _rest(MergedRows({}), replies, rest)
 
@@ -317,30 +313,30 @@ def _robot_rows(
     tool: str, replies: Sequence[RobotReply], failures: Mapping[str, str], max_chars: int
 ) -> JsonObject:
     """Returns a row for each robot; shortly where they would be too long otherwise."""
-    whole: list[JsonObject] = [
-        {ROBOT_NAME: each.name, **(each.value if isinstance(each.value, dict) else {})}
-        for each in replies
-    ]
+    whole: list[JsonObject] = [{ROBOT_NAME: each.name, **each.body} for each in replies]
     notes = _notes_on(replies, failures)
-    reply = _with_notes({"robots": [*whole]}, notes)
+    reply = with_notes({"robots": [*whole]}, notes)
     if len(to_json_text(reply)) <= max_chars:
         return reply
     keys = (ROBOT_NAME, *SHORT_KEYS[tool])
     short = [{key: row[key] for key in keys if key in row} for row in whole]
-    return _with_notes(
+    return with_notes(
         {"robots": [*short]}, ["each robot shortly; pass robot for all of it", *notes]
     )
 
 
+def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Returns the names of robots by what is said of them, of pairs of a name and that."""
+    found: dict[str, list[str]] = {}
+    for name, reason in said:
+        found.setdefault(reason, []).append(name)
+    return found
+
+
 def _notes_of(replies: Sequence[RobotReply]) -> list[str]:
     """Returns the notes of the replies, each with the names of its robots."""
-    by_note: dict[str, list[str]] = {}
-    for each in replies:
-        notes = each.value.get("notes") if isinstance(each.value, dict) else None
-        for note in notes if isinstance(notes, list) else ():
-            if isinstance(note, str):
-                by_note.setdefault(note, []).append(each.name)
-    return [_of_robots(names, note) for note, names in by_note.items()]
+    said = ((each.name, str(note)) for each in replies for note in _items(each.body, "notes"))
+    return [_of_robots(names, note) for note, names in by_reason(said).items()]
 
 
 def _of_robots(names: Sequence[str], note: str) -> str:
@@ -349,19 +345,14 @@ def _of_robots(names: Sequence[str], note: str) -> str:
 
 def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, str]) -> list[str]:
     """Returns what is to be known of robots: who did not answer and why, whose clock is ahead."""
-    by_reason: dict[str, list[str]] = {}
-    for name, reason in failures.items():
-        by_reason.setdefault(reason, []).append(name)
     notes = [
         still_quoted(f"no answer of {_of_robots(names, reason)}", reason)
-        for reason, names in by_reason.items()
+        for reason, names in by_reason(failures.items()).items()
     ]
-    by_reason = {}
-    for each in replies:
-        for note in () if each.lake is None else each.lake.notes:
-            by_reason.setdefault(note, []).append(each.name)
-    notes += [_of_robots(names, note) for note, names in by_reason.items()]
-    notes += shipped_to({each.name: each.lake.latest for each in replies if each.lake is not None})
+    of_lake = {each.name: each.lake for each in replies if each.lake is not None}
+    said = ((name, note) for name, lake in of_lake.items() for note in lake.notes)
+    notes += [_of_robots(names, note) for note, names in by_reason(said).items()]
+    notes += shipped_to({name: lake.latest for name, lake in of_lake.items()})
     if ahead := [each.name for each in replies if each.is_ahead]:
         notes.append(
             f"{listed(ahead, at_most=_MOST_NAMED)}: dated in the future by a clock that ran ahead, "
@@ -385,12 +376,13 @@ def _moment(time: Ns | None) -> str:
     return "no time" if time is None else iso_local(time) or str(time)
 
 
-def _with_notes(reply: JsonObject, notes: Sequence[str]) -> JsonObject:
-    return {**reply, "notes": [*notes]} if notes else reply
-
-
 def _without(value: JsonObject, keys: set[str]) -> JsonObject:
     return {key: item for key, item in value.items() if key not in keys}
+
+
+def _items(reply: JsonObject, key: str) -> list[JsonValue]:
+    found = reply.get(key)
+    return found if isinstance(found, list) else []
 
 
 def _list(value: JsonValue) -> list[JsonObject]:

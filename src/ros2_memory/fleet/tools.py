@@ -29,6 +29,7 @@ from ros2_memory.fleet.merging import (
     TABLE_FOR_ALL,
     TOPICS,
     RobotReply,
+    by_reason,
     merged,
     shipped_to,
 )
@@ -290,20 +291,17 @@ def _reason(error: EpisodicError) -> str:
 
 def _shared_error(errors: Mapping[str, EpisodicError]) -> EpisodicError:
     """Returns the error where no robot has an answer."""
-    by_reason: dict[str, list[str]] = {}
-    for name, error in errors.items():
-        by_reason.setdefault(_reason(error), []).append(name)
-    text = "; ".join(f"{listed(names)}: {reason}" for reason, names in by_reason.items())
+    reasons = by_reason((name, _reason(error)) for name, error in errors.items())
+    text = "; ".join(f"{listed(names)}: {reason}" for reason, names in reasons.items())
     kinds = {type(error) for error in errors.values()}
     first = next(iter(errors.values()))
-    if isinstance(first, NoDataError) and len(kinds) == 1:
-        reasons = {error.reason for error in errors.values() if isinstance(error, NoDataError)}
-        if len(reasons) == 1:
-            return NoDataError(first.reason, text)
+    no_data = {error.reason for error in errors.values() if isinstance(error, NoDataError)}
+    if isinstance(first, NoDataError) and len(kinds) == len(no_data) == 1:
+        return NoDataError(first.reason, text)
     if kinds == {NotInLakeError}:
         return NotInLakeError(text)
     if kinds == {InvalidArgumentsError}:
-        return InvalidArgumentsError(str(first) if len(by_reason) == 1 else text)
+        return InvalidArgumentsError(str(first) if len(reasons) == 1 else text)
     if any(issubclass(kind, QueryTimeoutError) for kind in kinds):
         return QueryTimeoutError(text)
     return RefusedError(text)

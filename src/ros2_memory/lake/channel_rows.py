@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.lake.packed_messages import packed_messages
-from ros2_memory.lake.tables import topic_key
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -30,9 +29,13 @@ _MOST_BYTES: Final = 64 << 20
 
 @dataclass(slots=True, eq=False)
 class _Messages:
-    """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these."""
+    """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
+
+    `is_whole`: they are shipped whatever they take.
+    """
 
     channel: Channel
+    is_whole: bool
     payloads: list[bytes] | None
     log_times: list[int] = field(default_factory=list)
     publish_times: list[int] = field(default_factory=list)
@@ -59,8 +62,11 @@ class ChannelRows:
         channel = record.channel
         found = self._of.get(id(channel))
         if found is None:
-            is_bulky = channel.type in BULKY_TYPES and channel.topic not in self._whole
-            found = self._of[id(channel)] = _Messages(channel, None if is_bulky else [])
+            is_whole = channel.topic in self._whole
+            payloads: list[bytes] | None = (
+                [] if is_whole or channel.type not in BULKY_TYPES else None
+            )
+            found = self._of[id(channel)] = _Messages(channel, is_whole, payloads)
         found.log_times.append(record.log_time)
         found.publish_times.append(record.publish_time)
         if found.payloads is not None:
@@ -77,31 +83,27 @@ class ChannelRows:
             channel, schema, count = each.channel, each.channel.schema, len(each.log_times)
             packed = packed_messages(each.log_times, each.publish_times, each.payloads)
             most = max(MOST_OF_MESSAGE * count, LEAST_OF_CHANNEL)
-            if each.payloads is not None and len(packed) > most and not self._is_whole(channel):
+            if each.payloads is not None and len(packed) > most and not each.is_whole:
                 each.payloads = None
                 packed = packed_messages(each.log_times, each.publish_times, None)
-            yield (
-                channel.topic,
-                topic_key(channel.topic),
-                number,
-                schema.name,
-                channel.encoding,
-                channel.latched,
-                schema.encoding,
-                schema.text,
-                json.dumps(channel.metadata),
-                count,
-                each.log_times[0],
-                each.log_times[-1],
-                each.payloads is not None,
-                packed,
-            )
-
-    def _is_whole(self, channel: Channel) -> bool:
-        return channel.topic in self._whole
+            yield {
+                "topic": channel.topic,
+                "channel": number,
+                "type": schema.name,
+                "encoding": channel.encoding,
+                "latched": channel.latched,
+                "schema_encoding": schema.encoding,
+                "schema": schema.text,
+                "metadata": json.dumps(channel.metadata),
+                "messages": count,
+                "first_ns": each.log_times[0],
+                "last_ns": each.log_times[-1],
+                "has_payloads": each.payloads is not None,
+                "packed": packed,
+            }
 
     def _drop_largest(self) -> None:
-        some = [each for each in self._of.values() if not self._is_whole(each.channel)]
+        some = [each for each in self._of.values() if not each.is_whole]
         largest = max(some, key=lambda each: each.size, default=None)
         if largest is not None:
             largest.payloads = None

@@ -17,7 +17,7 @@ from pyiceberg.expressions import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Sequence
     from datetime import date
 
     from pyiceberg.expressions import BooleanExpression
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     Predicate = Callable[[str, object], BooleanExpression]
 
 # Their constructors are not those that Pydantic's plugin for mypy takes them to have.
-equal: Final = cast("Predicate", EqualTo)
+_equal: Final = cast("Predicate", EqualTo)
 _at_least: Final = cast("Predicate", GreaterThanOrEqual)
 _at_most: Final = cast("Predicate", LessThanOrEqual)
 _below: Final = cast("Predicate", LessThan)
@@ -51,39 +51,32 @@ def of_topics(condition: BooleanExpression, topics: Collection[str]) -> BooleanE
     return And(condition, _one_of("topic", topics))
 
 
-def of_day(robot: str, day: date) -> BooleanExpression:
-    """Returns the condition on rows of one partition."""
-    return And(equal("robot", robot), equal("day", day.isoformat()))
-
-
 def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
     """Returns the condition on rows of one day of some robots."""
-    return And(_one_of("robot", robots), equal("day", day.isoformat()))
+    return And(_one_of("robot", robots), _equal("day", day.isoformat()))
 
 
-def of_bags(ids: Mapping[tuple[str, date], Collection[str]]) -> BooleanExpression:
-    """Returns the condition on rows of bags, given by robot and day.
+def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
+    """Returns the condition on rows of bags, at least one, given by robot, day and id.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
+    ids: dict[tuple[str, date], set[str]] = {}
+    for robot, day, bag_id in bags:
+        ids.setdefault((robot, day), set()).add(bag_id)
     return any_of(
-        [And(of_day(robot, day), of_ids(robot, of_one)) for (robot, day), of_one in ids.items()]
+        [And(of_robots([robot], day), of_ids(robot, some)) for (robot, day), some in ids.items()]
     )
 
 
 def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
     """Returns the condition on rows of bags of a robot, of any day."""
     return And(
-        equal("robot", robot),
+        _equal("robot", robot),
         _at_least("bag_id", min(ids)),
         _at_most("bag_id", max(ids)),
         _one_of("bag_id", ids),
     )
-
-
-def between(robot: str, column: str, start: Ns, stop: Ns) -> BooleanExpression:
-    """Returns the condition on rows of a robot whose time is in `[start, stop)`."""
-    return And(equal("robot", robot), _at_least(column, start), _below(column, stop))
 
 
 def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> BooleanExpression:
@@ -93,4 +86,4 @@ def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> Bo
     """
     first, last = columns
     ends = Or(_at_least(last, start), And(_is_null(last), _at_least(first, start)))
-    return And(equal("robot", robot), _below(first, stop), ends)
+    return And(_equal("robot", robot), _below(first, stop), ends)

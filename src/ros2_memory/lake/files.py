@@ -6,18 +6,17 @@ import math
 import threading
 import time
 from contextlib import nullcontext
-from datetime import date
 from typing import TYPE_CHECKING, Final
 
 from pyiceberg.exceptions import NoSuchTableError
 
 from ros2_memory.lake.engines.base import DataFiles
-from ros2_memory.lake.partitions import NO_DAYS, Days, Partitions, locations
+from ros2_memory.lake.partitions import Partitions
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping
     from contextlib import AbstractContextManager
 
     import pyarrow as pa
@@ -25,8 +24,8 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
+    from ros2_memory.lake.partitions import Days, LakeFile
 
-_EVER: Final = (date.min, date.max)
 _MESSAGE_BYTES: Final = 64 << 20
 
 
@@ -62,7 +61,7 @@ class Lake:
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}
-        self._partitions = {name: Partitions(name) for name in TABLES}
+        self._partitions = {name: Partitions() for name in TABLES}
 
     def refresh(self, within_s: float = 0.0) -> None:
         """Looks for what was committed since, unless that was done within so many seconds.
@@ -90,36 +89,28 @@ class Lake:
             return [*self._days("bags")]
 
     def days(self, name: str, robot: str) -> Days:
-        """Returns the files of a robot in a table.
+        """Returns the files of a robot in a table, in which no row of another one is.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            return self._days(name).get(robot, NO_DAYS)
+            return self._days(name).get(robot, {})
 
     def select(
-        self,
-        sql: str,
-        tables: Iterable[str],
-        parameters: Parameters | None = None,
-        *,
-        robots: Collection[str] | None = None,
-        days: tuple[date, date] | None = None,
-        bags: tuple[str, str] | None = None,
+        self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
     ) -> pa.Table:
-        """Returns the rows of a select (see `LakeEngine`) over tables by their names.
-
-        Only files of these robots and days (inclusive) are read, and no row of others is in them:
-        every table is partitioned so. Files that can have no row of `bags`, from one id to another
-        (inclusive), are not read.
+        """Returns the rows of a select (see `LakeEngine`) over some files of a table.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
         with self._lock, self._translated("looking into the lake"):
-            files = {name: self._files(name, robots, days or _EVER, bags) for name in tables}
-        return self._engine.select(sql, files, parameters or {})
+            table = self._table(name)
+        store = {} if table is None else dict(table.io.properties)
+        locations = tuple(each.location for each in files)
+        found = DataFiles(TABLES[name].arrow_schema, locations, store)
+        return self._engine.select(sql, {name: found}, parameters or {})
 
     def _table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:
@@ -132,18 +123,3 @@ class Lake:
     def _days(self, name: str) -> Mapping[str, Days]:
         table = self._table(name)
         return {} if table is None else self._partitions[name].look(table)
-
-    def _files(
-        self,
-        name: str,
-        robots: Collection[str] | None,
-        days: tuple[date, date],
-        bags: tuple[str, str] | None,
-    ) -> DataFiles:
-        of_robot, table = self._days(name), self._table(name)
-        among = of_robot if robots is None else sorted(robots)
-        files = [each for robot in among for each in of_robot.get(robot, NO_DAYS).files(*days)]
-        if bags is not None:
-            files = [each for each in files if each.first <= bags[1] and bags[0] <= each.last]
-        store = {} if table is None else dict(table.io.properties)
-        return DataFiles(TABLES[name].arrow_schema(), locations(files), store)

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.lake.conditions import (
     any_of,
-    between,
     except_bags,
     of_bags,
     of_ids,
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from datetime import date
 
-    import pyarrow as pa
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
@@ -57,24 +55,21 @@ def forget_in_lake(
         LakeError: the lake cannot be read or written.
     """
     with location.translated("forgetting in the lake"):
-        named = _named(tombstone)
-        reaching = named or _reaching(tombstone, "start_ns", "end_ns")
-        found = _bags(tables["bags"], reaching)
+        named = of_ids(tombstone.robot, tombstone.bags) if tombstone.bags else None
+        found = _bags(tables["bags"], named or _reaching(tombstone, "bags"))
         spared: set[str] = set()
         if tombstone.topics:
             # What is in the lake of a bag shows in its channels.
-            holding = _reaching(tombstone, "first_ns", "last_ns")
-            of_these = _bags(tables["channels"], of_topics(holding, tombstone.topics))
-            spared = {*found["bag_id"].to_pylist()} - {*of_these["bag_id"].to_pylist()}
-        ids: dict[tuple[str, date], set[str]] = {}
-        for bag_id, day in zip(found["bag_id"].to_pylist(), found["day"].to_pylist(), strict=True):
-            if bag_id not in spared:
-                ids.setdefault((tombstone.robot, day), set()).add(bag_id)
+            holding = of_topics(_reaching(tombstone, "channels"), tombstone.topics)
+            holders = {bag_id for _, bag_id in _bags(tables["channels"], holding)}
+            spared = {bag_id for _, bag_id in found} - holders
+        bags = [(tombstone.robot, *each) for each in found if each[1] not in spared]
         # `bags` last: until then it lists the rows to delete.
-        for name in sorted(TABLES, key=lambda each: each == "bags"):
-            conditions = [named or except_bags(_in_window(tombstone, name), spared)]
-            if ids:
-                conditions.append(of_bags(ids))
+        for name in TABLES:
+            # By their own times, too: a killed process left rows without one in `bags`.
+            conditions = [named or except_bags(_reaching(tombstone, name), spared)]
+            if bags:
+                conditions.append(of_bags(bags))
             table = tables[name]
             with quiet_deletes():
                 table.refresh().delete(any_of(conditions))
@@ -90,33 +85,17 @@ def forget_in_lake(
         if each.snapshot_id != table.metadata.current_snapshot_id
     )
     append_tombstone(location.state_dir, tombstone, done=True)
-    gone = found.num_rows - len(spared)
-    log.info("forgotten_in_lake", robot=tombstone.robot, bags=gone, files=files)
-    return Forgotten(gone, files, kept_by)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
+    return Forgotten(len(bags), files, kept_by)
 
 
-def _bags(table: IcebergTable, condition: BooleanExpression) -> pa.Table:
+def _bags(table: IcebergTable, condition: BooleanExpression) -> list[tuple[date, str]]:
+    """Returns the day and the bag of each of some rows."""
     scan = table.refresh().scan(row_filter=condition, selected_fields=("bag_id", "day"))
-    return scan.to_arrow()
+    found = scan.to_arrow()
+    return [*zip(found["day"].to_pylist(), found["bag_id"].to_pylist(), strict=True)]
 
 
-def _named(tombstone: Tombstone) -> BooleanExpression | None:
-    """Returns the condition on rows of the bags that a tombstone names, if it names any."""
-    return of_ids(tombstone.robot, tombstone.bags) if tombstone.bags else None
-
-
-def _in_window(tombstone: Tombstone, name: str) -> BooleanExpression:
-    """Returns the condition on rows of a table that are of the window by their own times.
-
-    Such as those that a killed process left without a row in `bags`.
-    """
-    columns = TABLES[name].columns
-    if "time_ns" in columns:
-        return between(tombstone.robot, "time_ns", tombstone.start, tombstone.stop)
-    first = "start_ns" if name == "bags" else "first_ns"
-    last = "end_ns" if name == "bags" else "last_ns"
-    return _reaching(tombstone, first, last)
-
-
-def _reaching(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
-    return overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)
+def _reaching(tombstone: Tombstone, name: str) -> BooleanExpression:
+    """Returns the condition on rows of a table that reach into the window."""
+    return overlapping(tombstone.robot, TABLES[name].span, tombstone.start, tombstone.stop)

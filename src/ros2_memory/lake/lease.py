@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final
 from pyiceberg.io import load_file_io
 
 from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 
@@ -65,9 +66,7 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
                 f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file "
                 "system that supports locks"
             ) from error
-        text = json.dumps({"pid": os.getpid(), "host": socket.gethostname()}) + "\n"
-        with suppress(OSError):  # a full disk: the lock holds all the same
-            os.ftruncate(descriptor, os.pwrite(descriptor, text.encode(), 0))
+        write_holder(descriptor)
         yield
     finally:
         os.close(descriptor)
@@ -142,7 +141,7 @@ class WarehouseLease:
             self._require_mine(self._clock.now())
         self.renew()
 
-    def release(self) -> None:
+    def close(self) -> None:
         """Ends the lease, if it is held; one that cannot be ended is over with its term."""
         if self._until:
             with suppress(LakeError), self._location.translated("ending the lease of the lake"):
@@ -195,24 +194,6 @@ def _id_in(state_dir: Path) -> str:
         raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
 
 
-@contextmanager
-def leased(location: LakeLocation, clock: Clock) -> Iterator[WarehouseLease]:
-    """Yields the lease of a lake, whose lock the caller holds, and ends it if it was taken.
-
-    It is taken with the first `renew`, which a service tries again where that fails.
-    """
-    lease = WarehouseLease(location, clock)
-    try:
-        yield lease
-    finally:
-        lease.release()
-
-
 def _holder(descriptor: int) -> str:
-    try:
-        value: object = json.loads(os.pread(descriptor, _MAX_TEXT, 0))
-    except (OSError, ValueError):
-        value = None
-    if not isinstance(value, dict):
-        return "another process"
-    return f"process {value.get('pid')} on {value.get('host')}"
+    pid, host = read_holder(descriptor)
+    return "another process" if pid is None else f"process {pid} on {host}"

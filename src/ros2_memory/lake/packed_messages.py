@@ -21,13 +21,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.pack import compressed, decompressed
+from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes
 from ros2_memory.storage.base import Batch, Channel
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.storage.base import IntArray
 
 _FORMAT: Final = 1
 _HEAD: Final = struct.Struct("<BBI")
@@ -44,16 +43,16 @@ def packed_messages(
     published = np.array(publish_times, np.int64)
     parts = [
         _HEAD.pack(_FORMAT, payloads is not None, len(logged)),
-        _planes(np.diff(logged, prepend=np.int64(0)).astype("<i8")),
-        _planes((published - logged).astype("<i8")),
+        byte_planes(np.diff(logged, prepend=np.int64(0)), 8),
+        byte_planes(published - logged, 8),
     ]
     if payloads is not None:
-        sizes = np.array([len(payload) for payload in payloads], "<u4")
+        sizes = np.array([len(payload) for payload in payloads], np.int64)
         joined = b"".join(payloads)
         if len(sizes) and (sizes == sizes[0]).all():
             rows = np.frombuffer(joined, np.uint8).reshape(len(sizes), -1)
             joined = rows.T.tobytes()
-        parts += [_planes(sizes), joined]
+        parts += [byte_planes(sizes, 4), joined]
     return compressed(b"".join(parts))
 
 
@@ -71,12 +70,12 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     if form != _FORMAT:
         raise ValueError(f"messages are packed in format {form}, this program reads {_FORMAT}")
     at = _HEAD.size
-    logged = np.cumsum(_from_planes(content, at, count, "<i8"))
-    published = logged + _from_planes(content, at + 8 * count, count, "<i8")
+    logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
+    published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
     at += 16 * count
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
-        sizes = _from_planes(content, at, count, "<u4").astype(np.int64)
+        sizes = from_planes(content, at, count, 4).astype(np.int64)
         payloads = content[at + 4 * count :]
         if len(payloads) != sizes.sum():
             raise ValueError("packed messages are cut short")
@@ -85,13 +84,3 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
             payloads = planes.T.tobytes()
     starts = np.cumsum(sizes) - sizes
     return Batch(channel, logged, published, np.arange(count), payloads, starts, sizes)
-
-
-def _planes(numbers: np.ndarray[tuple[int], np.dtype[np.generic[object]]]) -> bytes:
-    return numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes()
-
-
-def _from_planes(data: bytes, at: int, count: int, dtype: str) -> IntArray:
-    size = np.dtype(dtype).itemsize
-    planes = np.frombuffer(data, np.uint8, count * size, at).reshape(size, count)
-    return np.ascontiguousarray(planes.T).view(dtype).ravel().astype(np.int64)

@@ -6,7 +6,7 @@ takes most of an answer. Manifests never change, so each is read once.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from datetime import date, timedelta
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -17,7 +17,7 @@ from pyiceberg.transforms import IdentityTransform
 from ros2_memory.core.errors import RefusedError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from pyiceberg.manifest import ManifestFile
     from pyiceberg.partitioning import PartitionSpec
@@ -29,77 +29,50 @@ _LAST: Final = "\U0010ffff"
 
 
 class LakeFile(NamedTuple):
-    """A Parquet file, and how many rows it has.
+    """A Parquet file, how many rows it has, and its size (bytes).
 
     No id of a bag in it is before `first`, nor after `last`.
     """
 
     location: str
     rows: int
+    size: int = 0
     first: str = ""
     last: str = _LAST
 
 
+Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
+"""The files of one robot in one table by day, in order of the days."""
 Partition: TypeAlias = tuple[str, date]
 """A robot and a day."""
 _Files: TypeAlias = "Mapping[Partition, Sequence[LakeFile]]"
 
 
-class Days:
-    """The files of one robot in one table. Immutable.
+def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
+    """Returns the newest days with rows up to one, and the one before them, if there is one.
 
-    Args:
-        files: by day.
+    They are those of `fewest` days, and more while all have at most `rows` rows.
     """
-
-    def __init__(self, files: Mapping[date, tuple[LakeFile, ...]]) -> None:
-        self._days = sorted(files)
-        self._files = files
-
-    @property
-    def known(self) -> Sequence[date]:
-        """The days with rows, in order."""
-        return self._days
-
-    def files(self, first: date, last: date) -> list[LakeFile]:
-        """Returns the files of days, both inclusive, in order of the days."""
-        begin, end = bisect_left(self._days, first), bisect_right(self._days, last)
-        return [*chain.from_iterable(self._files[day] for day in self._days[begin:end])]
-
-    def newest(self, until: date, rows: int, days: int) -> tuple[date, date] | None:
-        """Returns the first and last of the newest days up to one; None where none has rows.
-
-        They are those of `days` days, and more while all have at most `rows` rows.
-        """
-        end = bisect_right(self._days, until)
-        if not end:
-            return None
-        last = self._days[end - 1]
-        first, at_least, total = last, last - timedelta(days=days - 1), 0
-        for day in reversed(self._days[:end]):
-            total += sum(each.rows for each in self._files[day])
-            if total > rows and day < at_least:
-                break
-            first = day
-        return first, last
-
-
-NO_DAYS: Final = Days({})
-"""Of a robot that has no row."""
+    order = [*days]
+    begin = end = bisect_right(order, until)
+    total = 0
+    while begin:
+        day = order[begin - 1]
+        total += sum(each.rows for each in days[day])
+        if total > rows and day <= order[end - 1] - timedelta(days=fewest):
+            break
+        begin -= 1
+    found = {day: days[day] for day in order[begin:end]}
+    return found, order[begin - 1] if begin else None
 
 
 class Partitions:
-    """The files of the versions of one table that it was last shown. Not thread-safe.
+    """The files of the versions of one table that it was last shown. Not thread-safe."""
 
-    Args:
-        name: of the table.
-    """
-
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self) -> None:
         self._snapshot: int | None = None
         self._read: dict[str, _Files] = {}
-        self._robots: dict[str, Days] = {}
+        self._robots: dict[str, dict[date, Sequence[LakeFile]]] = {}
 
     def look(self, table: IcebergTable) -> Mapping[str, Days]:
         """Returns the files of a table's current version, by robot.
@@ -114,11 +87,12 @@ class Partitions:
         for manifest in snapshot.manifests(table.io):
             path = manifest.manifest_path
             read[path] = self._read.get(path) or self._files(table, manifest)
-        found: dict[str, dict[date, tuple[LakeFile, ...]]] = {}
-        for (robot, day), files in chain.from_iterable(each.items() for each in read.values()):
-            of_robot = found.setdefault(robot, {})
-            of_robot[day] = (*of_robot.get(day, ()), *files)
-        self._robots = {robot: Days(found[robot]) for robot in sorted(found)}
+        found: dict[Partition, list[LakeFile]] = {}
+        for part, files in chain.from_iterable(each.items() for each in read.values()):
+            found.setdefault(part, []).extend(files)
+        self._robots = {}
+        for robot, day in sorted(found):
+            self._robots.setdefault(robot, {})[day] = found[robot, day]
         self._read, self._snapshot = read, snapshot.snapshot_id
         return self._robots
 
@@ -126,8 +100,8 @@ class Partitions:
         entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
         if entries and manifest.content is ManifestContent.DELETES:
             raise RefusedError(
-                f"the lake's table {self._name} has delete files, which another program wrote: "
-                "rewrite them into its data files first (copy-on-write)"
+                f"the lake's table {table.name()[-1]} has delete files, which another program "
+                "wrote: rewrite them into its data files first (copy-on-write)"
             )
         spec = table.specs()[manifest.partition_spec_id]
         robot, day = (self._position(table, spec, column) for column in ("robot", "day"))
@@ -139,7 +113,9 @@ class Partitions:
                 bytes(bounds.get(bag_id) or b"").decode()
                 for bounds in (each.lower_bounds or {}, each.upper_bounds or {})
             )
-            file = LakeFile(each.file_path, each.record_count, first, last or _LAST)
+            file = LakeFile(
+                each.file_path, each.record_count, each.file_size_in_bytes, first, last or _LAST
+            )
             found.setdefault((str(each.partition[robot]), when), []).append(file)
         return found
 
@@ -149,11 +125,6 @@ class Partitions:
             if each.source_id == source and isinstance(each.transform, IdentityTransform):
                 return position
         raise RefusedError(
-            f"the lake's table {self._name} has files that are not of one {column}, which another "
-            "program wrote: partition it by robot and day again"
+            f"the lake's table {table.name()[-1]} has files that are not of one {column}, which "
+            "another program wrote: partition it by robot and day again"
         )
-
-
-def locations(files: Iterable[LakeFile]) -> tuple[str, ...]:
-    """Returns the URIs of files."""
-    return tuple(each.location for each in files)

@@ -10,9 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from datetime import timedelta
-from typing import TYPE_CHECKING, Final, NamedTuple
-
-import pyarrow as pa
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
@@ -36,8 +34,8 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.lake.conditions import any_of, of_bags, overlapping
 from ros2_memory.lake.forgetting import forget_in_lake
-from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, end_of, to_arrow
+from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.tables import TABLES, day_of, end_of
 from ros2_memory.lake.tombstones import Tombstone, append_tombstone
 from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import quiet_deletes
@@ -47,6 +45,7 @@ if TYPE_CHECKING:
     from datetime import date
     from pathlib import Path
 
+    import pyarrow as pa
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
@@ -61,17 +60,6 @@ log = get_logger(__name__)
 MOST_BAGS: Final = 2_000
 MOST_ROWS: Final = 200_000
 """Of one batch: they are in memory until it is committed."""
-_KNOWN: Final = (
-    "bag_id",
-    "file",
-    "size",
-    "sha256",
-    "mtime_ns",
-    "made_of",
-    "start_ns",
-    "end_ns",
-    "day",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,18 +95,16 @@ class Shipped:
     problems: list[str] = field(default_factory=list)
 
 
-class _Known(NamedTuple):
-    """A bag that has a row in `bags`."""
+@dataclass(slots=True)
+class _Seen:
+    """A state of a bag: of its file, and of what says which of its messages count.
 
+    `is_forgotten`: whether it has messages that were forgotten; None before it was read for that.
+    """
+
+    state: tuple[int, Ns, Ns]
     bag_id: str
-    file: str
-    size: int
-    sha256: str
-    mtime_ns: Ns
-    made_of: str
-    start: Ns
-    end: Ns
-    day: date
+    is_forgotten: bool | None = None
 
 
 @dataclass(slots=True)
@@ -128,15 +114,13 @@ class _OfRobot:
     Attributes:
         days: of which the lake was asked, with those beside them.
         known: the bags of these days that are in the lake, by their ids.
-        ids: by path, with the size and time of the file.
-        forbidden: whether a state of a bag has messages that were forgotten.
+        seen: the newest state of each, by its path.
         receipts: by path; None before they were read.
     """
 
     days: frozenset[date] = frozenset()
-    known: dict[str, _Known] = field(default_factory=dict)
-    ids: dict[str, tuple[tuple[int, Ns], str]] = field(default_factory=dict)
-    forbidden: dict[str, bool] = field(default_factory=dict)
+    known: dict[str, ShippedBag] = field(default_factory=dict)
+    seen: dict[str, _Seen] = field(default_factory=dict)
     receipts: dict[str, Receipt] | None = None
 
 
@@ -145,9 +129,9 @@ class _Ready:
     """A bag of a batch, its rows, and the days and ids under which older ones of it may lie."""
 
     robot: RobotBags
-    known: _Known
+    known: ShippedBag
     rows: Mapping[str, Sequence[Row]]
-    replaced: tuple[_Known, ...]
+    replaced: tuple[ShippedBag, ...]
 
 
 class Shipper:
@@ -249,7 +233,9 @@ class Shipper:
     def _look_again(self) -> None:
         """Has the lake asked again what it has, and bags whether they were forgotten."""
         for each in self._of.values():
-            each.days, each.known, each.forbidden = frozenset(), {}, {}
+            each.days, each.known = frozenset(), {}
+            for seen in each.seen.values():
+                seen.is_forgotten = None
 
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
@@ -270,8 +256,8 @@ class Shipper:
         bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
         known = self._known_of(robot.name, bags)
         by_file = {each.file: each for each in known.values()}
-        seen: set[str] = set()
-        receipts: list[_Known] = []
+        ids: set[str] = set()
+        receipts: list[ShippedBag] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
         for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
             self._alive()
@@ -281,15 +267,15 @@ class Shipper:
                 if not is_settled(bag, robot.bag_dir, robot.memory.clock.now()):
                     done.waiting += 1
                     continue
-                bag_id = self._id_of(robot, bag)
-                before = known.get(bag_id)
+                seen = self._look(robot, bag)
+                before = known.get(seen.bag_id)
                 is_again = before is not None and self._is_moment(robot, bag)
-                if bag_id in seen or is_again or self._is_forgotten(robot, bag, bag_id, done):
+                if seen.bag_id in ids or is_again or self._is_forgotten(robot, bag, seen, done):
                     continue
-                seen.add(bag_id)
-                now = self._described(robot, bag, bag_id, before)
+                ids.add(seen.bag_id)
+                now = self._described(robot, bag, seen.bag_id, before)
                 if before is not None and _is_same(before, now):
-                    known[bag_id] = now
+                    known[now.bag_id] = now
                     receipts.append(now)
                 else:
                     yield self._made(robot, bag, now, before, by_file.get(now.file))
@@ -301,15 +287,10 @@ class Shipper:
     def _drop_gone(self, robot: RobotBags, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer: a hub runs for years."""
         of_robot, root = self._of[robot.name], str(robot.bag_dir)
-        present = {each.file: each for each in bags}
-        ids = {file: each for file, each in of_robot.ids.items() if file in present}
-        states = {_state_of(present[file], bag_id) for file, (_, bag_id) in ids.items()}
-        names = {relative(file, root) for file in present}
-        of_robot.ids = ids
-        of_robot.forbidden = {
-            state: each for state, each in of_robot.forbidden.items() if state in states
-        }
+        files = {each.file for each in bags}
+        of_robot.seen = {file: each for file, each in of_robot.seen.items() if file in files}
         if of_robot.receipts is not None:
+            names = {relative(file, root) for file in files}
             of_robot.receipts = {
                 name: each for name, each in of_robot.receipts.items() if name in names
             }
@@ -318,61 +299,66 @@ class Shipper:
     def _is_moment(robot: RobotBags, bag: BagFile) -> bool:
         return relative(bag.file, str(robot.bag_dir)).startswith(f"{MOMENTS_FOLDER}/")
 
-    def _id_of(self, robot: RobotBags, bag: BagFile) -> str:
-        stat = (bag.size, bag.mtime_ns)
-        ids = self._of[robot.name].ids
-        found = ids.get(bag.file)
-        if found is None or found[0] != stat:
-            found = stat, bag_id_of(robot.name, bag, robot.first_in(bag.path))
-            ids[bag.file] = found
-        return found[1]
+    def _look(self, robot: RobotBags, bag: BagFile) -> _Seen:
+        """Returns a state of a bag, which is read once."""
+        state, known = (bag.size, bag.mtime_ns, bag.sidecar_ns), self._of[robot.name].seen
+        seen = known.get(bag.file)
+        if seen is None or seen.state != state:
+            seen = _Seen(state, bag_id_of(robot.name, bag, robot.first_in(bag.path)))
+            known[bag.file] = seen
+        return seen
 
     def _made(
         self,
         robot: RobotBags,
         bag: BagFile,
-        now: _Known,
-        before: _Known | None,
-        other: _Known | None,
+        now: ShippedBag,
+        before: ShippedBag | None,
+        other: ShippedBag | None,
     ) -> _Ready:
         """Returns a bag with its rows; `other` was known under its path."""
-        content = BagContent(bag, now.bag_id, now.sha256, now.made_of)
-        rows = rows_of(robot.memory, content, self._messages)
+        rows = rows_of(robot.memory, bag, now, self._messages)
         older = [] if before is None else [before]
         if other is not None and other is not before and _holds(other, now):
             older.append(other)
         return _Ready(robot, now, rows, tuple(older))
 
-    def _is_forgotten(self, robot: RobotBags, bag: BagFile, bag_id: str, done: Shipped) -> bool:
-        """Returns, and reports, whether a bag has a message that was forgotten.
-
-        Each state of a bag is read once.
-        """
-        key, forbidden = _state_of(bag, bag_id), self._of[robot.name].forbidden
-        if key not in forbidden:
+    def _is_forgotten(self, robot: RobotBags, bag: BagFile, seen: _Seen, done: Shipped) -> bool:
+        """Returns, and reports, whether a bag has a message that was forgotten."""
+        if seen.is_forgotten is None:
             reader = robot.memory.reader
-            forbidden[key] = any(
-                each.forbids(reader, robot.name, bag, bag_id) for each in self._tombstones
+            seen.is_forgotten = any(
+                each.forbids(reader, robot.name, bag, seen.bag_id) for each in self._tombstones
             )
-        if forbidden[key]:
+        if seen.is_forgotten:
             done.problems.append(
                 f"{robot.name}: {bag.file} has messages that were forgotten in the lake; it is "
                 "not shipped: delete it, or the messages, with ros2-memory forget"
             )
-        return forbidden[key]
+        return seen.is_forgotten
 
     def _described(
-        self, robot: RobotBags, bag: BagFile, bag_id: str, before: _Known | None
-    ) -> _Known:
+        self, robot: RobotBags, bag: BagFile, bag_id: str, before: ShippedBag | None
+    ) -> ShippedBag:
         """Returns what a bag would be known as."""
         made = made_of(robot.memory, bag, robot.config, self._messages)
         same = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and same else sha256_of(bag.path)
         file = relative(bag.file, str(robot.bag_dir))
-        day = day_of(bag.start)
-        return _Known(bag_id, file, bag.size, sha256, bag.mtime_ns, made, bag.start, bag.end, day)
+        return ShippedBag(
+            robot.name,
+            bag_id,
+            day_of(bag.start),
+            file,
+            bag.size,
+            sha256,
+            bag.mtime_ns,
+            made,
+            bag.start,
+            bag.end,
+        )
 
-    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, _Known]:
+    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, ShippedBag]:
         """Returns what the lake has of the days of some bags; of each day it is asked once.
 
         And of the days beside them: another first message of a bag that counts moves its begin.
@@ -387,12 +373,12 @@ class Shipper:
             of_robot.known = {
                 bag_id: each
                 for bag_id, each in of_robot.known.items()
-                if any(each.day <= day <= day_of(each.end) for day in days)
+                if any(each.day <= day <= day_of(each.end_ns) for day in days)
             }
             of_robot.days = days
         return of_robot.known
 
-    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[_Known]:
+    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[ShippedBag]:
         """Yields the bags of a robot in the lake that have something of some days.
 
         Raises:
@@ -401,13 +387,12 @@ class Shipper:
         spans = united(
             (end_of(day - timedelta(1)) + 1, min(end_of(day) + 1, MAX_NS)) for day in days
         )
-        reaching = [overlapping(robot, ("start_ns", "end_ns"), *span) for span in spans]
+        reaching = any_of([overlapping(robot, TABLES["bags"].span, *span) for span in spans])
         with self._location.translated("reading the lake's bags"):
-            scan = self._tables["bags"].refresh().scan(any_of(reaching), selected_fields=_KNOWN)
-            found = scan.to_arrow().select(_KNOWN)
-            columns = [found[name].to_pylist() for name in _KNOWN]
-        for row in zip(*columns, strict=True):
-            yield _Known(*row)
+            bags = self._tables["bags"].refresh()
+            found = bags.scan(reaching, selected_fields=ShippedBag._fields).to_arrow()
+        for row in found.to_pylist():
+            yield ShippedBag(**row)
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
         """Commits a batch.
@@ -416,22 +401,18 @@ class Shipper:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
         self._pause()
-        condition = _rows_of(batch)
-        parts: dict[tuple[str, date], list[_Ready]] = {}
-        for each in batch:
-            parts.setdefault((each.robot.name, each.known.day), []).append(each)
+        # Few files have to be looked at for it.
+        condition = of_bags(
+            (one.robot, one.day, one.bag_id)
+            for each in batch
+            for one in (each.known, *each.replaced)
+        )
         rows = 0
         try:
-            # `bags` last: a bag with a row there is whole.
-            for name in sorted(TABLES, key=lambda each: each == "bags"):
-                table = pa.concat_tables(
-                    to_arrow(
-                        TABLES[name], robot, day, {one.known.bag_id: one.rows[name] for one in part}
-                    )
-                    for (robot, day), part in parts.items()
-                )
-                rows += table.num_rows
-                self._overwrite(name, table, condition)
+            for name, table in TABLES.items():
+                filled = table.filled([row for each in batch for row in each.rows[name]])
+                rows += filled.num_rows
+                self._overwrite(name, filled, condition)
         except LakeError:
             self._look_again()
             raise
@@ -455,7 +436,7 @@ class Shipper:
         with self._location.translated(f"writing the lake's {name}"), quiet_deletes():
             self._tables[name].refresh().overwrite(rows, overwrite_filter=condition)
 
-    def _confirm(self, robot: RobotBags, bags: Iterable[_Known], done: Shipped) -> None:
+    def _confirm(self, robot: RobotBags, bags: Iterable[ShippedBag], done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
         if not has_recorded(robot.bag_dir):
             return
@@ -484,33 +465,14 @@ class Shipper:
             done.problems.append(problem)
 
 
-def _state_of(bag: BagFile, bag_id: str) -> str:
-    """Returns what names a state of a bag."""
-    return f"{bag_id} {bag.size} {bag.mtime_ns} {bag.sidecar_ns}"
+def _is_same(before: ShippedBag, now: ShippedBag) -> bool:
+    """Returns whether the rows of a bag would be the same; a copy has another path and mtime."""
+    return before == now._replace(mtime_ns=before.mtime_ns, file=before.file)
 
 
-def _is_same(before: _Known, now: _Known) -> bool:
-    """Returns whether the rows of a bag would be the same."""
-    return before == _with_times(now, before)
-
-
-def _with_times(now: _Known, before: _Known) -> _Known:
-    """Returns what is known with the path and mtime of before: a copy has others."""
-    return now._replace(mtime_ns=before.mtime_ns, file=before.file)
-
-
-def _holds(old: _Known, new: _Known) -> bool:
+def _holds(old: ShippedBag, new: ShippedBag) -> bool:
     """Returns whether a bag of the same path is an older state of another one.
 
     As where its first messages were deleted by request: what is left lies within it.
     """
-    return old.start <= new.start and new.end <= old.end
-
-
-def _rows_of(batch: Sequence[_Ready]) -> BooleanExpression:
-    """Returns the condition on rows of a batch's bags, so that few files have to be looked at."""
-    ids: dict[tuple[str, date], set[str]] = {}
-    for each in batch:
-        for one in (each.known, *each.replaced):
-            ids.setdefault((each.robot.name, one.day), set()).add(one.bag_id)
-    return of_bags(ids)
+    return old.start_ns <= new.start_ns and new.end_ns <= old.end_ns

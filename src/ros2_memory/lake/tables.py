@@ -21,10 +21,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import TYPE_CHECKING, Final, Literal
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import pyarrow as pa
 from pyiceberg.exceptions import NoSuchTableError
+from pyiceberg.io.pyarrow import schema_to_pyarrow
 from pyiceberg.partitioning import PartitionField, PartitionSpec
 from pyiceberg.schema import Schema as IcebergSchema
 from pyiceberg.table.sorting import SortField, SortOrder
@@ -51,156 +53,122 @@ if TYPE_CHECKING:
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
-    Kind = Literal[
-        "text",
-        "long",
-        "double",
-        "bool",
-        "bytes",
-        "date",
-        "time",
-        "texts",
-        "longs",
-        "doubles",
-        "bools",
-    ]
-
 NAMESPACE: Final = "ros2_memory"
 ROWS_VERSION: Final = 27
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _NS_PER_US: Final = 1_000
-
-
-def _map(field_id: int, kind: IcebergType) -> MapType:
-    return MapType(field_id, StringType(), field_id + 1, kind, value_required=False)
-
-
-_TYPES: Final[Mapping[Kind, tuple[IcebergType, pa.DataType]]] = {
-    "text": (StringType(), pa.large_string()),
-    "long": (LongType(), pa.int64()),
-    "double": (DoubleType(), pa.float64()),
-    "bool": (BooleanType(), pa.bool_()),
-    "bytes": (BinaryType(), pa.large_binary()),
-    "date": (DateType(), pa.date32()),
-    "time": (TimestamptzType(), pa.timestamp("us", tz="UTC")),
-    "texts": (_map(101, StringType()), pa.map_(pa.large_string(), pa.large_string())),
-    "longs": (_map(103, LongType()), pa.map_(pa.large_string(), pa.int64())),
-    "doubles": (_map(105, DoubleType()), pa.map_(pa.large_string(), pa.float64())),
-    "bools": (_map(107, BooleanType()), pa.map_(pa.large_string(), pa.bool_())),
-}
-"""The last four are maps from texts; their fields have ids that no column has."""
-_KEYS: Final[Mapping[str, Kind]] = {"robot": "text", "bag_id": "text", "day": "date"}
+_TEXT: Final = StringType()
+_LONG: Final = LongType()
+_DOUBLE: Final = DoubleType()
+_BOOL: Final = BooleanType()
+_BYTES: Final = BinaryType()
+_TIME: Final = TimestamptzType()
+_KEYS: Final[Mapping[str, IcebergType]] = {"robot": _TEXT, "bag_id": _TEXT, "day": DateType()}
 """Columns of all tables; a row has a value for each."""
+_TOPIC: Final[Mapping[str, IcebergType]] = {"topic": _TEXT, "topic_key": _TEXT}
+_SPANS: Final = (("time_ns", "time_ns"), ("first_ns", "last_ns"), ("start_ns", "end_ns"))
 _PROPERTIES: Final = {
     "write.parquet.compression-codec": "zstd",
     "commit.manifest-merge.enabled": "true",
 }
 
 
-@dataclass(frozen=True, slots=True)
+def _map(field_id: int, kind: IcebergType) -> MapType:
+    """Returns the type of a map from texts; its fields have ids that no column has."""
+    return MapType(field_id, _TEXT, field_id + 1, kind, value_required=False)
+
+
+@dataclass(frozen=True)
 class LakeTable:
     """One table.
 
     Attributes:
         name: its name in the namespace.
-        columns: the kind of each column besides `robot`, `bag_id` and `day`, in the order of a row.
+        columns: the type of each column besides `robot`, `bag_id` and `day`, in order.
         order: the columns that rows are sorted by.
         row_group: rows of a row group, so that engines skip those of other topics and labels.
     """
 
     name: str
-    columns: Mapping[str, Kind]
+    columns: Mapping[str, IcebergType]
     order: tuple[str, ...]
     row_group: int = 1 << 17
 
+    @property
+    def span(self) -> tuple[str, str]:
+        """The columns of the first and the last time (ns) of a row; a null is the first."""
+        return next(pair for pair in _SPANS if pair[0] in self.columns)
+
     def schema(self) -> IcebergSchema:
         """Returns its columns for Iceberg."""
-        fields = [
-            NestedField(number, name, _TYPES[kind][0], required=name in _KEYS)
-            for number, (name, kind) in enumerate({**_KEYS, **self.columns}.items(), 1)
-        ]
-        return IcebergSchema(*fields)
+        return IcebergSchema(
+            *(
+                NestedField(number, name, kind, required=name in _KEYS)
+                for number, (name, kind) in enumerate({**_KEYS, **self.columns}.items(), 1)
+            )
+        )
 
     def partition(self) -> PartitionSpec:
         """Returns its partitions: robot and day."""
-        schema = self.schema()
         return PartitionSpec(
             *(
-                PartitionField(
-                    schema.find_field(name).field_id, 1000 + nth, IdentityTransform(), name
-                )
+                PartitionField(self._id(name), 1000 + nth, IdentityTransform(), name)
                 for nth, name in enumerate(("robot", "day"))
             )
         )
 
     def sort_order(self) -> SortOrder:
-        """Returns its order, which `to_arrow` keeps."""
-        schema = self.schema()
-        return SortOrder(
-            *(
-                SortField(schema.find_field(name).field_id, IdentityTransform())
-                for name in self.order
-            )
-        )
+        """Returns its order, which `filled` keeps."""
+        return SortOrder(*(SortField(self._id(name), IdentityTransform()) for name in self.order))
 
+    @cached_property
     def arrow_schema(self) -> pa.Schema:
-        """Returns its columns for Arrow."""
-        return pa.schema(
-            [
-                pa.field(name, _TYPES[kind][1], nullable=name not in _KEYS)
-                for name, kind in {**_KEYS, **self.columns}.items()
-            ]
-        )
+        """Its columns for Arrow."""
+        # Without ids: those of a table in a catalogue are others.
+        return schema_to_pyarrow(self.schema(), include_field_ids=False)
+
+    def filled(self, rows: Sequence[Row]) -> pa.Table:
+        """Returns rows, sorted as the table is."""
+        schema = self.arrow_schema
+        columns = {
+            field.name: _array([row.get(field.name) for row in rows], field.type)
+            for field in schema
+        }
+        if "time" in columns:
+            first = columns[self.span[0]].to_numpy() // _NS_PER_US
+            columns["time"] = pa.array(first).cast(schema.field("time").type)
+        if "topic" in columns:
+            columns["topic_key"] = _array(
+                [topic_key(topic) for topic in columns["topic"].to_pylist()],
+                schema.field("topic_key").type,
+            )
+        order = [(name, "ascending") for name in self.order]
+        return pa.Table.from_pydict(columns, schema).sort_by(order)
+
+    def _id(self, column: str) -> int:
+        return self.schema().find_field(column).field_id
 
 
 TABLES: Final[Mapping[str, LakeTable]] = {
     each.name: each
     for each in (
         LakeTable(
-            "bags",
-            {
-                "recording": "text",
-                "file": "text",
-                "size": "long",
-                "sha256": "text",
-                "mtime_ns": "long",
-                "made_of": "text",
-                "start_ns": "long",
-                "end_ns": "long",
-                "time": "time",
-                "messages": "long",
-                "undecodable": "long",
-                "detections": "long",
-                "pose_topic": "text",
-                "map_frame": "text",
-                "poses": "long",
-                "distance_m": "double",
-                "gap_m": "double",
-                "max_mps": "double",
-                "stood_s": "double",
-                "summary": "text",
-                "counts": "bytes",
-            },
-            ("start_ns",),
-        ),
-        LakeTable(
             "channels",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "channel": "long",
-                "type": "text",
-                "encoding": "text",
-                "latched": "bool",
-                "schema_encoding": "text",
-                "schema": "bytes",
-                "metadata": "text",
-                "messages": "long",
-                "first_ns": "long",
-                "last_ns": "long",
-                "has_payloads": "bool",
-                "packed": "bytes",
+                **_TOPIC,
+                "channel": _LONG,
+                "type": _TEXT,
+                "encoding": _TEXT,
+                "latched": _BOOL,
+                "schema_encoding": _TEXT,
+                "schema": _BYTES,
+                "metadata": _TEXT,
+                "messages": _LONG,
+                "first_ns": _LONG,
+                "last_ns": _LONG,
+                "has_payloads": _BOOL,
+                "packed": _BYTES,
             },
             ("topic_key", "first_ns"),
             row_group=1024,
@@ -208,104 +176,123 @@ TABLES: Final[Mapping[str, LakeTable]] = {
         LakeTable(
             "poses",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "frame_id": "text",
-                "time_ns": "long",
-                "time": "time",
-                "x": "double",
-                "y": "double",
-                "heading": "double",
-                "begins": "bool",
-                "error_m": "double",
+                **_TOPIC,
+                "frame_id": _TEXT,
+                "time_ns": _LONG,
+                "time": _TIME,
+                "x": _DOUBLE,
+                "y": _DOUBLE,
+                "heading": _DOUBLE,
+                "begins": _BOOL,
+                "error_m": _DOUBLE,
             },
             ("topic_key", "frame_id", "time_ns"),
         ),
         LakeTable(
             "sightings",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "type": "text",
-                "time_ns": "long",
-                "time": "time",
-                "message": "long",
-                "label": "text",
-                "score": "double",
-                "frame_id": "text",
-                "x": "double",
-                "y": "double",
-                "z": "double",
-                "robot_frame": "text",
-                "robot_x": "double",
-                "robot_y": "double",
+                **_TOPIC,
+                "type": _TEXT,
+                "time_ns": _LONG,
+                "time": _TIME,
+                "message": _LONG,
+                "label": _TEXT,
+                "score": _DOUBLE,
+                "frame_id": _TEXT,
+                "x": _DOUBLE,
+                "y": _DOUBLE,
+                "z": _DOUBLE,
+                "robot_frame": _TEXT,
+                "robot_x": _DOUBLE,
+                "robot_y": _DOUBLE,
             },
             ("topic_key", "label", "time_ns"),
         ),
         LakeTable(
             "things",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "label": "text",
-                "count": "long",
-                "first_ns": "long",
-                "last_ns": "long",
-                "time": "time",
-                "frame_id": "text",
-                "x": "double",
-                "y": "double",
-                "z": "double",
-                "spread_m": "double",
-                "best_score": "double",
+                **_TOPIC,
+                "label": _TEXT,
+                "count": _LONG,
+                "first_ns": _LONG,
+                "last_ns": _LONG,
+                "time": _TIME,
+                "frame_id": _TEXT,
+                "x": _DOUBLE,
+                "y": _DOUBLE,
+                "z": _DOUBLE,
+                "spread_m": _DOUBLE,
+                "best_score": _DOUBLE,
             },
             ("topic_key", "label", "first_ns"),
         ),
         LakeTable(
             "events",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "kind": "text",
-                "first_ns": "long",
-                "last_ns": "long",
-                "time": "time",
-                "text": "text",
-                "value": "double",
-                "count": "long",
-                "x": "double",
-                "y": "double",
+                **_TOPIC,
+                "kind": _TEXT,
+                "first_ns": _LONG,
+                "last_ns": _LONG,
+                "time": _TIME,
+                "text": _TEXT,
+                "value": _DOUBLE,
+                "count": _LONG,
+                "x": _DOUBLE,
+                "y": _DOUBLE,
             },
             ("topic_key", "kind", "first_ns"),
         ),
         LakeTable(
             "messages",
             {
-                "topic": "text",
-                "topic_key": "text",
-                "type": "text",
-                "time_ns": "long",
-                "time": "time",
-                "publish_ns": "long",
-                "message": "long",
-                "value": "text",
-                "undecodable": "text",
-                "flags": "bools",
-                "integers": "longs",
-                "numbers": "doubles",
-                "texts": "texts",
+                **_TOPIC,
+                "type": _TEXT,
+                "time_ns": _LONG,
+                "time": _TIME,
+                "publish_ns": _LONG,
+                "message": _LONG,
+                "value": _TEXT,
+                "undecodable": _TEXT,
+                "flags": _map(107, _BOOL),
+                "integers": _map(103, _LONG),
+                "numbers": _map(105, _DOUBLE),
+                "texts": _map(101, _TEXT),
             },
             ("topic_key", "time_ns"),
         ),
+        LakeTable(
+            "bags",
+            {
+                "recording": _TEXT,
+                "file": _TEXT,
+                "size": _LONG,
+                "sha256": _TEXT,
+                "mtime_ns": _LONG,
+                "made_of": _TEXT,
+                "start_ns": _LONG,
+                "end_ns": _LONG,
+                "time": _TIME,
+                "messages": _LONG,
+                "undecodable": _LONG,
+                "detections": _LONG,
+                "pose_topic": _TEXT,
+                "map_frame": _TEXT,
+                "poses": _LONG,
+                "distance_m": _DOUBLE,
+                "gap_m": _DOUBLE,
+                "max_mps": _DOUBLE,
+                "stood_s": _DOUBLE,
+                "summary": _TEXT,
+                "counts": _BYTES,
+            },
+            ("start_ns",),
+        ),
     )
 }
-"""The tables by name; `bags` is committed last, so that a bag with a row there is whole."""
+"""The tables by name, `bags` last: in this order they are committed, and what is there is whole."""
 
-RETIRED: Final = ("digests",)
-"""Tables of earlier versions, from which nothing is read any more."""
-
-Row = tuple[object, ...]
-"""The values of a table's own columns, in order."""
+Row: TypeAlias = "Mapping[str, object]"
+"""Values by column; others are null, but for `time` and `topic_key`, which follow from these."""
 
 
 def topic_key(topic: str) -> str:
@@ -322,25 +309,6 @@ def end_of(day: date) -> Ns:
     """Returns the last log time of a day (UTC)."""
     next_day = datetime(day.year, day.month, day.day, tzinfo=UTC) + timedelta(days=1)
     return int(next_day.timestamp()) * NS_PER_S - 1
-
-
-def microseconds(time_ns: Ns) -> int:
-    """Returns a time for a column of timestamps."""
-    return time_ns // _NS_PER_US
-
-
-def to_arrow(
-    table: LakeTable, robot: str, day: date, rows_of: Mapping[str, Sequence[Row]]
-) -> pa.Table:
-    """Returns rows of one robot's bags of one day, by bag id, sorted as the table is."""
-    schema = table.arrow_schema()
-    rows = [row for of_bag in rows_of.values() for row in of_bag]
-    ids = [bag_id for bag_id, of_bag in rows_of.items() for _ in of_bag]
-    columns = zip(*rows, strict=True) if rows else ((),) * len(table.columns)
-    values = ([robot] * len(rows), ids, [day] * len(rows), *columns)
-    arrays = [_array(each, field.type) for each, field in zip(values, schema, strict=True)]
-    order = [(name, "ascending") for name in table.order]
-    return pa.Table.from_arrays(arrays, schema=schema).sort_by(order)
 
 
 def _array(values: Sequence[object], kind: pa.DataType) -> pa.Array:
@@ -384,8 +352,6 @@ def open_tables(
         known = {each.name for each in opened.schema().fields}
         if not known.issuperset(table.columns):
             with opened.update_schema() as update:
-                for column, kind in table.columns.items():
-                    if column not in known:
-                        update.add_column(column, _TYPES[kind][0])
+                update.union_by_name(table.schema())
         found[name] = opened
     return found

@@ -6,12 +6,10 @@ anything is deleted, and again as done when all of it is gone.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.durable_write import append_durably
-from ros2_memory.bag_dir.json_files import is_integer
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.lake.rows import id_of_file
@@ -21,7 +19,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.state_files import Forgetting
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
 
 TOMBSTONES_FILE: Final = "tombstones.jsonl"
@@ -32,13 +29,15 @@ class Tombstone:
     """Messages of a robot that were forgotten: those of a window (log times, half-open).
 
     Where there are `topics`, only theirs; where there are `bags`, all of these alone, by their ids.
+    `done`: all of it is gone; two that differ in that alone are equal.
     """
 
     robot: str
-    start: Ns
-    stop: Ns
+    start: Int64
+    stop: Int64
     topics: tuple[str, ...] = ()
     bags: tuple[str, ...] = ()
+    done: bool = field(default=False, compare=False)
 
     @property
     def window(self) -> TimeWindow:
@@ -72,16 +71,19 @@ class Tombstone:
         )
 
 
+TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
+
+
 def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> None:
     """Appends a tombstone durably, or that it is done.
 
     Raises:
         LakeError: it cannot be written.
     """
-    path = state_dir / TOMBSTONES_FILE
     try:
-        append_durably(path, json.dumps({**asdict(tombstone), "done": done}) + "\n")
+        TOMBSTONES.append(state_dir, [replace(tombstone, done=done)])
     except OSError as error:
+        path = state_dir / TOMBSTONES_FILE
         raise LakeError(f"{path} cannot be written: {error.strerror}") from error
 
 
@@ -89,52 +91,15 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
     """Returns the tombstones, and whether each is done.
 
     Raises:
-        LakeError: they cannot be read, or a line is damaged: nothing may be shipped then. A last
-            line that a crash cut short is skipped.
+        LakeError: they cannot be read, or a line is damaged: nothing may be shipped then.
     """
-    path = state_dir / TOMBSTONES_FILE
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise LakeError(f"{path} cannot be read: {error}") from error
     found: dict[Tombstone, bool] = {}
-    lines = text.split("\n")
-    for number, line in enumerate(lines[:-1], 1):
-        if not line:
-            continue
-        try:
-            value: object = json.loads(line)
-        except ValueError:
-            value = None
-        match value:
-            case {
-                "robot": str(robot),
-                "start": start,
-                "stop": stop,
-                "done": bool(done),
-                **more,
-            } if is_integer(start) and is_integer(stop):
-                names = [_names(more.get(key, []), path, number) for key in ("topics", "bags")]
-                tombstone = Tombstone(robot, start, stop, *names)
-                found[tombstone] = done or found.get(tombstone, False)
-            case _ if number == len(lines) - 1 or _was_cut(line):
-                continue
-            case _:
-                raise LakeError(
-                    f"{path}, line {number}: not a tombstone; nothing is shipped until it is "
-                    "repaired, since what was forgotten could come back"
-                )
+    try:
+        for _, each in TOMBSTONES.all_rows(state_dir):
+            found[each] = each.done or found.get(each, False)
+    except (OSError, ValueError) as error:
+        raise LakeError(
+            f"{state_dir / TOMBSTONES_FILE}: {error}; nothing is shipped until it is repaired, "
+            "since what was forgotten could come back"
+        ) from error
     return found
-
-
-def _names(value: object, path: Path, line: int) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
-        raise LakeError(f"{path}, line {line}: topics and bags must be lists of names")
-    return tuple(value)
-
-
-def _was_cut(line: str) -> bool:
-    """Returns whether a crash cut a line short: nothing was deleted for it yet."""
-    return line.startswith("{") and not line.endswith("}")

@@ -7,38 +7,26 @@ for all messages of a type without lists, which Parquet stores once.
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.lake.tables import Row
 
-    Scalar = str | float | bool
-    Found = dict[str, dict[str, Scalar]]
+    Found = dict[str, list[tuple[str, object]]]
 
-MAPS: Final = ("flags", "integers", "numbers", "texts")
-"""The columns of scalars, in the order of a row."""
 _LARGEST: Final = 1 << 63
 _KIND_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"}
 
 
-class TypedValue(NamedTuple):
-    """A message as columns: its scalars by dot-path and type, and `rest`, JSON of all else."""
+def taken_apart(value: JsonValue) -> Row:
+    """Returns a value in columns: its scalars by type and dot-path, and `value`, JSON of all else.
 
-    rest: str
-    flags: Mapping[str, Scalar]
-    integers: Mapping[str, Scalar]
-    numbers: Mapping[str, Scalar]
-    texts: Mapping[str, Scalar]
-
-
-def taken_apart(value: JsonValue) -> TypedValue:
-    """Returns a value in columns. Lists stay whole, and so does what has a dot in its name."""
-    found: Found = {name: {} for name in MAPS}
+    Lists stay whole, and so does what has a dot in its name.
+    """
+    found: Found = {name: [] for name in _KIND_OF.values()}
     rest = _without_scalars(value, "", found)
-    text = json.dumps(rest, ensure_ascii=False, separators=(",", ":"))
-    return TypedValue(text, **found)
+    return {**found, "value": json.dumps(rest, ensure_ascii=False, separators=(",", ":"))}
 
 
 def _without_scalars(value: JsonValue, path: str, found: Found) -> JsonValue:
@@ -52,7 +40,7 @@ def _without_scalars(value: JsonValue, path: str, found: Found) -> JsonValue:
     kind = _KIND_OF.get(type(value))
     if kind is None or not path or (kind == "integers" and not _fits(value)):
         return value
-    found[kind][path] = value  # type: ignore[assignment]  # `_KIND_OF` has scalars alone
+    found[kind].append((path, value))
     return None
 
 

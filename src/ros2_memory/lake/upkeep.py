@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from datetime import UTC, date, datetime
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.conditions import of_robots
+from ros2_memory.lake.partitions import Partitions
 from ros2_memory.lake.tables import TABLES, day_of
 from ros2_memory.lake.warehouse import quiet_deletes
 from ros2_memory.lake.written_files import delete_unreferenced
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+    from datetime import date
 
     from pyiceberg.table import Table as IcebergTable
 
@@ -64,35 +64,24 @@ def compact(
 
 def _to_compact(table: IcebergTable, closed: date) -> list[tuple[date, list[str]]]:
     """Returns what to put together of the days before `closed`: a day, and some of its robots."""
-    files: Counter[tuple[date, str]] = Counter()
-    size: Counter[tuple[date, str]] = Counter()
-    snapshot = table.current_snapshot()
-    # A plan of the whole table would have all its files in memory, 6 kB each.
-    for manifest in () if snapshot is None else snapshot.manifests(table.io):
-        for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=True):
-            file = entry.data_file
-            part = _day(file.partition[1]), file.partition[0]
-            files[part] += 1
-            size[part] += file.file_size_in_bytes
+    parts = {
+        (day, robot): files
+        for robot, days in Partitions().look(table).items()
+        for day, files in days.items()
+        if day < closed
+    }
     found: list[tuple[date, list[str]]] = []
     room = 0
-    for part in sorted(files):
-        day, robot = part
-        if day >= closed or files[part] <= FEW_FILES or size[part] > _MOST_BYTES:
+    for day, robot in sorted(parts):
+        size = sum(each.size for each in parts[day, robot])
+        if len(parts[day, robot]) <= FEW_FILES or size > _MOST_BYTES:
             continue
-        room -= size[part]
+        room -= size
         if not found or found[-1][0] != day or room < 0 or len(found[-1][1]) == _MOST_ROBOTS:
             found.append((day, []))
-            room = _MOST_BYTES - size[part]
+            room = _MOST_BYTES - size
         found[-1][1].append(robot)
     return found
-
-
-def _day(value: object) -> date:
-    """Returns the day of a partition, which is a date or days since the epoch."""
-    if isinstance(value, date):
-        return value
-    return datetime.fromtimestamp(int(str(value)) * 86_400, tz=UTC).date()
 
 
 def expire(location: LakeLocation, tables: Mapping[str, IcebergTable], now: Ns, grace: Ns) -> int:
@@ -113,7 +102,6 @@ def expire(location: LakeLocation, tables: Mapping[str, IcebergTable], now: Ns, 
         for table in tables.values():
             metadata = table.refresh().metadata
             kept = {each.snapshot_id for each in metadata.refs.values()}
-            kept.add(metadata.current_snapshot_id or 0)
             old = [
                 each.snapshot_id
                 for each in metadata.snapshots

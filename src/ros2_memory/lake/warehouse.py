@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -18,8 +18,8 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_MS
-from ros2_memory.lake.tables import NAMESPACE, RETIRED, open_tables
-from ros2_memory.lake.written_files import drop_with_files, file_properties
+from ros2_memory.lake.tables import NAMESPACE, open_tables
+from ros2_memory.lake.written_files import file_properties
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
@@ -56,6 +56,10 @@ class LakeLocation:
     secrets: Mapping[str, str] = field(default_factory=dict, repr=False)
     namespace: str = NAMESPACE
 
+    @property
+    def _is_file(self) -> bool:
+        return self.catalog == "sql" and self.uri is None
+
     @contextmanager
     def translated(self, what: str) -> Iterator[None]:
         """Turns the errors of catalogues and stores into `LakeError`s without secrets.
@@ -86,26 +90,21 @@ class LakeLocation:
         """
         # It logs each file that it opens, at the level of our own events.
         logging.getLogger("pyiceberg").setLevel(logging.WARNING)
-        properties = {
-            **self.properties,
-            **self.secrets,
-            **file_properties(self.state_dir),
-            "warehouse": self.warehouse,
-        }
-        if self.catalog == "rest":
-            with self.translated("opening the lake's catalogue"):
-                rest = RestCatalog("lake", **{**properties, "uri": self.uri or ""})
-            yield rest
-            return
+        kind = RestCatalog if self.catalog == "rest" else SqlCatalog
         with self.translated("opening the lake's catalogue"):
-            file = self.state_dir.absolute() / CATALOGUE_FILE
-            if self.uri is None:
+            if self._is_file:
                 self.state_dir.mkdir(parents=True, exist_ok=True)
-            catalog = SqlCatalog("lake", **{**properties, "uri": self.uri or f"sqlite:///{file}"})
-        try:
+            file = self.state_dir.absolute() / CATALOGUE_FILE
+            properties = {
+                **self.properties,
+                **self.secrets,
+                **file_properties(self.state_dir),
+                "warehouse": self.warehouse,
+                "uri": f"sqlite:///{file}" if self._is_file else self.uri or "",
+            }
+            catalog = kind("lake", **properties)
+        with closing(catalog):
             yield catalog
-        finally:
-            catalog.close()
 
     def last_commit(self) -> Ns | None:
         """Returns when a bag was last committed; None where none was. Makes nothing.
@@ -113,8 +112,7 @@ class LakeLocation:
         Raises:
             LakeError: the lake cannot be read.
         """
-        is_file = self.catalog == "sql" and self.uri is None
-        if is_file and not (self.state_dir / CATALOGUE_FILE).exists():
+        if self._is_file and not (self.state_dir / CATALOGUE_FILE).exists():
             return None
         with self.opened() as catalog, self.translated("looking into the lake"):
             name = f"{self.namespace}.bags"
@@ -124,16 +122,12 @@ class LakeLocation:
             return None if newest is None else newest.timestamp_ms * NS_PER_MS
 
     def tables(self, catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
-        """Returns tables by name, made where they are missing; drops those of earlier versions.
+        """Returns tables by name, made where they are missing.
 
         Raises:
             LakeError: they cannot be opened.
         """
         with self.translated("opening the lake's tables"):
-            for name in RETIRED:
-                identifier = f"{self.namespace}.{name}"
-                if catalog.table_exists(identifier):
-                    drop_with_files(self.state_dir, catalog, identifier)
             return open_tables(catalog, names, self.namespace)
 
 

@@ -7,27 +7,40 @@ those below the table's own location to which no version, branch or tag of the t
 
 from __future__ import annotations
 
-import json
 import os
+import sys
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 from pyiceberg.manifest import ManifestEntryStatus
 
-from ros2_memory.bag_dir.durable_write import append_durably, write_durably
-from ros2_memory.core.timebase import Ns, WallClock
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
+from ros2_memory.core.timebase import WallClock
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable
     from pathlib import Path
 
-    from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.core.timebase import Ns
 
 WRITTEN_FILE: Final = "written.jsonl"
 RECORD: Final = "ros2-memory.written"
-"""The setting of a `RecordingFileIO` that names its record."""
+"""The setting of a `RecordingFileIO` that names the folder of its record."""
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A file, and when (ns) it was about to be written."""
+
+    file: str
+    at: Int64
+
+
+WRITTEN: Final = JsonLog(WRITTEN_FILE, Written, most_bytes=sys.maxsize)
 
 
 class RecordingFileIO(PyArrowFileIO):
@@ -39,10 +52,9 @@ class RecordingFileIO(PyArrowFileIO):
 
         record = self.properties.get(RECORD)
         if record:
-            line = json.dumps({"file": location, "at": WallClock().now()})
             # With a REST catalogue nothing else is there before the first table.
-            Path(record).parent.mkdir(parents=True, exist_ok=True)
-            append_durably(Path(record), f"{line}\n")
+            Path(record).mkdir(parents=True, exist_ok=True)
+            WRITTEN.append(Path(record), [Written(location, WallClock().now())])
         return super().new_output(location)
 
 
@@ -50,28 +62,8 @@ def file_properties(state_dir: Path) -> dict[str, str]:
     """Returns the settings of a catalogue whose files are recorded."""
     return {
         "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
-        RECORD: os.fspath(state_dir.absolute() / WRITTEN_FILE),
+        RECORD: os.fspath(state_dir.absolute()),
     }
-
-
-def recorded_files(state_dir: Path) -> dict[str, Ns]:
-    """Returns the files that were written, with when; a line that a crash cut short is skipped.
-
-    Raises:
-        OSError: the record cannot be read.
-    """
-    found: dict[str, Ns] = {}
-    with suppress(FileNotFoundError), (state_dir / WRITTEN_FILE).open(encoding="utf-8") as lines:
-        for line in lines:
-            try:
-                fields: object = json.loads(line)
-            except ValueError:
-                continue
-            if isinstance(fields, dict):
-                file, at = fields.get("file"), fields.get("at")
-                if isinstance(file, str) and isinstance(at, int):
-                    found[file] = at
-    return found
 
 
 def referenced_files(table: IcebergTable) -> set[str]:
@@ -99,53 +91,23 @@ def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written
     Raises:
         OSError: a file cannot be deleted; those that were deleted before are gone.
     """
-    recorded = recorded_files(state_dir)
+    recorded = {each.file: each for each in WRITTEN.rows(state_dir)}
     gone: set[str] = set()
     try:
         for table in tables:
             below = f"{table.location().rstrip('/')}/"
             old = {
                 file
-                for file, at in recorded.items()
-                if file.startswith(below) and ".." not in file and at < written_before
+                for file, each in recorded.items()
+                if file.startswith(below) and ".." not in file and each.at < written_before
             }
             for file in sorted(old - referenced_files(table)) if old else ():
-                _delete(table, file)
+                with suppress(FileNotFoundError):  # as after a kill
+                    table.io.delete(file)
                 gone.add(file)
     finally:
         if gone:
-            _keep(state_dir, {file: at for file, at in recorded.items() if file not in gone})
+            WRITTEN.replace(
+                state_dir, [each for each in recorded.values() if each.file not in gone]
+            )
     return len(gone)
-
-
-def drop_with_files(state_dir: Path, catalog: IcebergCatalog, identifier: str) -> None:
-    """Drops a table, with the files of it that were recorded.
-
-    Killed before the drop, it is done again; right after it, one file of metadata may stay, which
-    has no rows.
-
-    Raises:
-        OSError: a file cannot be deleted.
-    """
-    table = catalog.load_table(identifier)
-    below = f"{table.location().rstrip('/')}/"
-    recorded = recorded_files(state_dir)
-    own = {file for file in recorded if file.startswith(below) and ".." not in file}
-    # Last, since the table is opened by it.
-    for file in sorted(own - {table.metadata_location}):
-        _delete(table, file)
-    _keep(state_dir, {file: at for file, at in recorded.items() if file not in own})
-    catalog.drop_table(identifier)
-    _delete(table, table.metadata_location)
-
-
-def _delete(table: IcebergTable, file: str) -> None:
-    try:
-        table.io.delete(file)
-    except FileNotFoundError:
-        return  # as after a kill
-
-
-def _keep(state_dir: Path, recorded: Mapping[str, Ns]) -> None:
-    lines = (json.dumps({"file": file, "at": at}) for file, at in recorded.items())
-    write_durably(state_dir / WRITTEN_FILE, "".join(f"{line}\n" for line in lines))

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.motion.robot_track import empty_track, place_at
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -52,18 +51,18 @@ class RobotPlaces:
         """Returns where the robot was (m) in `frame_id`; None outside the track."""
         if self.frame_id != self.map_frame:
             return None
-        return _on_track(self._track, time)
+        return place_at(self._track, time, SILENCE_NS)
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""
         places = self.view.memory.limits.places
         if not any(each.frame_id == self.map_frame for each in places):
             return ()
-        point = _on_track(self._track, time)
+        point = place_at(self._track, time, SILENCE_NS)
         return () if point is None else places_at(places, self.map_frame, *point)
 
     @cached_property
-    def _track(self) -> RobotTrack | None:
+    def _track(self) -> RobotTrack:
         try:
             joined = RobotTracks(self.view, self.map_frame).over(self.window)
         except QueryTimeoutError:
@@ -76,7 +75,7 @@ class RobotPlaces:
                 f"where the robot was in {self.map_frame} is {reach}: reading the bags that "
                 "are not stored takes too long"
             )
-        return None if joined is None else joined.track
+        return empty_track() if joined is None else joined.track
 
 
 def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) -> RobotPlaces | None:
@@ -93,19 +92,3 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
     usual = map_placement(view, own, topic).frame_id
     asked = usual if frame_id is None else map_placement(view, own, topic, frame_id).frame_id
     return RobotPlaces(view, window, asked, own, usual)
-
-
-def _on_track(track: RobotTrack | None, time: Ns) -> tuple[float, float] | None:
-    if track is None or not len(track.times):
-        return None
-    after = int(np.searchsorted(track.times, time, side="right"))
-    if not after:
-        return None
-    before = after - 1
-    if after == len(track.times) or track.begins[after]:
-        near = time - int(track.times[before]) <= SILENCE_NS
-        return (float(track.x[before]), float(track.y[before])) if near else None
-    share = (time - int(track.times[before])) / int(track.times[after] - track.times[before])
-    x = track.x[before] + (track.x[after] - track.x[before]) * share
-    y = track.y[before] + (track.y[after] - track.y[before]) * share
-    return float(x), float(y)

@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date, timedelta
 from itertools import islice
 from pathlib import Path
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import JsonValue
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables, to_arrow
-from ros2_memory.lake.typed_values import MAPS, taken_apart
+from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables
+from ros2_memory.lake.typed_values import taken_apart
 
 DAY = date(2026, 11, 20)
+ROBOTS = ("attic", "hall", "it's")
+MAPS = ("flags", "integers", "numbers", "texts")
 ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
 
 
-def seen(label: str, second: int, score: float | None = 0.5) -> Row:
-    at = second * 10**9
-    where = (1.0, 2.0, None, None, None, None)
-    return ("/seen", "seen", "T", at, at // 1000, 0, label, score, "map", *where)
+def seen(robot: str, day: int, label: str, second: int, score: float | None = 0.5) -> Row:
+    keys = {"robot": robot, "bag_id": f"{robot}{day}", "day": DAY + timedelta(days=day)}
+    at = (100 * day + second) * 10**9
+    return {**keys, "topic": "/seen", "time_ns": at, "label": label, "score": score}
 
 
 @pytest.fixture(scope="module")
@@ -35,24 +39,37 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> SqlCatalog:
     folder = tmp_path_factory.mktemp("lake")
     catalog = SqlCatalog("lake", uri=f"sqlite:///{folder}/lake.sqlite", warehouse=folder.as_uri())
     table = open_tables(catalog, ["sightings", "bags"])["sightings"]
-    for robot in ("attic", "hall", "it's"):
+    for robot in ROBOTS:
         for day in (0, 1):
-            rows = [seen(label, 100 * day + nth) for nth, label in enumerate(ODD)]
-            rows.append(seen("unscored", 100 * day, None))
-            part = to_arrow(
-                TABLES["sightings"], robot, DAY + timedelta(days=day), {f"{robot}{day}": rows}
-            )
-            table.append(part)
+            rows = [seen(robot, day, label, nth) for nth, label in enumerate(ODD)]
+            rows.append(seen(robot, day, "unscored", 0, None))
+            table.append(TABLES["sightings"].filled(rows))
     return catalog
 
 
+Select = Callable[..., pa.Table]
+
+
 @pytest.fixture
-def lake(catalog: SqlCatalog, engine: LakeEngine) -> Lake:
-    return Lake(catalog, engine)
+def select(catalog: SqlCatalog, engine: LakeEngine) -> Select:
+    """Runs a select over all files of some tables, which need not be in the catalogue."""
+
+    def run(sql: str, tables: Sequence[str], parameters: Parameters | None = None) -> pa.Table:
+        files = {}
+        for name in tables:
+            identifier = f"{NAMESPACE}.{name}"
+            found: tuple[str, ...] = ()
+            if catalog.table_exists(identifier):
+                plan = catalog.load_table(identifier).scan().plan_files()
+                found = tuple(task.file.file_path for task in plan)
+            files[name] = DataFiles(TABLES[name].arrow_schema, found, {})
+        return engine.select(sql, files, parameters or {})
+
+    return run
 
 
-def test_it_filters_groups_and_orders(lake: Lake) -> None:
-    found = lake.select(
+def test_it_filters_groups_and_orders(select: Select) -> None:
+    found = select(
         "SELECT robot, max(time_ns) AS newest, count(*) AS n, CAST(sum(time_ns) AS BIGINT) AS s"
         " FROM sightings WHERE label = $label AND (score IS NULL OR score >= $least)"
         " GROUP BY robot ORDER BY robot DESC LIMIT 2",
@@ -66,39 +83,43 @@ def test_it_filters_groups_and_orders(lake: Lake) -> None:
     ]
 
 
-def test_a_text_is_never_sql(lake: Lake) -> None:
+def test_a_text_is_never_sql(select: Select) -> None:
     sql = "SELECT label FROM sightings WHERE label IN $labels GROUP BY label ORDER BY label"
-    found = lake.select(sql, ["sightings"], {"labels": ODD})
+    found = select(sql, ["sightings"], {"labels": ODD})
     assert found["label"].to_pylist() == sorted(ODD)
     one_by_one = "SELECT count(*) AS n FROM sightings WHERE label = $label AND robot = $robot"
     for label in ODD:
-        counted = lake.select(one_by_one, ["sightings"], {"label": label, "robot": "it's"})
+        counted = select(one_by_one, ["sightings"], {"label": label, "robot": "it's"})
         assert counted["n"].to_pylist() == [2]
 
 
-def test_nothing_is_in_no_values(lake: Lake) -> None:
+def test_nothing_is_in_no_values(select: Select) -> None:
     sql = "SELECT label FROM sightings WHERE label IN $labels"
-    assert lake.select(sql, ["sightings"], {"labels": ()}).num_rows == 0
+    assert select(sql, ["sightings"], {"labels": ()}).num_rows == 0
 
 
-def test_only_files_of_these_robots_and_days_are_read(lake: Lake) -> None:
+def test_only_files_of_one_robot_and_day_are_read(catalog: SqlCatalog, engine: LakeEngine) -> None:
+    lake = Lake(catalog, engine)
     sql = "SELECT robot, day FROM sightings GROUP BY robot, day ORDER BY robot, day"
-    one = lake.select(sql, ["sightings"], robots=["hall", "it's"], days=(DAY, DAY))
-    assert one.to_pylist() == [{"robot": "hall", "day": DAY}, {"robot": "it's", "day": DAY}]
-    assert lake.select(sql, ["sightings"], robots=[]).num_rows == 0
+    for robot in ROBOTS:
+        files = lake.days("sightings", robot)[DAY]
+        one = lake.select(sql, "sightings", files)
+        assert one.to_pylist() == [{"robot": robot, "day": DAY}]
+    assert lake.select(sql, "sightings", []).num_rows == 0
 
 
-def test_two_tables_are_joined_and_one_may_be_empty(lake: Lake) -> None:
+def test_two_tables_are_joined_and_one_may_be_empty(select: Select) -> None:
     sql = "SELECT s.label FROM sightings s JOIN bags b ON s.bag_id = b.bag_id AND s.robot = b.robot"
-    assert lake.select(sql, ["sightings", "bags"]).num_rows == 0
+    assert select(sql, ["sightings", "bags"]).num_rows == 0
     inside = "SELECT label FROM sightings WHERE bag_id IN (SELECT bag_id FROM things)"
-    assert lake.select(inside, ["sightings", "things"]).num_rows == 0
+    assert select(inside, ["sightings", "things"]).num_rows == 0
 
 
 def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) -> None:
-    schema = TABLES["things"].arrow_schema()
-    rows: Row = ("/seen", "seen", "cup", 1, 0, 0, 0, "map", 1.0, 2.0, 0.0, 0.1, None)
-    old = to_arrow(TABLES["things"], "hall", DAY, {"a": [rows]}).drop_columns(["spread_m"])
+    schema = TABLES["things"].arrow_schema
+    row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
+    whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
+    old = whole.drop_columns(["spread_m"])
     pq.write_table(old, tmp_path / "old.parquet")
     files = DataFiles(schema, ((tmp_path / "old.parquet").as_uri(),), {})
     found = engine.select("SELECT label, spread_m FROM things", {"things": files}, {})
@@ -108,18 +129,18 @@ def test_a_column_that_a_file_lacks_is_null(tmp_path: Path, engine: LakeEngine) 
 def test_a_file_that_is_gone_is_reported_without_its_path(
     tmp_path: Path, engine: LakeEngine
 ) -> None:
-    schema = TABLES["things"].arrow_schema()
+    schema = TABLES["things"].arrow_schema
     files = DataFiles(schema, ((tmp_path / "gone.parquet").as_uri(),), {})
     with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
         engine.select("SELECT label FROM things", {"things": files}, {})
     assert str(tmp_path) not in str(raised.value)
 
 
-def test_threads_ask_at_once(lake: Lake) -> None:
+def test_threads_ask_at_once(select: Select) -> None:
     sql = "SELECT count(*) AS n FROM sightings WHERE label = $label"
 
     def count(label: str) -> object:
-        return lake.select(sql, ["sightings"], {"label": label})["n"].to_pylist()
+        return select(sql, ["sightings"], {"label": label})["n"].to_pylist()
 
     with ThreadPoolExecutor(4) as pool:
         assert [*pool.map(count, ODD * 2)] == [[6]] * len(ODD) * 2
@@ -136,17 +157,17 @@ def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
     table = catalog.create_table(
         f"{NAMESPACE}.messages", before.schema(), partition_spec=before.partition()
     )
-    old: Row = ("/a", "a", "T", 1, 0, 1, 0, '{"x":1,"on":null}', None)
-    table.append(to_arrow(before, "hall", DAY, {"one": [old]}))
+    old = {"robot": "hall", "bag_id": "one", "day": DAY, "topic": "/a", "time_ns": 1}
+    table.append(before.filled([{**old, "value": '{"x":1,"on":null}'}]))
     value: JsonValue = {"x": 2, "on": True, "y": 0.5, "name": "ß", "list": [1]}
     apart = taken_apart(value)
-    new: Row = (*old[:7], apart.rest, None, *([*each.items()] for each in apart[1:]))
-    open_tables(catalog, ["messages"])["messages"].append(
-        to_arrow(now, "hall", DAY, {"two": [new]})
-    )
+    new = {**old, "bag_id": "two", **apart}
+    open_tables(catalog, ["messages"])["messages"].append(now.filled([new]))
     columns = ", ".join(("type", "time_ns", "publish_ns", "value", *MAPS))
     sql = f"SELECT {columns} FROM messages ORDER BY bag_id"  # noqa: S608 - of constants
-    rows = Lake(catalog, engine).select(sql, ["messages"]).to_pylist()
-    assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart.rest]
-    for name, scalars in zip(MAPS, apart[1:], strict=True):
-        assert [row[name] and dict(row[name]) for row in rows] == [None, scalars]
+    lake = Lake(catalog, engine)
+    files = lake.days("messages", "hall")[DAY]
+    rows = lake.select(sql, "messages", files).to_pylist()
+    assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart["value"]]
+    for name in MAPS:
+        assert [row[name] for row in rows] == [None, apart[name]]

@@ -28,7 +28,7 @@ from ros2_memory.lake.tombstones import (
     read_tombstones,
 )
 from ros2_memory.lake.upkeep import compact, expire
-from ros2_memory.lake.written_files import recorded_files
+from ros2_memory.lake.written_files import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
@@ -295,7 +295,7 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     ship(lake, [robot_bags("hall", bag_dir)])
     where = location(lake)
     files = {path for path in lake.rglob("*") if path.is_file()}
-    now = max(recorded_files(where.state_dir).values()) + NS_PER_S
+    now = max(each.at for each in WRITTEN.rows(where.state_dir)) + NS_PER_S
     with where.opened() as catalog:
         tables = where.tables(catalog, TABLES)
         assert expire(where, tables, now, DAY_NS) == 0

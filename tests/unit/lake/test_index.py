@@ -10,18 +10,15 @@ import pyarrow as pa
 import pytest
 
 from ros2_memory.core.bag_summary import BagSummary
-from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
-from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory.index import MOST_BAGS
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.tables import day_of
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import detections, text, write_mcap
-from tests.support.clocks import FixedClock
-from tests.support.fleets import NOW, SEEN, START_S
+from tests.support.fleets import SEEN, START_S
 from tests.support.lake_rows import fill, lake_in, lake_robots
 from tests.support.memories import memory_of, with_store
 
@@ -67,8 +64,9 @@ class Shipping:
             write_mcap(bags / "rec" / f"{name or f'rec_{start_s}'}.mcap", messages)
         fill(self._catalog, {"hall": with_store(memory_of(bags), bags)}, ["/chatter"])
 
-    def robot(self) -> LakeRobot:
-        return lake_robots(self._catalog, self.engine, ["hall"])["hall"]
+    def robot(self, days: int = 31, most_bags: int = MOST_BAGS) -> LakeRobot:
+        robots = lake_robots(self._catalog, self.engine, ["hall"], days=days, most_bags=most_bags)
+        return robots["hall"]
 
 
 @pytest.fixture
@@ -129,23 +127,8 @@ def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shippin
     assert b"cup" in record.payload
 
 
-def test_the_newest_days_move_on_and_older_ones_are_still_found(
-    tmp_path: Path, shipping: Shipping
-) -> None:
-    lake = Lake(lake_in(tmp_path), shipping.engine)
-    first = shipping.robot().memory
-    robot = LakeRobot(
-        lake,
-        "hall",
-        FixedClock(NOW),
-        first.limits,
-        extractor=first.extractor,
-        decoder=McapReader(),
-        refresh_s=0,
-        days=1,
-        most_bags=1,
-        large=LargeReads(),
-    )
+def test_the_newest_days_move_on_and_older_ones_are_still_found(shipping: Shipping) -> None:
+    robot = shipping.robot(days=1, most_bags=1)
     shipping.ship([START_S - DAY_S])
     assert starts(robot) == [START_S - DAY_S]
     shipping.ship([START_S])
@@ -155,24 +138,11 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(
 
 
 def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
-    tmp_path: Path, shipping: Shipping, monkeypatch: pytest.MonkeyPatch
+    shipping: Shipping, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     older = START_S - DAY_S
     shipping.ship([older, START_S])
-    first = shipping.robot().memory
-    lake = Lake(lake_in(tmp_path), shipping.engine)
-    robot = LakeRobot(
-        lake,
-        "hall",
-        FixedClock(NOW),
-        first.limits,
-        extractor=first.extractor,
-        decoder=McapReader(),
-        refresh_s=0,
-        days=1,
-        most_bags=1,
-        large=LargeReads(),
-    )
+    robot = shipping.robot(days=1, most_bags=1)
     index = robot.memory.index
     assert starts(robot) == [START_S]
     bag, *_ = index.snapshot(older * NS_PER_S).bags
@@ -202,23 +172,11 @@ def test_bags_that_are_shipped_late_show_nothing_about_the_robots_clock(shipping
 
 
 def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
-    tmp_path: Path, shipping: Shipping
+    shipping: Shipping,
 ) -> None:
     before, last = START_S - 2 * DAY_S, START_S - DAY_S + 60
     shipping.ship([before, last, START_S])
-    first = shipping.robot().memory
-    robot = LakeRobot(
-        Lake(lake_in(tmp_path), shipping.engine),
-        "hall",
-        FixedClock(NOW),
-        first.limits,
-        extractor=first.extractor,
-        decoder=McapReader(),
-        refresh_s=0,
-        days=2,
-        most_bags=1,
-        large=LargeReads(),
-    )
+    robot = shipping.robot(days=2, most_bags=1)
     assert starts(robot) == [last, START_S]
     older = robot.memory.index.snapshot(before * NS_PER_S)
     assert [bag.start // NS_PER_S for bag in older.bags] == [before, last]

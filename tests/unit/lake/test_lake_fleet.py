@@ -243,7 +243,7 @@ def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:
     engine = engine_of(node)
     [row] = engine.select(
         "SELECT current_setting('memory_limit') AS memory, current_setting('threads') AS threads",
-        {"bags": DataFiles(TABLES["bags"].arrow_schema(), (), {})},
+        {"bags": DataFiles(TABLES["bags"].arrow_schema, (), {})},
         {},
     ).to_pylist()
     engine.close()

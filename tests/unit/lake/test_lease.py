@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from pathlib import Path
 
 import pytest
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.lease import TERM_NS, WarehouseLease, leased
+from ros2_memory.lake.lease import TERM_NS, WarehouseLease
 from ros2_memory.lake.warehouse import LakeLocation
 from tests.support.clocks import SettableClock
 
@@ -28,7 +29,7 @@ def test_another_hub_is_refused_until_the_first_has_ended(tmp_path: Path) -> Non
     one.renew()
     with pytest.raises(LakeError, match=r"another lake\.state_dir.*one writer"):
         other.renew()
-    one.release()
+    one.close()
     other.renew()
     with pytest.raises(LakeError, match="one writer"):
         one.confirm()
@@ -53,7 +54,7 @@ def test_a_hub_that_was_killed_goes_on_at_once_and_another_after_the_term(tmp_pa
 def test_one_that_ships_on_keeps_its_lease(tmp_path: Path) -> None:
     clock = SettableClock(NOW)
     other = WarehouseLease(location(tmp_path, "other"), clock)
-    with leased(location(tmp_path, "one"), clock) as lease:
+    with closing(WarehouseLease(location(tmp_path, "one"), clock)) as lease:
         for quarter in range(12):
             clock.at = NOW + quarter * TERM_NS // 4
             lease.renew()

@@ -10,21 +10,18 @@ from typing import Any
 import pytest
 
 from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.queries import find_last_match, value_when
 from ros2_memory.results import Match
-from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S
-from tests.support.lake_rows import fill, lake_in
-from tests.support.memories import extractor, memory_of, with_store
+from tests.support.lake_rows import fill, lake_in, lake_robots
+from tests.support.memories import memory_of, with_store
 from tests.unit.lake.test_questions import reply
 
 DAY_S = 86_400
@@ -48,18 +45,7 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> L
     memory = with_store(memory_of(folder / "bags"), folder / "bags")
     catalog = lake_in(folder)
     fill(catalog, {"hall": memory}, topics)
-    return LakeRobot(
-        Lake(catalog, engine),
-        "hall",
-        FixedClock(NOW),
-        QuerySettings(),
-        extractor=extractor(),
-        decoder=McapReader(),
-        refresh_s=0,
-        days=1,
-        most_bags=1,
-        large=LargeReads(),
-    )
+    return lake_robots(catalog, engine, ["hall"], days=1, most_bags=1)["hall"]
 
 
 def asked(robot: LakeRobot, label: str, topic: str = SEEN, **more: object) -> dict[str, Any]:

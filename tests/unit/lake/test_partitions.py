@@ -8,7 +8,7 @@ from datetime import date, timedelta
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.lake.partitions import NO_DAYS, Days, LakeFile
+from ros2_memory.lake.partitions import Days, LakeFile, newest
 
 FIRST = date(2024, 2, 27)
 SIZES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 50)), min_size=1, max_size=12)
@@ -20,11 +20,11 @@ def days_of(sizes: Sequence[tuple[int, int]]) -> Days:
     for gap, size in sizes:
         day += timedelta(days=gap + 1)
         found[day] = (LakeFile(f"file:///{day}", size),)
-    return Days(found)
+    return found
 
 
 def rows(days: Days, first: date, last: date) -> int:
-    return sum(each.rows for each in days.files(first, last))
+    return sum(each.rows for day, files in days.items() if first <= day <= last for each in files)
 
 
 @given(SIZES, st.integers(1, 60), st.integers(1, 40), st.integers(0, 500))
@@ -32,19 +32,19 @@ def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
     sizes: list[tuple[int, int]], most: int, fewest: int, after: int
 ) -> None:
     days, until = days_of(sizes), FIRST + timedelta(days=after)
-    known = [each for each in days.known if each <= until]
-    found = days.newest(until, most, fewest)
-    if found is None:
+    known = [each for each in days if each <= until]
+    found, before = newest(days, until, most, fewest)
+    assert [*found] == [each for each in known if before is None or each > before]
+    if not found:
         assert not known
         return
-    first, last = found
+    first, last = min(found), max(found)
     assert last == known[-1]
     assert rows(days, first, last) <= most or first > last - timedelta(days=fewest)
-    if older := [each for each in known if each < first]:
-        assert rows(days, older[-1], last) > most
-        assert older[-1] <= last - timedelta(days=fewest)
+    if before is not None:
+        assert rows(days, before, last) > most
+        assert before <= last - timedelta(days=fewest)
 
 
 def test_a_robot_without_rows_has_no_days() -> None:
-    assert NO_DAYS.newest(date.max, 1, 1) is None
-    assert NO_DAYS.files(date.min, date.max) == []
+    assert newest({}, date.max, 1, 1) == ({}, None)

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from random import Random
 
-import pyarrow as pa
 import pytest
-from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import BagVanishedError, NotInLakeError
 from ros2_memory.core.model import TimeWindow
@@ -23,7 +21,6 @@ from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots, store_columns
-from tests.support.lakes import location
 from tests.support.memories import memory_of, with_store
 from tests.unit.lake.test_questions import reply
 
@@ -115,24 +112,6 @@ def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
     assert filling.store.paths() == ["r1/one_0.mcap"]
 
 
-def test_bags_of_before_messages_were_shipped_are_named(
-    bags: Memory, engine: LakeEngine, tmp_path: Path
-) -> None:
-    catalog = lake_in(tmp_path)
-    fill(catalog, {"hall": bags})
-    rows = catalog.load_table("ros2_memory.bags")
-    old = rows.scan().to_arrow()
-    summaries = [None, old["summary"][1].as_py()]
-    nth = old.schema.get_field_index("summary")
-    rows.overwrite(
-        old.set_column(nth, old.schema.field(nth), pa.array(summaries, pa.large_string()))
-    )
-    robot = lake_robots(catalog, engine, ["hall"])["hall"]
-    assert len(robot.memory.index.snapshot().bags) == 1
-    [note] = robot.notes()
-    assert note.startswith("not in the answer: 1 bag ")
-
-
 def test_damaged_and_later_bytes_are_refused() -> None:
     data = packed_messages([1, 2], [1, 2], [b"ab", b"cd"])
     batch = unpacked_messages(data, CHANNEL)
@@ -141,16 +120,3 @@ def test_damaged_and_later_bytes_are_refused() -> None:
     for other in (data[:-3], b"", data[::-1]):
         with pytest.raises(ValueError, match="packed"):
             unpacked_messages(other, CHANNEL)
-
-
-def test_a_table_of_an_earlier_version_goes_with_its_files(tmp_path: Path) -> None:
-    where = location(tmp_path / "lake")
-    with where.opened() as catalog:
-        assert isinstance(catalog, SqlCatalog)
-        catalog.create_namespace("ros2_memory")
-        old = catalog.create_table("ros2_memory.digests", TABLES["things"].schema())
-        old.append(TABLES["things"].arrow_schema().empty_table())
-        assert [*(tmp_path / "lake").rglob("digests/**/*.avro")]
-        where.tables(catalog, TABLES)
-        assert not catalog.table_exists("ros2_memory.digests")
-    assert not [each for each in (tmp_path / "lake").rglob("digests/**/*") if each.is_file()]

@@ -16,11 +16,12 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.lake.packed_messages import unpacked_messages
-from ros2_memory.lake.rows import BagContent, bag_id_of, made_of, rows_of
-from ros2_memory.lake.tables import TABLES, Row, to_arrow, topic_key
+from ros2_memory.lake.rows import bag_id_of, made_of, rows_of
+from ros2_memory.lake.tables import TABLES, Row, day_of, topic_key
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import LENGTH_S, NOW, SEEN, SeededRobot, seeded, write_robot
+from tests.support.lake_rows import shipped
 from tests.support.memories import memory_of, with_store
 
 Table = list[dict[str, object]]
@@ -28,10 +29,9 @@ Table = list[dict[str, object]]
 
 def lake_rows(memory: Memory, bag: BagFile, messages: tuple[str, ...] = ()) -> dict[str, Table]:
     """The rows of a bag with names."""
-    content = BagContent(bag, "id", "0" * 64, "made")
-    found = rows_of(memory, content, messages)
+    found = rows_of(memory, bag, shipped("kitchen", bag), messages)
     return {
-        name: [dict(zip(TABLES[name].columns, row, strict=True)) for row in rows]
+        name: [{column: row.get(column) for column in TABLES[name].columns} for row in rows]
         for name, rows in found.items()
     }
 
@@ -182,20 +182,31 @@ def test_what_rows_are_made_of_changes_with_what_counts(memory: Memory) -> None:
 
 
 def test_arrow_tables_are_sorted_and_carry_the_keys(memory: Memory) -> None:
-    content = BagContent(memory.index.snapshot().bags[0], "id", "", "")
-    rows = rows_of(memory, content)["channels"]
-    table = to_arrow(TABLES["channels"], "kitchen", date(2026, 11, 20), {"a": rows, "b": rows[:1]})
+    bag = memory.index.snapshot().bags[0]
+    rows = rows_of(memory, bag, shipped("kitchen", bag))["channels"]
+    table = TABLES["channels"].filled([{**rows[0], "bag_id": "b"}, *rows])
     assert table.num_rows == len(rows) + 1
-    assert Counter(table["bag_id"].to_pylist()) == {"a": len(rows), "b": 1}
+    assert Counter(table["bag_id"].to_pylist()) == {rows[0]["bag_id"]: len(rows), "b": 1}
+    assert {*table["robot"].to_pylist()} == {"kitchen"}
+    assert {*table["day"].to_pylist()} == {day_of(bag.start)}
     keys = list(zip(*(table[name].to_pylist() for name in TABLES["channels"].order), strict=True))
     assert keys == sorted(keys)
-    assert to_arrow(TABLES["poses"], "kitchen", date(2026, 11, 20), {}).num_rows == 0
+    assert TABLES["poses"].filled([]).num_rows == 0
 
 
 def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:
-    row: Row = ("/a", "a", "t", 1, 0, 0, 0, "bad \udc80", None, [], [], [], [("\udc80", "\udc81")])
-    table = to_arrow(TABLES["messages"], "kitchen", date(2026, 11, 20), {"a": [row]})
+    row: Row = {
+        "robot": "kitchen",
+        "bag_id": "a",
+        "day": date(2026, 11, 20),
+        "topic": "/\udc80",
+        "time_ns": 1,
+        "value": "bad \udc80",
+        "texts": [("\udc80", "\udc81")],
+    }
+    table = TABLES["messages"].filled([row])
     assert table["value"].to_pylist() == ["bad \\udc80"]
+    assert table["topic_key"].to_pylist() == ["\\udc80"]
     assert table["texts"].to_pylist() == [[("\\udc80", "\\udc81")]]
 
 

@@ -10,7 +10,7 @@ from pyiceberg.partitioning import PartitionSpec
 from pyiceberg.schema import Schema
 from pyiceberg.types import DateType, NestedField, StringType
 
-from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables, to_arrow
+from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 DAY = date(2026, 11, 20)
 
@@ -23,18 +23,20 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> SqlCatalog:
 
 def test_a_row_comes_back_as_it_was(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["events"])["events"]
-    row = ("/odom", "odom", "stop", 5_000_000_123, None, 5_000_000, "stood", None, 2, 1.5, -0.5)
-    table.append(to_arrow(TABLES["events"], "kitchen", DAY, {"a": [row]}))
+    keys = {"robot": "kitchen", "bag_id": "a", "day": DAY}
+    row = {"topic": "/odom", "kind": "stop", "first_ns": 5_000_000_123, "x": 1.5}
+    table.append(TABLES["events"].filled([{**keys, **row}]))
     [found] = open_tables(catalog, ["events"])["events"].scan().to_arrow().to_pylist()
     assert (found["robot"], found["bag_id"], found["day"]) == ("kitchen", "a", DAY)
     assert (found["first_ns"], found["last_ns"], found["x"]) == (5_000_000_123, None, 1.5)
     assert found["time"].timestamp() == 5.0
+    assert found["topic_key"] == "odom"
 
 
 def test_files_lie_by_robot_and_day_and_are_zstd(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["poses"])["poses"]
-    row = ("/odom", "odom", "map", 1, 0, 1.0, 2.0, None, True, 0.05)
-    table.append(to_arrow(TABLES["poses"], "hall", DAY, {"a": [row]}))
+    row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/odom", "time_ns": 1}
+    table.append(TABLES["poses"].filled([row]))
     [task] = table.scan().plan_files()
     assert "/robot=hall/day=2026-11-20/" in task.file.file_path
     written = pa.parquet.read_metadata(Path(task.file.file_path.removeprefix("file://")))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -214,6 +214,24 @@ def jumps(track: RobotTrack) -> Mask:
     far = np.hypot(np.diff(track.x), np.diff(track.y)) * 1e9 > track.fastest_mps * lasted
     jumped = far & (lasted > 0) & (lasted <= _JUMP_NS) & ~track.begins[1:]
     return np.append(jumped, [False])[: len(track.times)]
+
+
+def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, float] | None:
+    """Returns where the robot was (m); None before the track.
+
+    Behind the end of a piece it is still there, for `silence` and until the next one begins.
+    """
+    after = int(np.searchsorted(track.times, time, side="right"))
+    if not after:
+        return None
+    before = after - 1
+    since = time - int(track.times[before])
+    if after == len(track.times) or track.begins[after]:
+        return (float(track.x[before]), float(track.y[before])) if since <= silence else None
+    share = since / int(track.times[after] - track.times[before])
+    x = track.x[before] + (track.x[after] - track.x[before]) * share
+    y = track.y[before] + (track.y[after] - track.y[before]) * share
+    return float(x), float(y)
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:

@@ -4,7 +4,7 @@ import json
 import math
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
@@ -75,12 +75,13 @@ def ship(
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
-    from ros2_memory.lake.lease import leased, writing_alone  # noqa: PLC0415
+    from ros2_memory.lake.lease import WarehouseLease, writing_alone  # noqa: PLC0415
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
     pace = _Pace(settings.lake.commit_interval_s)
-    with writing_alone(location.state_dir), leased(location, WallClock()) as lease:
+    alone = writing_alone(location.state_dir)
+    with alone, closing(WarehouseLease(location, WallClock())) as lease:
         if forget is None and not once:
             new = partial(_new_robots, partial(load_for, None, overrides), shared)
             _ship_on(settings, location, robots, pace, lease, new_robots=new)
@@ -153,7 +154,7 @@ def _forget(
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.opened() as catalog:
         tables = location.tables(catalog, TABLES)
-        known = {*Partitions("bags").look(tables["bags"]), *(each.name for each in robots)}
+        known = {*Partitions().look(tables["bags"]), *(each.name for each in robots)}
         if robot not in known:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "

@@ -16,7 +16,7 @@ from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     import pyarrow as pa
 
@@ -66,23 +66,26 @@ class LakeEngine(ABC):
         """Releases what the engine holds."""
 
 
-def expanded(sql: str, parameters: Parameters, shown: Callable[[str, Value], str]) -> str:
-    """Returns SQL in which each parameter is as `shown` has it, and each list in parentheses.
+def expanded(sql: str, parameters: Parameters) -> tuple[str, dict[str, Value]]:
+    """Returns SQL with each list in parentheses, and the values of all parameters by their names.
 
-    `shown` gets a name of its own for each value of a list.
+    Each value of a list has a name of its own.
     """
+    bound: dict[str, Value] = {}
 
     def parameter(found: re.Match[str]) -> str:
         name = found[1]
         value = parameters[name]
         if isinstance(value, str | int | float):
-            return shown(name, value)
-        each: Sequence[Value] = value
+            bound[name] = value
+            return found[0]
+        several: Sequence[Value] = value
+        each = {f"{name}_{nth}": one for nth, one in enumerate(several)}
+        bound.update(each)
         # IN () is no SQL; nothing is equal to NULL.
-        texts = [shown(f"{name}_{nth}", one) for nth, one in enumerate(each)] or ["NULL"]
-        return f"({', '.join(texts)})"
+        return f"({', '.join(f'${one}' for one in each) or 'NULL'})"
 
-    return _PARAMETER.sub(parameter, sql)
+    return _PARAMETER.sub(parameter, sql), bound
 
 
 def text_literal(text: str) -> str:

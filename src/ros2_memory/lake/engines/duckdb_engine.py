@@ -16,7 +16,7 @@ from ros2_memory.lake.engines.base import LakeEngine, expanded, failed, text_lit
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ros2_memory.lake.engines.base import DataFiles, Parameters, Value
+    from ros2_memory.lake.engines.base import DataFiles, Parameters
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
@@ -44,13 +44,7 @@ class DuckdbEngine(LakeEngine):
 
     def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
         """Runs the select in a cursor of its own."""
-        bound: dict[str, Value] = {}
-
-        def shown(name: str, value: Value) -> str:
-            bound[name] = value
-            return f"${name}"
-
-        text = expanded(sql, parameters, shown)
+        text, bound = expanded(sql, parameters)
         try:
             with self._connection.cursor() as cursor:
                 sources = [

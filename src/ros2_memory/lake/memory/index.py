@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import threading
-from bisect import bisect_left, bisect_right
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
-from itertools import groupby
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
@@ -18,7 +16,7 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.partitions import locations
+from ros2_memory.lake.partitions import newest
 from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
@@ -27,13 +25,9 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.partitions import Days
+    from ros2_memory.lake.partitions import Days, LakeFile
     from ros2_memory.retention.foreign import Foreign
 
-_BAGS: Final = (
-    "SELECT bag_id, day, file, size, sha256, made_of, mtime_ns, start_ns, end_ns, summary, counts"
-    " FROM bags ORDER BY start_ns, end_ns, bag_id"
-)
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""
 _FEWEST_DAYS: Final = 2
@@ -44,6 +38,30 @@ _TOGETHER: Final = 64
 """Bags of a day whose messages are read together."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
+
+
+class _Row(NamedTuple):
+    """A row of `bags`, as far as it is read; the fields are its columns."""
+
+    bag_id: str
+    day: date
+    file: str
+    size: int
+    sha256: str
+    made_of: str
+    mtime_ns: Ns
+    start_ns: Ns
+    end_ns: Ns
+    summary: str
+    counts: bytes
+
+    @property
+    def state(self) -> int:
+        """Tells states of a bag apart: one as large and as old may have other messages."""
+        return crc32(f"{self.bag_id} {self.sha256} {self.made_of}".encode())
+
+
+_BAGS: Final = f"SELECT {', '.join(_Row._fields)} FROM bags ORDER BY start_ns, end_ns, bag_id"  # noqa: S608 - constants
 
 
 class LakeBag(NamedTuple):
@@ -72,12 +90,10 @@ class _Day(NamedTuple):
     Attributes:
         made_of: the files of its rows.
         bags: its bags, as what they are there, and as files.
-        unread: how many others were shipped by a version that shipped no messages.
     """
 
-    made_of: tuple[str, ...]
+    made_of: Sequence[LakeFile]
     bags: Sequence[tuple[LakeBag, BagFile]]
-    unread: int
 
 
 @dataclass(frozen=True)
@@ -90,7 +106,6 @@ class _Window:
         days: what is known of each.
         timeline: the bags of all.
         files: these by their paths, and what they are in the lake.
-        unread: how many bags of them are no files; see `_Day`.
     """
 
     since: date | None = None
@@ -98,7 +113,6 @@ class _Window:
     days: Mapping[date, _Day] = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     files: Mapping[str, tuple[LakeBag, BagFile]] = field(default_factory=dict)
-    unread: int = 0
 
 
 class LakeIndex:
@@ -171,8 +185,8 @@ class LakeIndex:
         with self._lock:
             self._lake.refresh(self._refresh_s / _LOOKS)
             days = self._lake.days("bags", self._robot)
-            span = days.newest(date.max, self._most_bags, self._fewest_days)
-            self._newest = self._window(days, span, self._newest)
+            own, before = newest(days, date.max, self._most_bags, self._fewest_days)
+            self._newest = self._window(own, before, self._newest)
             timeline = self._newest.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
@@ -191,12 +205,6 @@ class LakeIndex:
         found: date = getattr(self._asked, "since", date.min)
         self._asked.since = date.max
         return found if date.min < found < date.max else None
-
-    def take_unread(self) -> int:
-        """Returns how many bags without messages this thread was shown since it asked."""
-        found: int = getattr(self._asked, "unread", 0)
-        self._asked.unread = 0
-        return found
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -222,30 +230,30 @@ class LakeIndex:
     def _note(self, window: _Window) -> None:
         known: date = getattr(self._asked, "since", date.max)
         self._asked.since = min(known, window.since or date.min)
-        self._asked.unread = max(getattr(self._asked, "unread", 0), window.unread)
 
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
         with self._lock:
             days = self._lake.days("bags", self._robot)
-            span = days.newest(day + timedelta(days=1), self._most_bags, _FEWEST_DAYS)
-            last = day if span is None else span[1]
-            window = self._window(days, span, self._older.get(last, _Window()))
+            after = day + timedelta(days=1)
+            own, before = newest(days, after, self._most_bags, _FEWEST_DAYS)
+            last = max(own, default=day)
+            window = self._window(own, before, self._older.get(last, _Window()))
             # A new dict: other threads look for the bags of their answers in the old one.
             others = [each for each in self._older.items() if each[0] != last]
             self._older = dict([*others[1 - _MOST_WINDOWS :], (last, window)])
             return window
 
-    def _window(self, known_days: Days, span: tuple[date, date] | None, known: _Window) -> _Window:
-        """Returns what the lake has of some days; only those are read of which a file is new."""
-        if span is None:
+    def _window(self, made_of: Days, older_day: date | None, known: _Window) -> _Window:
+        """Returns what the lake has of some days; only those are read of which a file is new.
+
+        `older_day` is the newest one before them.
+        """
+        if not made_of:
             return _Window()
-        begin, end = bisect_left(known_days.known, span[0]), bisect_right(known_days.known, span[1])
-        older = end_of(known_days.known[begin - 1]) if begin else None
-        bounds = replace(known, since=span[0] if begin else None, older=older)
-        made_of = {
-            day: locations(known_days.files(day, day)) for day in known_days.known[begin:end]
-        }
+        bounds = replace(known, since=None, older=None)
+        if older_day is not None:
+            bounds = replace(known, since=min(made_of), older=end_of(older_day))
         days = {
             day: known.days[day]
             for day, files in made_of.items()
@@ -254,9 +262,7 @@ class LakeIndex:
         if days.keys() == made_of.keys() == known.days.keys():
             return bounds
         paths = _Paths(known.files)
-        for is_known, run in groupby(made_of, key=days.keys().__contains__):
-            if not is_known:
-                days |= self._read({day: made_of[day] for day in run}, paths)
+        days |= self._read({day: each for day, each in made_of.items() if day not in days}, paths)
         files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
         before = {file: bag for file, (_, bag) in known.files.items()}
         now = {file: bag for file, (_, bag) in files.items()}
@@ -268,34 +274,27 @@ class LakeIndex:
                 [bag for file, bag in now.items() if before.get(file) is not bag],
             ),
             files=files,
-            unread=sum(each.unread for each in days.values()),
         )
 
-    def _read(self, made_of: Mapping[date, tuple[str, ...]], paths: _Paths) -> dict[date, _Day]:
-        """Returns what the lake has of days between which there is no other; known bags stay."""
-        span = min(made_of), max(made_of)
-        found = self._lake.select(_BAGS, ["bags"], robots=[self._robot], days=span)
-        rows: dict[date, list[Mapping[str, object]]] = {day: [] for day in made_of}
-        unread = Counter[date]()
-        for row in found.to_pylist():
-            if row["summary"] is None:
-                unread[row["day"]] += 1
-            else:
-                rows[row["day"]].append(row)
+    def _read(self, made_of: Days, paths: _Paths) -> dict[date, _Day]:
+        """Returns what the lake has of some days; known bags stay."""
+        found = self._lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
+        rows: dict[date, list[_Row]] = {day: [] for day in made_of}
+        for row in (_Row(**each) for each in found.to_pylist()):
+            rows[row.day].append(row)
         schemas: dict[str, SummarySchema] = {}
         days: dict[date, _Day] = {}
         for day, of_day in rows.items():
             bags: list[tuple[LakeBag, BagFile]] = []
             for begin in range(0, len(of_day), _TOGETHER):
                 some = of_day[begin : begin + _TOGETHER]
-                states = {str(row["bag_id"]): _state(row) for row in some}
+                states = {row.bag_id: row.state for row in some}
                 for row in some:
-                    bag_id = str(row["bag_id"])
-                    name = str(row["file"]).removesuffix(COMPRESSED)
-                    path = paths.of(f"{self.bag_dir}/{name}", bag_id)
+                    name = row.file.removesuffix(COMPRESSED)
+                    path = paths.of(f"{self.bag_dir}/{name}", row.bag_id)
                     bag = paths.known(_file(path, row, schemas))
-                    bags.append((LakeBag(bag_id, day, states), bag))
-            days[day] = _Day(made_of[day], bags, unread[day])
+                    bags.append((LakeBag(row.bag_id, day, states), bag))
+            days[day] = _Day(made_of[day], bags)
         return days
 
 
@@ -322,26 +321,16 @@ class _Paths:
         return known[1] if known is not None and known[1] == bag else bag
 
 
-def _file(path: str, row: Mapping[str, object], schemas: dict[str, SummarySchema]) -> BagFile:
-    text, counts = str(row["summary"]), row["counts"]
-    if text not in schemas:
-        schemas[text] = SummarySchema.from_json(text)
+def _file(path: str, row: _Row, schemas: dict[str, SummarySchema]) -> BagFile:
+    if row.summary not in schemas:
+        schemas[row.summary] = SummarySchema.from_json(row.summary)
     return BagFile(
         path,
-        _whole(row["size"]),
-        _whole(row["mtime_ns"]),
+        row.size,
+        row.mtime_ns,
         BagState.CLOSED,
-        BagSummary.decoded(schemas[text], counts if isinstance(counts, bytes) else b""),
-        _whole(row["start_ns"]),
-        _whole(row["end_ns"]),
-        _state(row),
+        BagSummary.decoded(schemas[row.summary], row.counts),
+        row.start_ns,
+        row.end_ns,
+        row.state,
     )
-
-
-def _state(row: Mapping[str, object]) -> int:
-    """Returns what tells states of a bag apart: one as large and as old may have other messages."""
-    return crc32(f"{row['bag_id']} {row['sha256']} {row['made_of']}".encode())
-
-
-def _whole(value: object) -> int:
-    return value if isinstance(value, int) else 0

@@ -112,7 +112,7 @@ class LakeReader(BagReader):
             NotInLakeError: the lake has the times of a topic alone.
         """
         step = -1 if newest_first else 1
-        batches = [*self._batches(path, topics, window)][::step]
+        batches = [*self.batches(path, topics, window)][::step]
         found = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
         yield from heapq.merge(*found, key=attrgetter("log_time"), reverse=newest_first)
 
@@ -129,11 +129,33 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        return self._batches(path, topics, window, bare)
+        here, _ = self._index.bag(path)
+        wanted = [each for each in self._heads_of(here) if each.channel.topic in topics]
+        names = sorted({each.channel.topic for each in wanted})
+        for head in wanted:
+            topic = head.channel.topic
+            if not head.has_payloads and topic not in bare:
+                raise NotInLakeError(
+                    f"the lake has only the times of {topic}, whose messages are large: name it in "
+                    "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's "
+                    "own memory"
+                )
+            data = self._packed_of(here, head, names)
+            if data is None:
+                raise BagError(str(path), f"the lake has no messages of {topic} any more")
+            if is_large(data):
+                self._large.acquire()
+            try:
+                batch = unpacked_messages(data, head.channel)
+            except ValueError as error:
+                raise BagError(str(path), f"{topic} in the lake: {error}") from error
+            inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
+            if inside.any():
+                yield batch if inside.all() else batch.taken(inside)
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """Returns the log times of the messages."""
-        found = [each.log_times for each in self._batches(path, [topic], window, [topic])]
+        found = [each.log_times for each in self.batches(path, [topic], window, bare=[topic])]
         times: Sequence[Ns] = np.sort(np.concatenate(found)).tolist() if found else ()
         return times
 
@@ -152,29 +174,6 @@ class LakeReader(BagReader):
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages, as of that of a file."""
         return self._decoder.definition(channel)
-
-    def _batches(
-        self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str] = ()
-    ) -> Iterator[Batch]:
-        here, _ = self._index.bag(path)
-        wanted = [each for each in self._heads_of(here) if each.channel.topic in topics]
-        names = sorted({each.channel.topic for each in wanted})
-        for head in wanted:
-            topic = head.channel.topic
-            if not head.has_payloads and topic not in bare:
-                raise _has_times_alone(topic)
-            data = self._packed_of(here, head, names)
-            if data is None:
-                raise BagError(str(path), f"the lake has no messages of {topic} any more")
-            if is_large(data):
-                self._large.acquire()
-            try:
-                batch = unpacked_messages(data, head.channel)
-            except ValueError as error:
-                raise BagError(str(path), f"{topic} in the lake: {error}") from error
-            inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
-            if inside.any():
-                yield batch if inside.all() else batch.taken(inside)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
         known = self._heads.get((bag.bag_id, bag.state))
@@ -222,27 +221,15 @@ class LakeReader(BagReader):
     def _select(
         self, sql: str, bag: LakeBag, bags: list[str], topics: Sequence[str] = ()
     ) -> pa.Table:
-        asked = {
-            "bags": bags,
-            "first": min(bags),
-            "last": max(bags),
-            "topics": topics,
-            "keys": [*map(topic_key, topics)],
-        }
-        days = (bag.day, bag.day)
-        return self._lake.select(
-            sql, ["channels"], asked, robots=[self._robot], days=days, bags=(min(bags), max(bags))
-        )
+        first, last = min(bags), max(bags)
+        of_day = self._lake.days("channels", self._robot).get(bag.day, ())
+        files = [each for each in of_day if each.first <= last and first <= each.last]
+        keys = [*map(topic_key, topics)]
+        asked = {"bags": bags, "first": first, "last": last, "topics": topics, "keys": keys}
+        return self._lake.select(sql, "channels", files, asked)
 
     def _shared(self, channel: Channel) -> Channel:
         """Returns the first channel that was equal: bags of one robot declare the same."""
         if len(self._channels) > _MOST_CHANNELS:
             self._channels.clear()
         return self._channels.setdefault(channel, channel)
-
-
-def _has_times_alone(topic: str) -> NotInLakeError:
-    return NotInLakeError(
-        f"the lake has only the times of {topic}, whose messages are large: name it in "
-        "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's own memory"
-    )

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.core.text import counted
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.memory.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.memory.reader import LakeReader
@@ -93,9 +92,4 @@ class LakeRobot:
             yield (
                 f"the lake has days before {since}, which were not looked at: an end (or before, "
                 "or a time) there has them looked at"
-            )
-        if unread := self._index.take_unread():
-            yield (
-                f"not in the answer: {counted(unread, 'bag')} that an earlier version shipped, "
-                "without messages"
             )
