@@ -136,9 +136,11 @@ class Scanner:
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
-        made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+        if kind.name not in self._fragments:
+            made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+            self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
-        return cast("Fragments[T]", self._fragments.setdefault(kind.name, made))
+        return cast("Fragments[T]", self._fragments[kind.name])
 
     def fragments_of_others(self) -> list[Ns]:
         """Returns where slices begin that have fragments of other settings alone, newest first."""
