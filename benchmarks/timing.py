@@ -7,6 +7,7 @@ in which the server has looked at the bags and answered nothing: the first time,
 from __future__ import annotations
 
 import asyncio
+import gc
 import hashlib
 import json
 import multiprocessing
@@ -22,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 from benchmarks.worlds import STRANGERS
-from ros2_memory.bootstrap import build_dispatcher, build_memory
+from ros2_memory.bootstrap import NEW_OBJECTS, build_dispatcher, build_memory
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.options import EXIT_NEGATIVE
 from ros2_memory.config import load_settings
@@ -195,6 +196,7 @@ def _asked(place: Path, question: Question) -> Asked:
 
 def _dispatcher(settings: Settings) -> Dispatcher:
     """Returns what answers as the server does, having looked at all bags."""
+    gc.set_threshold(NEW_OBJECTS)
     memory, fleet = build_memory(settings), build_fleet(settings)
     if fleet is None:
         memory.index.refresh()

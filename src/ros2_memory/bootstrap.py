@@ -15,7 +15,7 @@ import os
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from hydra.errors import HydraException
 from hydra.utils import instantiate
@@ -68,7 +68,7 @@ _Port = TypeVar("_Port")
 
 log = get_logger(__name__)
 
-_NEW_OBJECTS = 50_000
+NEW_OBJECTS: Final = 50_000
 """After so many new objects the server looks for garbage among them."""
 _READ_ALIKE = (
     "ros2_memory.storage.mcap_reader.McapReader",
@@ -700,7 +700,7 @@ def build_server(
     server = settings.server
     # Answers make many objects that stay in memory, and hardly any garbage: looking for that after
     # each 700 new ones takes up to a sixth of the first answers.
-    gc.set_threshold(_NEW_OBJECTS)
+    gc.set_threshold(NEW_OBJECTS)
     return EpisodicServer(
         build_dispatcher(settings, memory, telemetry, fleet),
         name=server.name,

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 import threading
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -27,7 +28,7 @@ from ros2_memory.storage.base import SEQUENCE, Definition, Field
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
@@ -46,6 +47,8 @@ _CACHED_TYPE_BYTES: Final = 2_048
 _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
+_WIDE: Final = frozenset({"wchar", "wstring"})
+"""Types of IDL that rosbags parses, and makes no deserializer for."""
 _EVENT: Final = "_Event"
 _HALVES: Final = ("Request", "Response")
 _SERVICE_HEADER: Final = re.compile(r"={80}\nSRV: .*\n")
@@ -72,15 +75,28 @@ class MessageType(NamedTuple):
         definitions: those of the type and of its nested types.
         fieldless: whether the definition has no field, so that any payload of more than a byte
             contradicts it.
-        deserialize: decodes a payload.
         fields: the definitions again, from the root down, for readers that do not know rosbags.
+        store: compiles a deserializer when one is first asked for: columns need none.
     """
 
     name: str
     definitions: Typesdict
     fieldless: bool
-    deserialize: Callable[[bytes], object]
     fields: Definition
+    store: Typestore
+
+    def compiled(self) -> MessageType | str:
+        """Returns the type with a deserializer; or why none can be made."""
+        try:
+            with _run_by_rosbags():
+                self.store.get_msgdef(self.name)
+        except _UnusableError as error:
+            return str(error)
+        return self
+
+    def deserialize(self, payload: bytes) -> object:
+        """Decodes a payload."""
+        return self.store.deserialize_cdr(payload, self.name)
 
 
 class _UnusableError(Exception):
@@ -135,15 +151,13 @@ class Typestores:
         root = full_name(name)
         try:
             definitions = self._closure(root, _sections(root, encoding, text))
-            store = _compiled(definitions, root)
+            store = Typestore()
+            with _run_by_rosbags():
+                store.register(definitions)
         except _UnusableError as error:
             return " ".join(str(error).split())[:_REASON_LENGTH]
-
-        def deserialize(payload: bytes) -> object:
-            return store.deserialize_cdr(payload, root)
-
         fields = definition_of(definitions, root)
-        return MessageType(root, definitions, not definitions[root][1], deserialize, fields)
+        return MessageType(root, definitions, not definitions[root][1], fields, store)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""
@@ -168,6 +182,8 @@ class Typestores:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 found.update(definition)
             fields = [field for _, field in found[name][1]]
+            if wide := _WIDE.intersection(map(_primitive, fields)):
+                raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
             unrolled += sum(map(_unrolled, fields))
             if unrolled > MAX_UNROLLED:
                 raise _UnusableError(
@@ -289,15 +305,14 @@ def _parse(name: str, section: _Section) -> Typesdict:
         raise _UnusableError(reason) from error
 
 
-def _compiled(definitions: Typesdict, root: str) -> Typestore:
-    store = Typestore()
+@contextmanager
+def _run_by_rosbags() -> Iterator[None]:
+    """Translates what is raised in the block, in which rosbags makes Python of definitions."""
     try:
-        store.register(definitions)
-        store.get_msgdef(root)
-    # rosbags turns definitions into Python and runs it: its failures have no common base.
+        yield
+    # It runs that, too: its failures have no common base.
     except Exception as error:
         raise _UnusableError(f"its definition cannot be used: {_brief(error)}") from error
-    return store
 
 
 def _plain_idl(text: str) -> str:
@@ -372,6 +387,13 @@ def _nested_type(field: FieldDesc) -> str | None:
         element = field[1][0]
         return str(element[1]) if element[0] == Nodetype.NAME else None
     return None
+
+
+def _primitive(field: FieldDesc) -> str | None:
+    """Returns the primitive type of a field, alone or in an array; None for a message."""
+    if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
+        field = field[1][0]
+    return str(field[1][0]) if field[0] == Nodetype.BASE else None
 
 
 def _unrolled(field: FieldDesc) -> int:

@@ -297,6 +297,11 @@ class TestHostileDefinitions:
         with pytest.raises(Exception, match="deserialize"):
             found.deserialize(CDR + bytes(16))
 
+    @pytest.mark.parametrize("kind", ["wstring", "wchar", "sequence<wstring>", "wstring<5>"])
+    def test_wide_characters(self, kind: str) -> None:
+        whole = f"module a_msgs {{ module msg {{ struct A {{ {kind} x; }}; }}; }};"
+        assert "which is not decoded" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
+
     @pytest.mark.parametrize(
         "statement",
         [

@@ -280,10 +280,11 @@ class Scan:
         for start, stop in self._shared[bisect_right(self._ends, unit.first) :]:
             if start > unit.last:
                 break
-            for begin in range(start, stop, _SLICE_NS):
-                end = min(begin + _SLICE_NS, stop)
-                if begin <= unit.last and unit.first < end and begin not in self._compared:
+            first = start + max(unit.first - start, 0) // _SLICE_NS * _SLICE_NS
+            for begin in range(first, min(unit.last + 1, stop), _SLICE_NS):
+                if begin not in self._compared:
                     self._compared.add(begin)
+                    end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
         found = self._copies.get(unit.key, [])
         if self._asked.relatches:

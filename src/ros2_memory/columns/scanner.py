@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.stored import Topic
-    from ros2_memory.columns.table import Column
+    from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
@@ -47,6 +47,8 @@ _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
 _FRAGMENT_BYTES: Final = 24 << 20
 """How much the fragments of a kind may take in memory, and as much again as they are stored."""
+DECODED_BYTES: Final = 8 << 20
+"""How much the tables of bags that are not stored may take in memory."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 
@@ -101,6 +103,7 @@ class Scanner:
         large: the turn to hold much of a bag, which large columns need, too.
 
     Attributes:
+        decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
@@ -122,6 +125,7 @@ class Scanner:
         self._known: ByteLru[Packed] = ByteLru(16 << 20)
         self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
+        self.decoded: ByteLru[list[list[Table]]] = ByteLru(DECODED_BYTES)
         self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
         self.clock_steps: ByteLru[tuple[ClockStep, ...]] = ByteLru(1 << 20)
         self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
@@ -132,9 +136,11 @@ class Scanner:
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
-        made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+        if kind.name not in self._fragments:
+            made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+            self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
-        return cast("Fragments[T]", self._fragments.setdefault(kind.name, made))
+        return cast("Fragments[T]", self._fragments[kind.name])
 
     def fragments_of_others(self) -> list[Ns]:
         """Returns where slices begin that have fragments of other settings alone, newest first."""

@@ -345,8 +345,7 @@ class ColumnStore(Database):
             added: dict[int, Topic] = {}
             for number, name, encoding, latched, layout, *schema in rows:
                 channel = Channel(name, encoding, Schema(*schema), bool(latched))
-                definition = self._definition_of(channel)
-                added[number] = Topic(channel, Layout.from_json(layout), definition)
+                added[number] = Topic(channel, Layout.from_json(layout), self._definition_of)
             self._topics = self.offset, ({**known, **added} if added else known)
             return self._topics[1]
 

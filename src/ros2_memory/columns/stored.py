@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
+from functools import cached_property
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from ros2_memory.columns.table import Elements, Table
 
@@ -75,12 +76,21 @@ class StoredTable(Table):
         return None if packed is None else packed.zone
 
 
-class Topic(NamedTuple):
-    """What the caller keeps of a topic under its number."""
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """What the caller keeps of a topic under its number.
+
+    `define` finds the definition, when it is first asked for: to parse one takes some 10 ms.
+    """
 
     channel: Channel
     layout: Layout
-    definition: Definition | None = None
+    define: Callable[[Channel], Definition | None] = lambda _: None
+
+    @cached_property
+    def definition(self) -> Definition | None:
+        """The fields of the messages; None where they are not known."""
+        return self.define(self.channel)
 
 
 def lazy_columns(

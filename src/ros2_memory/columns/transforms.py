@@ -52,19 +52,12 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
     found = _elements(table)
     if found is None:
         return None
-    owners, some = found.owners, None
     if index is not None:
-        wanted = np.zeros(len(table), np.bool_)
-        wanted[index] = True
-        some = np.flatnonzero(wanted[owners])
-        owners = np.searchsorted(index, owners[some])
+        found = found.rows(index)
     pairs, codes = _names(found)
     translation = _numbers(found, _TRANSLATION, METRES)
     rotation = _numbers(found, _ROTATION, QUATERNION)
     stamps = np.asarray(found.columns[_STAMP], np.int64)
-    if some is not None:
-        codes, stamps = codes[some], stamps[some]
-        translation, rotation = translation[some], rotation[some]
     # tf2 refuses what is not finite, and rotations that are not unit quaternions.
     fine = (codes >= 0) & np.isfinite(translation).all(axis=1)
     fine &= np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
@@ -73,7 +66,7 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
         here = np.flatnonzero(fine & (codes == nth))
         if here.size:
             turned = unit_quaternions(rotation[here])
-            edges[pair] = Edge(stamps[here], times[owners[here]], translation[here], turned)
+            edges[pair] = Edge(stamps[here], times[found.owners[here]], translation[here], turned)
     return edges
 
 

@@ -7,6 +7,8 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.fill import is_settled
+from ros2_memory.columns.scanner import DECODED_BYTES
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
@@ -214,9 +216,15 @@ class BagAccess:
         what lies around it is read to recognise duplicates only, or not, if these are known.
         With `hashed` they have the hashes of all payloads, else those of latched channels alone.
         Without `columns` they have times, and rows for messages that cannot be decoded, too.
+
+        What was read whole of a bag that does not change is remembered.
         """
         self.check_deadline()
         part = _indexed_part(bag, TimeWindow.everything() if around else window)
+        remembered = self.memory.columns.decoded
+        key = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, topic, part, hashed, columns)
+        is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
+        known = remembered.get(key) if is_lasting else None
         groups = decoded(
             self.memory.reader,
             bag.path,
@@ -225,22 +233,31 @@ class BagAccess:
             hashed=lambda channel: hashed or channel.latched,
             columns=columns,
         )
+        groups = groups if known is None else iter(known)
+        read: list[list[Table]] = []
+        size = 0
         while True:
             try:
                 with self.call.stages.timed("read"):
                     tables = next(groups, None)
             except BagError as error:
+                is_lasting = False  # each answer notes what is lost
                 self._note_unreadable(bag, error, window)
                 if error.lost is None:
                     return
                 continue
             if tables is None:
-                return
+                break
             self._track_source(bag)
+            size += 1000 + sum(table.memory_bytes for table in tables)
+            if size <= DECODED_BYTES:
+                read.append(tables)
             for table in tables:
                 with suppress(BagError):  # it was read before, and what is lost was noted
                     yield with_all_messages(self.memory.reader, bag.path, table, part)
             self.check_deadline()
+        if is_lasting and known is None:
+            remembered.put(key, read, size)
 
     def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
         """Returns what `read` yields first with `newest_first`, without reading more of the bag."""

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
@@ -216,7 +217,11 @@ def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
 def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
     found: dict[Path, tuple[IntArray, IntArray]] = {}
-    for rows in scan(view, topic, window):
+
+    def may_match(parts: PartZones) -> bool:
+        return _STAMP in parts.topic.layout.columns
+
+    for rows in scan(view, topic, window, may_match=may_match):
         column = rows.table.columns.get(_STAMP)
         if column is None or isinstance(column, Texts):
             continue

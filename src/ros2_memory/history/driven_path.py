@@ -22,6 +22,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -64,6 +65,8 @@ _MOST_BAGS_OF_BODY: Final = 128
 """Bags of which transforms are read for a path."""
 _STEP_NS: Final[Ns] = NS_PER_S // 20
 """Poses by transforms are no closer than this."""
+_POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
+"""Of a call: the frames of topics of poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +250,14 @@ def pose_frame(view: View, topic: str) -> str:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
-    body = robot_body(view) if topic in view.memory.limits.tf_topics else None
-    if body is not None:
-        return body.parent
+    known = view.memo.of(_POSE_FRAMES, dict)
+    if topic not in known:
+        body = robot_body(view) if topic in view.memory.limits.tf_topics else None
+        known[topic] = _newest_frame(view, topic) if body is None else body.parent
+    return known[topic]
+
+
+def _newest_frame(view: View, topic: str) -> str:
     failure: UndecodableError | None = None
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
     for found in islice(newest, _MOST_TRIED):

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
-from ros2_memory.core.memo import Key
+from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -68,6 +68,7 @@ class View:
     Attributes:
         bags: each bag by itself.
         stream: all bags as one stream.
+        memo: what was found out in this call.
         sessions: which recordings belong together, once that is asked (see `transforms`).
     """
 
@@ -78,6 +79,7 @@ class View:
         self.stream = MergedStream(self.bags)
         self.snapshot = self.bags.snapshot
         self.notes = self.bags.notes
+        self.memo = Memo()
         self.sessions: Sessions | None = None
 
     @cached_property

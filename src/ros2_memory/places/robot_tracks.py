@@ -32,6 +32,7 @@ from ros2_memory.columns.tracks import TRACKS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.geometry import multiply
+from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Parts, Steps, parts_inside
 from ros2_memory.core.text import Reason
@@ -105,6 +106,10 @@ class JoinedTrack:
     others: tuple[RobotTrack, ...] = ()
 
 
+_JOINED: Final[Key[dict[tuple[str, TimeWindow], JoinedTrack]]] = Key()
+"""Of a call: its tracks, by frame and window."""
+
+
 class RobotTracks:
     """Places the robot in one frame.
 
@@ -131,11 +136,15 @@ class RobotTracks:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out before any result.
         """
+        known = self._view.memo.of(_JOINED, dict)
+        if (self._frame_id, window) not in known:
+            known[self._frame_id, window] = self._over(window)
+        return known[self._frame_id, window]
+
+    def _over(self, window: TimeWindow) -> JoinedTrack:
         view = self._view
         # Whole stretches, so that no vertex depends on the window; and what may reach into it.
-        begin = max(window.start - SILENCE_NS, MIN_NS) // STRETCH_NS * STRETCH_NS
-        end = -(-min(window.stop + SILENCE_NS, MAX_NS) // STRETCH_NS) * STRETCH_NS
-        around = TimeWindow(max(begin, MIN_NS), min(end, MAX_NS))
+        around = _aligned(window.widened(SILENCE_NS), STRETCH_NS)
         found: list[tuple[Path, TrackPart]] = []
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
@@ -167,8 +176,8 @@ class RobotTracks:
             QueryTimeoutError: the call's time runs out.
         """
         around = window.widened(2 * PART_NS)
-        moving = None if self._is_own else _Moving(self._view, around.widened(TF_CACHE_NS))
         for topic in self._topics:
+            moving = None if self._is_own else _Moving(self._view, around, around)
             for rows in scan(self._view, topic, around, newest_first=True, stored=True):
                 groups = self._groups(rows, moving)
                 if self._key(rows, groups) is not None:
@@ -176,17 +185,31 @@ class RobotTracks:
 
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
         """Yields the track table by table, the newest first."""
-        moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
+        # Whole parts, also those that the window cuts: their tracks are stored.
+        whole, within = _aligned(window, PART_NS), [(window.start, window.stop)]
         for topic in self._topics:
-            for rows in scan(self._view, topic, window, newest_first=True):
-                yield rows, self._part(rows, self._groups(rows, moving), reading)
+            moving = None
+            for rows in scan(self._view, topic, whole, newest_first=True, within=within):
+                if moving is None and not self._is_own:
+                    around = TimeWindow(whole.start, min(rows.last + 1, whole.stop))
+                    moving = _Moving(self._view, around, window)
+                groups = self._groups(rows, moving)
+                if window.covers(rows.first, rows.last):
+                    yield rows, self._part(rows, groups, reading)
+                    continue
+                known = self._known(self._key(rows, groups))
+                if known is not None and not known.left_out:
+                    yield rows, known.some(_inside(known.times, window))
+                elif (inside := _inside(rows.times, window)).size:
+                    yield rows, self._part(rows.some(inside), groups, reading)
+
+    def _known(self, key: FragmentKey | None) -> TrackPart | None:
+        return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
 
     def _part(self, rows: Rows, groups: Sequence[_Group], reading: Deadline) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
-        scanner = self._view.memory.columns
         key = self._key(rows, groups)
-        known = None if key is None else scanner.fragments(TRACKS)
-        part = None if known is None or key is None else known.get(key)
+        part = self._known(key)
         if part is None:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
@@ -194,8 +217,8 @@ class RobotTracks:
             placed = self._placed(rows, groups, thins=True)
             part = track_part(placed.times, placed.x, placed.y, placed.heading, placed.left_out)
             is_sure = noted == (self._view.notes.added, len(self._failures))
-            if known is not None and key is not None and is_sure:
-                known.put(key, part)
+            if key is not None and is_sure:
+                self._view.memory.columns.fragments(TRACKS).put(key, part)
         return part
 
     def _key(self, rows: Rows, groups: Sequence[_Group]) -> FragmentKey | None:
@@ -262,9 +285,9 @@ class RobotTracks:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        moving = None if self._is_own else _Moving(self._view, window.widened(TF_CACHE_NS))
         found = [NOWHERE]
         for topic in self._topics:
+            moving = None if self._is_own else _Moving(self._view, window, window)
             every = scan(self._view, topic, window, newest_first=True)
             found += [self._placed(rows, self._groups(rows, moving), thins=False) for rows in every]
         return _joined(found)
@@ -399,10 +422,11 @@ def _placed_body(
 
 
 class _Source:
-    """A table of moving transforms."""
+    """A table of moving transforms; those of log times in a window alone are read."""
 
-    def __init__(self, rows: Rows) -> None:
+    def __init__(self, rows: Rows, window: TimeWindow) -> None:
         self.rows = rows
+        self._window = window
         self._edges: dict[Session, Edges] = {}
 
     def is_of(self, view: View, among: Session) -> bool:
@@ -414,22 +438,41 @@ class _Source:
     def edges(self, view: View, among: Session) -> Edges:
         """Returns the transforms of a session in it."""
         if among not in self._edges:
-            self._edges[among] = edges_of_rows(view, self.rows, among)
+            rows = self.rows
+            if not self._window.covers(rows.first, rows.last):
+                rows = rows.some(_inside(rows.times, self._window))
+            self._edges[among] = edges_of_rows(view, rows, among)
         return self._edges[among]
 
 
 class _Moving:
-    """The tables of moving transforms around times that are asked about, the latest first."""
+    """The tables of moving transforms around times that are asked about, the latest first.
 
-    def __init__(self, view: View, window: TimeWindow) -> None:
+    Args:
+        view: of the call.
+        window: of the times.
+        placed: of those times of which poses are placed.
+    """
+
+    def __init__(self, view: View, window: TimeWindow, placed: TimeWindow) -> None:
         topics = [
             topic
             for topic in view.memory.limits.tf_topics
             if topic in view.snapshot.timeline.topics()
         ]
+        around = window.widened(TF_CACHE_NS)
         self._waiting = [
-            scan(view, topic, window, newest_first=True, copies=True) for topic in topics
+            scan(
+                view,
+                topic,
+                _aligned(around, PART_NS),
+                newest_first=True,
+                copies=True,
+                within=[(around.start, around.stop)],
+            )
+            for topic in topics
         ]
+        self._placed = placed.widened(TF_CACHE_NS)
         self._held: list[list[_Source]] = [[] for _ in topics]
 
     def around(self, first: Ns, last: Ns) -> list[_Source]:
@@ -442,9 +485,20 @@ class _Moving:
                 rows = next(waiting, None)
                 if rows is None:
                     break
-                held.append(_Source(rows))
+                held.append(_Source(rows, self._placed))
             found += [each for each in held if each.rows.first <= last and each.rows.last >= first]
         return found
+
+
+def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
+    """Returns the slices of the clock of a length that a window is in."""
+    start, stop = window.start // length * length, -(-window.stop // length) * length
+    return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
+
+
+def _inside(times: Times, window: TimeWindow) -> Times:
+    """Returns the positions of those times that are in a window."""
+    return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
 def _within(edges: Edges, window: TimeWindow) -> Edges:

@@ -97,6 +97,7 @@ class Decoding:
             return f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         schema = channel.schema
         found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
+        found = found if isinstance(found, str) else found.compiled()
         return found if isinstance(found, str) else partial(_deserialized, found)
 
 

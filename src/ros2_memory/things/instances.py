@@ -277,6 +277,7 @@ class _Seen:
         counts: how many detections of each spot count.
         poor: which spots were seen while localisation was poor: these move nothing.
         hits: the hits of these, by spot; `starts` is where each spot's begin.
+        groups: of each spot a number; those of one bag, topic and label have the same.
         side: of each spot, the mean of the unit vectors to it from where it was seen.
     """
 
@@ -286,6 +287,8 @@ class _Seen:
         self.poor, poor = poorly_localised(sights)
         self.hits, self.starts = _by_spot(_hits(sights, self.counts), sights)
         self.hits[np.append(poor, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
+        by = (Spot.SLICE, Spot.TOPIC, Spot.LABEL)
+        self.groups = distinct_rows([sights.spots[:, column] for column in by])[1]
         self.cells = Cells(sights, epoch, poor)
         hits = self.hits[self.hits[:, Hit.LOOK] >= 0]
         away, bearing = self.cells.seen_at(
@@ -380,7 +383,7 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
         place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
         for nth in range(int(place.max(initial=-1)) + 1):
             mine = rows[place == nth]
-            if _are_several(spots[mine]):
+            if _are_several(seen.groups[mine]):
                 group.places.append(mine)
             elif seen.counts[mine].sum() >= _FEWEST:
                 single.append((group, mine))
@@ -389,12 +392,10 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
         group.places += [rows[step == each] for each in range(int(step.max()) + 1)]
 
 
-def _are_several(spots: Ints) -> bool:
+def _are_several(groups: Ints) -> bool:
     """Whether bags have several spots of a label at one place: things that stand together."""
-    distinct = len(
-        distinct_rows([spots[:, each] for each in (Spot.SLICE, Spot.TOPIC, Spot.LABEL)])[0]
-    )
-    return len(spots) - distinct > _SEVERAL_SHARE * distinct
+    distinct = np.unique(groups).size
+    return groups.size - distinct > _SEVERAL_SHARE * distinct
 
 
 def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
