@@ -26,7 +26,7 @@ from ros2_memory.columns.shown import (
     children,
     placed,
 )
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
@@ -210,16 +210,6 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
         np.concatenate([part.places for part in parts])[order],
         joined_texts([part.frames for part in parts]).rows(order),
     )
-
-
-def joined_texts(parts: Sequence[Texts]) -> Texts:
-    """Returns columns of texts one after the other."""
-    known: dict[str, int] = {}
-    codes = [np.empty(0, np.uint32)]
-    for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(known))
 
 
 # Where a type has detections

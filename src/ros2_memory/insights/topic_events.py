@@ -19,7 +19,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import blocks, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -68,13 +68,8 @@ def events_back(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     columns = StatedColumns(view.memory.extractor)
-    together: list[Rows] = []
-    for rows in scan(view, topic, window, newest_first=True, reached=reached):
-        if together and rows.last < min(each.first for each in together):
-            yield from _events(view, columns, together, may_match)
-            together = []
-        together.append(rows)
-    if together:
+    scanned = scan(view, topic, window, newest_first=True, reached=reached)
+    for together in blocks(scanned, newest_first=True):
         yield from _events(view, columns, together, may_match)
 
 
