@@ -28,6 +28,7 @@ from ros2_memory.columns.shown import (
 )
 from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
+from ros2_memory.columns.walk import within
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
 from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, detections_of
@@ -389,7 +390,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     once = detections_by(known)
     first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
     of = np.repeat(among, counts)
-    nth = np.arange(of.size) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    nth = np.repeat(first, counts) + within(counts)
     _, rows = placed(values, source.leaf.level, of, (), surely=True)
     around = _frames(values, source.leaf.level, of, source.frames)
     yield Detections(
