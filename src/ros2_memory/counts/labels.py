@@ -145,9 +145,9 @@ class _Seen:
         reached: Ns | None = None
         parts: dict[str, list[IntervalPart]] = {}
         try:
-            for window, some in self._scope.narrowed([(self._scope.window, topics)]):
+            for window in self._scope.narrowed():
                 parts = defaultdict(list)
-                sources = (_blocks(self._view, topic, window) for topic in some)
+                sources = (_blocks(self._view, topic, window) for topic in topics)
                 for block in heapq.merge(*sources, key=lambda block: -block.last):
                     parts[block.topic].append(self._counted(block, wanted))
                     reached = block.first if len(topics) == 1 else block.last
