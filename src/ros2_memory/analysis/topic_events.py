@@ -37,7 +37,7 @@ _NOTHING_VISIBLE: Final = IntervalTable()
 _DIGITS: Final = re.compile(r"\d+")
 
 
-class Held(NamedTuple):
+class KnownState(NamedTuple):
     """A state: its value in the first message that has it, and in the last; see `facts.Word`."""
 
     kind: str
@@ -89,7 +89,7 @@ class TopicEvents:
     first: Ns
     last: Ns
     visible: IntervalTable = _NOTHING_VISIBLE
-    known: tuple[Held, ...] = ()
+    known: tuple[KnownState, ...] = ()
     changes: tuple[Change, ...] = ()
     errors: tuple[Report, ...] = ()
     reports: tuple[Report, ...] = ()
@@ -103,7 +103,7 @@ class TopicEvents:
         lists = (self.known, self.changes, self.errors, self.reports, self.visible.labels)
         return _BYTES * (1 + sum(map(len, lists))) + len(self.visible.rows)
 
-    def of_kind(self, kind: str) -> tuple[Sequence[Held], Sequence[Change]]:
+    def of_kind(self, kind: str) -> tuple[Sequence[KnownState], Sequence[Change]]:
         """Returns the states of a kind, and their changes."""
         return (
             [each for each in self.known if each.kind == kind],
@@ -135,7 +135,7 @@ def events_of(stated: Stated) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = stated.facts.of_kinds({LABEL})
     labels = [word.name for word in seen.words]
-    known, changes = _held(stated)
+    known, changes = _states(stated)
     return TopicEvents(
         int(times[0]),
         int(times[-1]),
@@ -161,7 +161,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
     visible = (seen[0] if len(seen) == 1 else joined(seen)).visible
-    known, changes, more = _joined_held(parts)
+    known, changes, more = _joined_states(parts)
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
@@ -177,7 +177,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     return whole.limited(MAX_HELD, MAX_SEEN)
 
 
-def _held(stated: Stated) -> tuple[tuple[Held, ...], tuple[Change, ...]]:
+def _states(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
     """Returns what each state was first and last, and its changes."""
     facts = stated.facts.of_kinds(STATES)
     if not facts.rows.size:
@@ -200,7 +200,7 @@ def _held(stated: Stated) -> tuple[tuple[Held, ...], tuple[Change, ...]]:
     last = values[order[np.append(begins[1:], order.size) - 1]][np.argsort(first)].tolist()
     known = zip(listed(np.sort(first)), last, strict=True)
     return (
-        tuple(Held(*word[:2], at, value, end, word.text) for (word, at, value), end in known),
+        tuple(KnownState(*word[:2], at, value, end, word.text) for (word, at, value), end in known),
         tuple(
             Change(*word[:2], at, value, word.text)
             for word, at, value in listed(np.sort(order[is_change]))
@@ -208,14 +208,14 @@ def _held(stated: Stated) -> tuple[tuple[Held, ...], tuple[Change, ...]]:
     )
 
 
-def _joined_held(
+def _joined_states(
     parts: Sequence[TopicEvents],
-) -> tuple[tuple[Held, ...], tuple[Change, ...], int]:
+) -> tuple[tuple[KnownState, ...], tuple[Change, ...], int]:
     """Returns the states in times that follow each other, and the changes in and between them.
 
     The changes are in order of time, part by part. With them how much more was held than is kept.
     """
-    known: dict[tuple[str, str], Held] = {}
+    known: dict[tuple[str, str], KnownState] = {}
     found: list[Change] = []
     left_out = 0
     for part in parts:

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.topic_events import Change, Held, Report, TopicEvents
+from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents
 from ros2_memory.columns.fragments import Fragment, Kind
 
 
@@ -32,7 +32,7 @@ def _events(fragment: Fragment) -> TopicEvents:
         first,
         last,
         IntervalTable(tuple(head["labels"]), fragment.arrays["visible"].tobytes()),
-        tuple(Held(*row) for row in head["known"]),
+        tuple(KnownState(*row) for row in head["known"]),
         tuple(Change(*row) for row in head["changes"]),
         tuple(Report(*row) for row in head["errors"]),
         tuple(Report(*row) for row in head["reports"]),

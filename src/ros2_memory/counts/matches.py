@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.intervals import IntervalTable
-    from ros2_memory.analysis.topic_events import Change, Held, TopicEvents
+    from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
@@ -239,7 +239,7 @@ def _flag_held(
 
 
 def _spans_of(
-    known: Held, toggles: Sequence[Change], last: Ns, *, wanted: bool
+    known: KnownState, toggles: Sequence[Change], last: Ns, *, wanted: bool
 ) -> Iterator[tuple[Ns, Ns, bool]]:
     """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
     since, begun, value = known.at, False, bool(known.first)

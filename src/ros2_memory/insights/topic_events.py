@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.facts import State, Stated
-    from ros2_memory.analysis.topic_events import Change, Held
+    from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
 
 
-def flag_name(topic: str, flag: Held | Change) -> str:
+def flag_name(topic: str, flag: KnownState | Change) -> str:
     """Returns how a boolean of a topic is called."""
     return topic if flag.name == "value" else f"{topic} {flag.name}"
 

@@ -20,7 +20,7 @@ from ros2_memory.analysis.facts import (
     stated_by,
 )
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.topic_events import Change, Held, Report, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents, joined_events
 from ros2_memory.analysis.topic_events import events_of as events_of_stated
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import Fragment
@@ -145,7 +145,7 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     parts = []
     for nth in range(15):
         at = nth * 100 * NS_PER_S
-        known = [Held(FLAG, path, at, 0, 1) for path in ("x", "y")]
+        known = [KnownState(FLAG, path, at, 0, 1) for path in ("x", "y")]
         parts.append(
             TopicEvents(
                 at,
