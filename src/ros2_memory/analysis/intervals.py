@@ -204,27 +204,19 @@ def visible_in(
     names = [labels[code] for code in used.tolist()]
     rank = np.argsort(np.argsort(np.array(names, object)))
     order = np.lexsort((rows, rank[codes]))
-    label, row, best = rank[codes][order], rows[order], _stored_scores(scores[order])
+    label, row = rank[codes][order], rows[order]
     at = times[row]
+    # Each detection is an interval; two of one label in a message are one.
+    seen = np.zeros(row.size, ROW)
+    seen["first"], seen["last"], seen["label"] = at, at, label
+    seen["count"] = np.append(True, (np.diff(row) != 0) | (np.diff(label) != 0))
+    seen["ends"] = (row == 0) * _FROM_START + (row == len(times) - 1) * _TO_END
+    seen["best"] = _stored_scores(scores[order])
     # As if an empty message came where the topic was silent.
     silent = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
-    nth = row + silent[row]
-    goes_on = (np.diff(nth) <= 1) | (np.diff(at) <= FLICKER_NS)
+    goes_on = (np.diff(row + silent[row]) <= 1) | (np.diff(at) <= FLICKER_NS)
     goes_on &= np.diff(label) == 0
-    begins = np.flatnonzero(np.append(True, ~goes_on))
-    stops = np.append(begins[1:], len(row)) - 1
-    found = np.empty(len(begins), ROW)
-    found["first"], found["last"], found["label"] = at[begins], at[stops], label[begins]
-    # Two detections of one label in a message are one.
-    is_new = np.append(True, (np.diff(row) != 0) | (np.diff(label) != 0))
-    found["count"] = np.add.reduceat(is_new, begins, dtype=np.int64)
-    pauses = np.append(0, np.where(goes_on, np.diff(at), 0))
-    found["longest"] = np.maximum.reduceat(pauses, begins)
-    found["best"] = np.maximum.reduceat(best, begins)
-    found["ends"] = (row[begins] == 0) * _FROM_START
-    found["ends"] |= ((row[stops] == len(times) - 1) * _TO_END).astype(np.uint8)
-    rows_of_time = found[np.lexsort((found["label"], found["first"]))]
-    return IntervalTable(tuple(sorted(names)), rows_of_time.tobytes())
+    return IntervalTable(tuple(sorted(names)), _continued(seen, at, goes_on))
 
 
 def _stored_scores(scores: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -261,18 +253,27 @@ def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Inter
     goes_on &= (part[1:] - part[:-1] == 1) & follow[part[1:]]
     goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
     goes_on &= label[1:] == label[:-1]
+    rows["label"] = label
+    rows["ends"] = ends & ((part == 0) * _FROM_START + (part == len(tables) - 1) * _TO_END)
+    return IntervalTable(labels, _continued(rows, reach, goes_on))
+
+
+def _continued(rows: Rows, reach: NDArray[np.int64], goes_on: NDArray[np.bool_]) -> bytes:
+    """Returns rows, sorted by label, as those of an `IntervalTable`: some go on in the next one.
+
+    `reach` is the latest end of each and of those of its label before it.
+    """
     begins = np.flatnonzero(np.append(True, ~goes_on))
     stops = np.append(begins[1:], len(rows)) - 1
-    found = np.empty(len(begins), ROW)
-    found["first"], found["last"], found["label"] = first[begins], reach[stops], label[begins]
+    found = rows[begins]
+    found["last"] = reach[stops]
     found["count"] = np.add.reduceat(rows["count"], begins)
-    # Times below may be as far apart as any two can be: only those of one interval are subtracted.
-    pauses = np.append(0, np.where(goes_on, np.maximum(first[1:] - reach[:-1], 0), 0))
+    # Times may be as far apart as any two can be: only those of one interval are subtracted.
+    pauses = np.append(0, np.where(goes_on, np.maximum(rows["first"][1:] - reach[:-1], 0), 0))
     found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
     found["best"] = np.maximum.reduceat(rows["best"], begins)
-    found["ends"] = (ends[begins] & _FROM_START) * (part[begins] == 0)
-    found["ends"] |= (ends[stops] & _TO_END) * (part[stops] == len(tables) - 1)
-    return IntervalTable(labels, found[np.lexsort((found["label"], found["first"]))].tobytes())
+    found["ends"] = rows["ends"][begins] & _FROM_START | rows["ends"][stops] & _TO_END
+    return found[np.lexsort((found["label"], found["first"]))].tobytes()
 
 
 def _shared_labels(

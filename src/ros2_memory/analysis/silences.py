@@ -25,6 +25,7 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -105,7 +106,7 @@ def joined(parts: Sequence[Presence]) -> Presence:
     for part in parts:
         for octave, spacing in part.spacings.items():
             spacings[octave] = spacings.get(octave, Spacing()) + spacing
-    runs = _merged(sorted(run for part in parts for run in part.runs), SHORTEST_NS)
+    runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
     return Presence(
         tuple(runs),
         spacings,
@@ -161,20 +162,9 @@ def silences(
         if others not in on:
             on[others] = _heard([presences[each].runs for each in sorted(others)])
         limit = shortest_silence(period)
-        runs = _merged(presences[topic].runs, limit)
+        runs = united(presences[topic].runs, limit)
         found += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
     return sorted(found, key=lambda each: (each.start, each.end, each.topic))
-
-
-def _merged(runs: Iterable[Span], apart: Ns) -> list[Span]:
-    """Returns sorted runs, joined where they are no farther apart."""
-    merged: list[Span] = []
-    for first, last in runs:
-        if merged and first - merged[-1][1] <= apart:
-            merged[-1] = merged[-1][0], max(merged[-1][1], last)
-        else:
-            merged.append((first, last))
-    return merged
 
 
 def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
@@ -191,7 +181,7 @@ def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
             since = at
         elif count < enough <= before:
             spans.append((since, at))
-    return _merged(spans, SHORTEST_NS)
+    return united(spans, SHORTEST_NS)
 
 
 def _silences_of(

@@ -1,89 +1,65 @@
-"""Events on a topic: objects came into view and left, booleans toggled, errors were reported.
+"""The events that follow from what the messages of a topic state.
 
-What else changed, and only matters before another event, is in `state_changes`. Where a history is
-cut changes nothing, as long as nothing is left out for being too much.
+Objects came into view and left, a state changed, errors and warnings were reported. Where a history
+is cut changes nothing, as long as nothing is left out for being too much.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
-from ros2_memory.analysis.state_changes import (
-    NO_CHANGES,
-    Change,
-    Held,
-    StateChanges,
-    StateLevel,
-    has_levels,
-    joined_held,
-    joined_reports,
-    levels_of,
-    reports_of,
-)
-from ros2_memory.core.text import shortened
-from ros2_memory.messages.detections import detections_of
+import numpy as np
+
+from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, visible_in
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.analysis.facts import Ints, Stated, Word
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.detections import Detection
 
 MAX_PER_BAG: Final = 64
-"""Intervals, toggles and errors of one topic in one bag that a lake holds; the rest is counted."""
+"""Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""
 MAX_HELD: Final = 20_000
-"""Toggles, errors, changes and the like of a topic that a question about a week may hold."""
+"""Changes, errors and the like of a topic that a question about a week may hold."""
 MAX_SEEN: Final = 100_000
 """Intervals likewise; they are held as numbers."""
-MAX_FLAGS: Final = 512
-"""Booleans of one message that are tracked; the rest is counted."""
-MAX_LABELS: Final = 256
-"""Labels of one message, likewise."""
+REPEATED_NS: Final = 2 * NS_PER_S
+"""A log entry that follows its like sooner is the same report."""
 
-_ERROR_LEVEL: Final = 2
-_STALE_LEVEL: Final = 3
-_ERROR_LEVELS: Final = {
-    "rcl_interfaces/msg/Log": 40,
-    "diagnostic_msgs/msg/DiagnosticArray": _ERROR_LEVEL,
-}
-_MAX_TEXT_CHARS: Final = 160
 _BYTES: Final = 600
-"""About how much memory a toggle, an error or a level takes, and what each topic's events do."""
-_MEASURED_WITH_EVENTS: Final = frozenset({"sensor_msgs/msg/BatteryState"})
-_MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
-"""Packages whose messages are measurements: they contain no events."""
-
-
-class State(NamedTuple):
-    """What one message states: labels of objects, booleans by dot-path, errors as sentences.
-
-    `beyond` is how many more labels and booleans it has; `levels` and `reports` are those of
-    `state_changes`. `scores` has the best one of each label, or is empty where none has one.
-    """
-
-    labels: tuple[str, ...] = ()
-    flags: tuple[tuple[str, bool], ...] = ()
-    errors: tuple[str, ...] = ()
-    beyond: int = 0
-    levels: tuple[StateLevel, ...] = ()
-    reports: tuple[str, ...] = ()
-    scores: tuple[float | None, ...] = ()
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether the message states nothing."""
-        return not (self.labels or self.flags or self.errors or self.levels or self.reports)
-
-
-EMPTY_STATE: Final = State()
+"""About how much memory a change, an error or a state takes, and what each topic's events do."""
 _NOTHING_VISIBLE: Final = IntervalTable()
+_DIGITS: Final = re.compile(r"\d+")
 
 
-class ReportedError(NamedTuple):
-    """An error, and the log times of its first and last report (inclusive)."""
+class KnownState(NamedTuple):
+    """A state: its value in the first message that has it, and in the last; see `facts.Word`."""
+
+    kind: str
+    name: str
+    at: Ns
+    first: int
+    last: int
+    text: str = ""
+
+
+class Change(NamedTuple):
+    """A state that is `value` from `time` on, and was another before."""
+
+    kind: str
+    name: str
+    time: Ns
+    value: int
+    text: str = ""
+
+
+class Report(NamedTuple):
+    """Sentences that are alike, and the log times of the first and last of them (inclusive)."""
 
     text: str
     first: Ns
@@ -99,113 +75,79 @@ class TopicEvents:
         first: log time of the first message.
         last: of the last.
         visible: the intervals in which objects were visible.
-        known: each boolean's value at either end.
-        toggles: in order.
+        known: each state's value at either end.
+        changes: of states, in order.
         errors: by the time of their first report.
-        left_out: intervals, toggles and errors beyond what is kept: the longest intervals are,
-            and the earliest of the others.
+        reports: log entries of WARN and above, likewise: those alike but for their numbers.
+        left_out: events and states beyond what is kept: the longest intervals are, and the earliest
+            of the others.
         undecodable: messages that cannot be decoded; where there are no others, `first` is after
             `last`.
-        beyond: labels and booleans of one message that are not tracked, at most.
-        changes: what else changed.
+        beyond: facts of one message that are not tracked, at most.
     """
 
     first: Ns
     last: Ns
     visible: IntervalTable = _NOTHING_VISIBLE
-    known: tuple[Held, ...] = ()
-    toggles: tuple[Change, ...] = ()
-    errors: tuple[ReportedError, ...] = ()
+    known: tuple[KnownState, ...] = ()
+    changes: tuple[Change, ...] = ()
+    errors: tuple[Report, ...] = ()
+    reports: tuple[Report, ...] = ()
     left_out: int = 0
     undecodable: int = 0
     beyond: int = 0
-    changes: StateChanges = NO_CHANGES
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there were only messages without an event."""
-        has_events = self.visible.rows or self.known or self.errors or self.undecodable
-        return not has_events and self.changes.is_empty
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        changes = self.changes
-        lists = (self.known, self.toggles, self.errors, changes.known, changes.changes)
-        more = sum(map(len, lists)) + len(changes.reports) + len(self.visible.labels)
-        return _BYTES * (1 + more) + len(self.visible.rows)
+        lists = (self.known, self.changes, self.errors, self.reports, self.visible.labels)
+        return _BYTES * (1 + sum(map(len, lists))) + len(self.visible.rows)
 
-    @property
-    def all_left_out(self) -> int:
-        """Events of any kind beyond what is kept, changes included."""
-        return self.left_out + self.changes.left_out
+    def of_kind(self, kind: str) -> tuple[Sequence[KnownState], Sequence[Change]]:
+        """Returns the states of a kind, and their changes."""
+        return (
+            [each for each in self.known if each.kind == kind],
+            [each for each in self.changes if each.kind == kind],
+        )
+
+    def without_sights(self) -> TopicEvents:
+        """Returns states, changes and reports alone: what was visible, and errors, are left out."""
+        return replace(self, visible=_NOTHING_VISIBLE, errors=())
 
     def limited(self, at_most: int, intervals: int) -> TopicEvents:
         """Returns these with so many intervals, and so many of each other kind, at most."""
-        changes = self.changes
-        if changes is not NO_CHANGES:
-            more = _beyond(at_most, changes.changes, changes.reports)
-            changes = StateChanges(
-                changes.known,
-                changes.changes[:at_most],
-                changes.reports[:at_most],
-                changes.left_out + more,
-            )
-        left_out = _beyond(at_most, self.toggles, self.errors)
+        lists = (self.changes, self.errors, self.reports)
+        left_out = sum(max(0, len(each) - at_most) for each in lists)
         return replace(
             self,
             visible=self.visible.most_lasting(intervals),
-            toggles=self.toggles[:at_most],
+            changes=self.changes[:at_most],
             errors=self.errors[:at_most],
+            reports=self.reports[:at_most],
             left_out=self.left_out + left_out + max(0, self.visible.size - intervals),
-            changes=changes,
         )
 
 
-def _beyond(at_most: int, *kinds: Sequence[object]) -> int:
-    return sum(max(0, len(kind) - at_most) for kind in kinds)
-
-
-def has_events(type_name: str) -> bool:
-    """Returns whether messages of a type can contain events."""
-    return type_name in _MEASURED_WITH_EVENTS or not type_name.startswith(_MEASUREMENT_PACKAGES)
-
-
-def has_errors(type_name: str) -> bool:
-    """Returns whether messages of a type can report errors."""
-    return type_name in _ERROR_LEVELS
-
-
-def state_of(value: JsonValue, type_name: str) -> State:
-    """Returns what an extracted message of a type states."""
-    levels = levels_of(value, type_name) if has_levels(type_name) else ()
-    if not has_events(type_name):
-        return State(levels=levels) if levels else EMPTY_STATE
-    errors = tuple(_errors_in(value, _ERROR_LEVELS.get(type_name)))
-    if type_name in _ERROR_LEVELS:
-        reports = reports_of(value, type_name)
-        state = State(errors=errors, levels=levels, reports=reports)
-        return EMPTY_STATE if state.is_empty else state
-    best = _best_scores(detections_of(value))
-    labels = tuple(best)
-    flags = tuple(_flags_in(value, ""))
-    if not (labels or flags or levels):
-        return EMPTY_STATE
-    beyond = len(labels[MAX_LABELS:]) + len(flags[MAX_FLAGS:])
-    scores = tuple(best.values())[:MAX_LABELS]
-    if all(score is None for score in scores):
-        scores = ()
-    return State(labels[:MAX_LABELS], flags[:MAX_FLAGS], errors, beyond, levels, scores=scores)
-
-
-def _best_scores(detections: Sequence[Detection]) -> dict[str, float | None]:
-    """Returns the labels of detections, in order, with the best score of each."""
-    best: dict[str, float | None] = {}
-    for each in detections:
-        known = best.get(each.label)
-        if known is None or (each.score is not None and each.score > known):
-            best[each.label] = each.score
-    return best
+def events_of(stated: Stated) -> TopicEvents | None:
+    """Returns the events of messages in order of log time; None without any."""
+    times, undecodable = stated.times, stated.undecodable.size
+    if not times.size:
+        return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
+    seen = stated.facts.of_kinds({LABEL})
+    labels = [word.name for word in seen.words]
+    known, changes = _states(stated)
+    return TopicEvents(
+        int(times[0]),
+        int(times[-1]),
+        visible_in(times, seen.rows, seen.codes, seen.values, labels),
+        known,
+        changes,
+        _errors(_said(stated, ERROR)),
+        _reports(_said(stated, REPORT)),
+        0,
+        undecodable,
+        stated.beyond,
+    )
 
 
 def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
@@ -219,61 +161,106 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
     visible = (seen[0] if len(seen) == 1 else joined(seen)).visible
-    known, toggles, more = joined_held((part.known, part.toggles) for part in parts)
-    errors: dict[str, ReportedError] = {}
-    for error in (error for part in parts for error in part.errors):
-        before = errors.setdefault(error.text, error)
-        if before is not error:
-            reports = before.reports + error.reports
-            errors[error.text] = before._replace(last=error.last, reports=reports)
+    known, changes, more = _joined_states(parts)
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
         visible,
         known,
-        tuple(toggles),
-        tuple(sorted(errors.values(), key=lambda each: (each.first, each.text))),
+        changes,
+        _errors(error for part in parts for error in part.errors),
+        _reports(report for part in parts for report in part.reports),
         more + sum(part.left_out for part in parts),
         undecodable,
         max(part.beyond for part in parts),
-        _joined_changes([part.changes for part in parts]),
     )
     return whole.limited(MAX_HELD, MAX_SEEN)
 
 
-def _joined_changes(parts: Sequence[StateChanges]) -> StateChanges:
-    parts = [part for part in parts if part is not NO_CHANGES]
-    if not parts:
-        return NO_CHANGES
-    known, changes, more = joined_held((part.known, part.changes) for part in parts)
-    reports = joined_reports(report for part in parts for report in part.reports)
-    left_out = more + sum(part.left_out for part in parts)
-    return StateChanges(known, tuple(changes), tuple(reports), left_out)
+def _states(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
+    """Returns what each state was first and last, and its changes."""
+    facts = stated.facts.of_kinds(STATES)
+    if not facts.rows.size:
+        return (), ()
+    ids: dict[tuple[str, ...], int] = {}
+    of_code = np.array([ids.setdefault(word[:2], len(ids)) for word in facts.words], np.int64)
+    name = of_code[facts.codes]
+    order = np.argsort(name, kind="stable")
+    begins = np.flatnonzero(np.diff(name[order], prepend=-1))
+    values = facts.values.astype(np.int64)
+    is_change = np.diff(values[order], prepend=0) != 0
+    is_change[begins] = False
+    times = stated.times[facts.rows]
+
+    def listed(nth: Ints) -> list[tuple[Word, Ns, int]]:
+        words = [facts.words[code] for code in facts.codes[nth].tolist()]
+        return [*zip(words, times[nth].tolist(), values[nth].tolist(), strict=True)]
+
+    first = order[begins]
+    last = values[order[np.append(begins[1:], order.size) - 1]][np.argsort(first)].tolist()
+    known = zip(listed(np.sort(first)), last, strict=True)
+    return (
+        tuple(KnownState(*word[:2], at, value, end, word.text) for (word, at, value), end in known),
+        tuple(
+            Change(*word[:2], at, value, word.text)
+            for word, at, value in listed(np.sort(order[is_change]))
+        ),
+    )
 
 
-def _flags_in(value: JsonValue, path: str) -> Iterator[tuple[str, bool]]:
-    """Yields the booleans of an object and of nested objects, by dot-path; none of lists."""
-    if isinstance(value, bool):
-        yield path, value
-    elif isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _flags_in(inner, f"{path}.{name}" if path else name)
+def _joined_states(
+    parts: Sequence[TopicEvents],
+) -> tuple[tuple[KnownState, ...], tuple[Change, ...], int]:
+    """Returns the states in times that follow each other, and the changes in and between them.
+
+    The changes are in order of time, part by part. With them how much more was held than is kept.
+    """
+    known: dict[tuple[str, str], KnownState] = {}
+    found: list[Change] = []
+    left_out = 0
+    for part in parts:
+        between: list[Change] = []
+        for held in part.known:
+            before = known.get(held[:2])
+            if before is None and len(known) >= MAX_HELD:
+                left_out += 1
+                continue
+            known[held[:2]] = held if before is None else before._replace(last=held.last)
+            if before is not None and before.last != held.first:
+                between.append(Change(held.kind, held.name, held.at, held.first, held.text))
+        found += sorted([*between, *part.changes], key=lambda change: change.time)
+    return tuple(known.values()), tuple(found), left_out
 
 
-def _errors_in(value: JsonValue, least: int | None) -> Iterator[str]:
-    """Yields the errors in a log entry or a list of diagnostics: who reports it, and what."""
-    if least is None:
-        return
-    status = value.get("status") if isinstance(value, dict) else None
-    for each in status if isinstance(status, list) else [value]:
-        if not isinstance(each, dict):
-            continue
-        level, name = each.get("level"), each.get("name")
-        message = each.get("msg", each.get("message"))
-        if (
-            isinstance(level, int)
-            and level >= least
-            and not (level == _STALE_LEVEL and least == _ERROR_LEVEL)
-        ):
-            text = ": ".join(part for part in (name, message) if isinstance(part, str) and part)
-            yield shortened(text, _MAX_TEXT_CHARS)
+def _said(stated: Stated, kind: str) -> list[Report]:
+    """Returns each sentence of a kind as a report."""
+    facts = stated.facts.of_kinds({kind})
+    cells = zip(facts.codes.tolist(), stated.times[facts.rows].tolist(), strict=True)
+    return [Report(facts.words[code].name, time, time, 1) for code, time in cells]
+
+
+def _errors(found: Iterable[Report]) -> tuple[Report, ...]:
+    alike = _joined_reports(found, str, MAX_NS)
+    return tuple(sorted(alike, key=lambda error: (error.first, error.text)))
+
+
+def _reports(found: Iterable[Report]) -> tuple[Report, ...]:
+    return tuple(_joined_reports(found, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
+
+
+def _joined_reports(
+    reports: Iterable[Report], likeness: Callable[[str], str], apart: Ns
+) -> list[Report]:
+    """Returns reports in order, each joined to the newest one like it, where that is recent."""
+    found: list[Report] = []
+    newest: dict[str, int] = {}
+    for report in reports:
+        alike = likeness(report.text)
+        nth = newest.get(alike)
+        if nth is not None and report.first - found[nth].last <= apart:
+            before = found[nth]
+            found[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
+        else:
+            newest[alike] = len(found)
+            found.append(report)
+    return found

@@ -26,8 +26,9 @@ from ros2_memory.columns.shown import (
     children,
     placed,
 )
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
+from ros2_memory.columns.walk import within
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
 from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, detections_of
@@ -212,16 +213,6 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
     )
 
 
-def joined_texts(parts: Sequence[Texts]) -> Texts:
-    """Returns columns of texts one after the other."""
-    known: dict[str, int] = {}
-    codes = [np.empty(0, np.uint32)]
-    for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(known))
-
-
 # Where a type has detections
 
 
@@ -399,7 +390,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     once = detections_by(known)
     first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
     of = np.repeat(among, counts)
-    nth = np.arange(of.size) - np.repeat(np.cumsum(counts) - counts - first, counts)
+    nth = np.repeat(first, counts) + within(counts)
     _, rows = placed(values, source.leaf.level, of, (), surely=True)
     around = _frames(values, source.leaf.level, of, source.frames)
     yield Detections(

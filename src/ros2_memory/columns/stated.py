@@ -7,28 +7,30 @@ of a goal, which has no columns) the messages are named that have to be read.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.state_changes import (
+from ros2_memory.analysis.facts import (
     BATTERY,
     CHARGE,
     COMMAND,
     DIAGNOSTICS,
+    FLAG,
     GOALS,
-    MAX_LEVELS,
+    LABEL,
+    MOST,
+    NOTHING,
+    STATUS,
     VELOCITIES,
+    Facts,
+    Stated,
+    Word,
     charge_levels,
-    is_still,
-)
-from ros2_memory.analysis.stated import NOTHING, Facts, Stated, joined_facts
-from ros2_memory.analysis.topic_events import (
-    MAX_FLAGS,
-    MAX_LABELS,
     has_errors,
     has_events,
+    is_still,
+    joined_facts,
     state_of,
 )
 from ros2_memory.columns.detections import found_in, sources_in, texts_of
@@ -44,11 +46,12 @@ from ros2_memory.columns.shown import (
     placed,
 )
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+from ros2_memory.columns.walk import within
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.stated import Word
+    from ros2_memory.analysis.facts import Fact
     from ros2_memory.columns.detections import Source
     from ros2_memory.columns.shown import Node
     from ros2_memory.columns.table import Table
@@ -109,8 +112,8 @@ class StatedColumns:
             return None
 
 
-_CHARGE: Final = ((CHARGE, ""),)
-_COMMAND: Final = ((COMMAND, ""),)
+_CHARGE: Final = (Word(CHARGE),)
+_COMMAND: Final = (Word(COMMAND),)
 
 
 class _Plan(NamedTuple):
@@ -141,7 +144,7 @@ class _Plan(NamedTuple):
         if not has_events(type_name):
             return cls(type_name, numbers=numbers)
         flags = tuple(_flags(value, ""))
-        if len(flags) > MAX_FLAGS:
+        if len(flags) > MOST[FLAG]:
             raise UnknownShapeError("more booleans than are tracked")
         return cls(type_name, tuple(sources_in(value)), flags, numbers=numbers)
 
@@ -151,21 +154,24 @@ class _Plan(NamedTuple):
         Raises:
             UnknownShapeError: they have to be read.
         """
-        values = Values(table)
-        stated, to_read = Stated(table.log_times), np.empty(0, np.int64)
+        values, nothing = Values(table), np.empty(0, np.int64)
         if self.type == GOALS:
-            return FromColumns(stated, to_read, _alike(values, self.numbers))
+            stated = Stated(table.log_times)
+            return FromColumns(stated, nothing, _alike(values, self.numbers))
         if self.entry:
-            return FromColumns(_entries(values, self.entry, self.type, stated), to_read)
+            facts = _entries(values, self.entry, self.type)
+            return FromColumns(Stated(table.log_times, facts), nothing)
         labels = joined_facts([facts for each in self.labels for facts in _labels(values, each)])
-        if labels.rows.size and np.bincount(labels.rows).max() > MAX_LABELS:
+        if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
             raise UnknownShapeError("more labels than are tracked")
-        flags = joined_facts([_booleans(values, path, leaf) for path, leaf in self.flags])
-        levels = NOTHING
+        numbers, to_read = NOTHING, nothing
         if self.numbers:
             of = _charges if self.type == BATTERY else _commands
-            levels, to_read = of(values, self.numbers)
-        return FromColumns(stated._replace(labels=labels, flags=flags, levels=levels), to_read)
+            numbers, to_read = of(values, self.numbers)
+        flags = [_booleans(values, path, leaf) for path, leaf in self.flags]
+        return FromColumns(
+            Stated(table.log_times, joined_facts([labels, *flags, numbers])), to_read
+        )
 
 
 # What a type has
@@ -234,7 +240,7 @@ def _of_goals(value: Node) -> Iterator[Leaf]:
 def _labels(values: Values, source: Source) -> Iterator[Facts]:
     """Yields the labels at one place of the messages, with their scores."""
     for found in found_in(values, source, places=False):
-        words = [(word, "") for word in found.labels.words]
+        words = [Word(LABEL, label) for label in found.labels.words]
         yield Facts(found.rows, found.labels.codes.astype(np.int64), found.scores, words)
 
 
@@ -247,64 +253,46 @@ def _booleans(values: Values, path: str, leaf: Leaf) -> Facts:
         if found is None:
             raise UnknownShapeError(f"{path} is not held")
         flags = found.values.astype(np.float64)
-    return Facts(rows, np.zeros(rows.size, np.int64), flags, [(path, "")])
+    return Facts(rows, np.zeros(rows.size, np.int64), flags, [Word(FLAG, path)])
 
 
-def _entries(values: Values, entry: tuple[Leaf, ...], type_name: str, stated: Stated) -> Stated:
+def _entries(values: Values, entry: tuple[Leaf, ...], type_name: str) -> Facts:
     """Returns what log entries or diagnostics state: each that is alike is looked at once."""
     zone = values.zone(entry[0])
-    if zone is not None and (
-        zone.greatest is None or state_of(_value(int(zone.greatest), type_name), type_name).is_empty
-    ):
-        return stated
+    if zone is not None and (zone.greatest is None or not _of_entry(int(zone.greatest), type_name)):
+        return NOTHING
     level, (name, text) = values.numbers(entry[0]), [texts_of(values, leaf) for leaf in entry[1:]]
     if level is None:
         raise UnknownShapeError("levels are not held")
     numbers = level.values.astype(np.int64)
-    telling = [
-        number
-        for number in np.unique(numbers).tolist()
-        if not state_of(_value(number, type_name), type_name).is_empty
-    ]
+    telling = [each for each in np.unique(numbers).tolist() if _of_entry(each, type_name)]
     among = np.flatnonzero(np.isin(numbers, telling))
     _, rows = placed(values, entry[0].level, among, (), surely=True)
-    if rows.size and np.bincount(rows).max() > MAX_LEVELS:
+    if rows.size and np.bincount(rows).max() > MOST[STATUS]:
         raise UnknownShapeError("more levels than are tracked")
     keys = np.stack([numbers[among], name.codes[among], text.codes[among]])
     alike, codes = np.unique(keys, axis=1, return_inverse=True)
-    states = [
-        state_of(_value(number, type_name, name.words[who], text.words[what]), type_name)
-        for number, who, what in alike.T.tolist()
-    ]
-    codes = codes.reshape(-1)
-    levels = [[((each.name, each.text), each.value) for each in s.levels] for s in states]
-    errors = [[((each, ""), math.nan) for each in s.errors] for s in states]
-    reports = [[((each, ""), math.nan) for each in s.reports] for s in states]
-    return stated._replace(
-        levels=_repeated(rows, codes, levels),
-        errors=_repeated(rows, codes, errors),
-        reports=_repeated(rows, codes, reports),
+    once = Facts.of(
+        [
+            (nth, fact)
+            for nth, (number, who, what) in enumerate(alike.T.tolist())
+            for fact in _of_entry(number, type_name, name.words[who], text.words[what])
+        ]
     )
+    # Each entry has the facts of its code, one after another.
+    codes = codes.reshape(-1)
+    counts = np.bincount(once.rows, minlength=alike.shape[1])
+    begins, counts = (np.cumsum(counts) - counts)[codes], counts[codes]
+    nth = np.repeat(begins, counts) + within(counts)
+    return Facts(np.repeat(rows, counts), once.codes[nth], once.values[nth], once.words)
 
 
-def _value(level: int, type_name: str, name: str = "", text: str = "") -> JsonValue:
-    """Returns a log entry, or diagnostics, of one entry as the extractor shows it."""
-    if type_name != DIAGNOSTICS:
-        return {"level": level, "name": name, "msg": text}
-    return {"status": [{"level": level, "name": name, "message": text}]}
-
-
-def _repeated(rows: Ints, codes: Ints, states: Sequence[Sequence[tuple[Word, float]]]) -> Facts:
-    """Returns the facts of rows, each of which tells what its code does: one fact, or none."""
-    once = Facts.of([(nth, *fact) for nth, facts in enumerate(states) for fact in facts])
-    if not once.rows.size:
-        return NOTHING
-    place = np.full(len(states), -1)
-    place[once.rows] = np.arange(once.rows.size)
-    nth = place[codes]
-    kept = nth >= 0
-    nth = nth[kept]
-    return Facts(rows[kept], once.codes[nth], once.values[nth], once.words)
+def _of_entry(level: int, type_name: str, name: str = "", text: str = "") -> tuple[Fact, ...]:
+    """Returns the facts of a log entry, or of diagnostics of one entry."""
+    value: JsonValue = {"level": level, "name": name, "msg": text}
+    if type_name == DIAGNOSTICS:
+        value = {"status": [{"level": level, "name": name, "message": text}]}
+    return state_of(value, type_name).facts
 
 
 def _charges(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:

@@ -161,6 +161,16 @@ class Texts:
         return Texts(new[nth], tuple(self.words[code] for code in used[order].tolist()))
 
 
+def joined_texts(parts: Sequence[Texts]) -> Texts:
+    """Returns columns of texts one after the other."""
+    known: dict[str, int] = {}
+    codes = [np.empty(0, np.uint32)]
+    for part in parts:
+        new = [known.setdefault(word, len(known)) for word in part.words]
+        codes.append(np.array(new, np.uint32)[part.codes])
+    return Texts(np.concatenate(codes), tuple(known))
+
+
 Column: TypeAlias = "Numbers | Texts"
 
 
@@ -320,12 +330,7 @@ def _joined_column(parts: Sequence[Column]) -> Column:
     texts = [part for part in parts if isinstance(part, Texts)]
     if len(texts) < len(parts):
         return np.concatenate([part for part in parts if not isinstance(part, Texts)])
-    known: dict[str, int] = {}
-    codes = []
-    for part in texts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(known))
+    return joined_texts(texts)
 
 
 def _joined_elements(

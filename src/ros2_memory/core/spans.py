@@ -18,11 +18,11 @@ Spans: TypeAlias = list[tuple[Ns, Ns]]
 """Sorted and apart, where functions return them."""
 
 
-def united(spans: Iterable[tuple[Ns, Ns]]) -> Spans:
-    """Returns half-open spans, sorted; those that touch are merged."""
+def united(spans: Iterable[tuple[Ns, Ns]], apart: Ns = 0) -> Spans:
+    """Returns spans, sorted; those that touch, or are no farther apart, are merged."""
     merged: Spans = []
     for start, stop in sorted(spans):
-        if merged and start <= merged[-1][1]:
+        if merged and start - merged[-1][1] <= apart:
             merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
         else:
             merged.append((start, stop))

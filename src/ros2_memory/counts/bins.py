@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 import numpy as np
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import without
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.spans import united, without
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.clock_steps import elapsed_in
@@ -109,17 +109,9 @@ class BinnedWindow:
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
-        spans = [
-            (each.first, each.last)
-            for each in self.view.stream.overlapping_bags(topics, self.counted)
-        ]
-        pause = 2 * _split_ns(self.view)
-        heard: list[tuple[Ns, Ns]] = []
-        for first, last in spans:
-            if heard and first - heard[-1][1] <= pause:
-                heard[-1] = (heard[-1][0], max(heard[-1][1], last))
-            else:
-                heard.append((first, last))
+        bags = self.view.stream.overlapping_bags(topics, self.counted)
+        pause = round(2 * NS_PER_S * self.view.memory.limits.split_duration_s)
+        heard = united(((each.first, each.last) for each in bags), pause)
         self.add_lengths(column, "duration", without(heard, self.gaps))
 
     def add_unknown(self, spans: Spans) -> None:
@@ -272,7 +264,3 @@ class BinnedWindow:
             more = len(spans) - _MOST_SPANS
             shown = ", ".join(spans[:_MOST_SPANS]) + (f" and {more} more" if more > 0 else "")
             self.view.notes.add(f"no rows for times in which nothing was recorded: {shown}")
-
-
-def _split_ns(view: View) -> Ns:
-    return round(view.memory.limits.split_duration_s * 1e9)

@@ -24,7 +24,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach
 from ros2_memory.history.detections import DetectionRows, joined_detected
 from ros2_memory.history.no_data import matching_topics, seconds
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import blocks, scan
 from ros2_memory.results import Bins
 
 if TYPE_CHECKING:
@@ -145,9 +145,9 @@ class _Seen:
         reached: Ns | None = None
         parts: dict[str, list[IntervalPart]] = {}
         try:
-            for window, some in self._scope.narrowed([(self._scope.window, topics)]):
+            for window in self._scope.narrowed():
                 parts = defaultdict(list)
-                sources = (_blocks(self._view, topic, window) for topic in some)
+                sources = (_blocks(self._view, topic, window) for topic in topics)
                 for block in heapq.merge(*sources, key=lambda block: -block.last):
                     parts[block.topic].append(self._counted(block, wanted))
                     reached = block.first if len(topics) == 1 else block.last
@@ -195,17 +195,12 @@ def _check(reading: Deadline) -> None:
 def _blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Block]:
     """Yields the messages of a topic in blocks that do not overlap, the newest first."""
     reader = DetectionRows(view)
-    together: list[Detected] = []
     left_out = 0
-    for rows in scan(view, topic, window, newest_first=True):
-        if together and rows.last < min(int(each.log_times[0]) for each in together):
-            yield _Block(topic, joined_detected(together))
-            together = []
-        found = reader.of(rows)
-        left_out += len(rows) - found.log_times.size
-        together += [found] if found.log_times.size else []
-    if together:
-        yield _Block(topic, joined_detected(together))
+    for together in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
+        found = joined_detected([reader.of(rows) for rows in together])
+        left_out += sum(map(len, together)) - found.log_times.size
+        if found.log_times.size:
+            yield _Block(topic, found)
     if left_out:
         view.notes.complete = False
         view.notes.add(f"messages of {topic} that could not be decoded: {left_out}")

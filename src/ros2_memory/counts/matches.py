@@ -17,8 +17,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Contains, Equals
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined
-from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events
+from ros2_memory.analysis.facts import FLAG, has_events
+from ros2_memory.analysis.intervals import IntervalPart, joined
+from ros2_memory.analysis.topic_events import joined_events
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import listed
@@ -40,7 +41,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.state_changes import Held
+    from ros2_memory.analysis.intervals import IntervalTable
+    from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.counts.bins import By
@@ -225,26 +227,29 @@ def _flag_held(
     wanted: bool,
 ) -> TrueIntervals | None:
     """Returns when a boolean held; None where it is not clear which boolean is meant."""
-    events = joined_events([replace(part, visible=IntervalTable(), errors=()) for part in parts])
+    events = joined_events([part.without_sights() for part in parts])
     if events is None:
         return TrueIntervals.of([])
-    meant = [each for each in events.known if condition.field in {None, each.name}]
+    flags, toggles = events.of_kind(FLAG)
+    meant = [each for each in flags if condition.field in {None, each.name}]
     if len(meant) != 1:
         return None
-    spans = _spans_of(events, meant[0], wanted=wanted)
+    spans = _spans_of(meant[0], toggles, events.last, wanted=wanted)
     return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
 
 
-def _spans_of(events: TopicEvents, known: Held, *, wanted: bool) -> Iterator[tuple[Ns, Ns, bool]]:
+def _spans_of(
+    known: KnownState, toggles: Sequence[Change], last: Ns, *, wanted: bool
+) -> Iterator[tuple[Ns, Ns, bool]]:
     """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
     since, begun, value = known.at, False, bool(known.first)
-    for toggle in events.toggles:
+    for toggle in toggles:
         if toggle.name == known.name:
             if value is wanted:
                 yield since, toggle.time, begun
             since, begun, value = toggle.time, True, bool(toggle.value)
     if value is wanted:
-        yield since, events.last, begun
+        yield since, last, begun
 
 
 def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:

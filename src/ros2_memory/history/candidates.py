@@ -13,7 +13,7 @@ from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.units import Rows
@@ -106,7 +106,16 @@ class CandidateRows:
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)
 
-        for rows in _tables(self._view, topic, self._until, self._may_match, reached):
+        window = TimeWindow(MIN_NS, self._until)
+        for rows in scan(
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._may_match,
+            may_be_empty=True,
+            reached=reached,
+        ):
             yield rows.last, self._candidates(rows)
         self._left[topic] = MIN_NS
 
@@ -129,65 +138,6 @@ class CandidateRows:
         return rows.times[may]
 
 
-def _tables(
-    view: View,
-    topic: str,
-    until: Ns,
-    may_match: Callable[[PartZones], bool | Mask],
-    reached: Callable[[Ns], None] = lambda _: None,
-) -> Iterator[Rows]:
-    """Returns the tables of a topic before a moment that zones do not rule out, newest first."""
-    return scan(
-        view,
-        topic,
-        TimeWindow(MIN_NS, until),
-        newest_first=True,
-        may_match=may_match,
-        may_be_empty=True,
-        reached=reached,
-    )
-
-
 def _together(group: Sequence[tuple[Ns, str]]) -> Candidate:
     topics = tuple(sorted({topic for _, topic in group}))
     return Candidate(TimeWindow(group[-1][0], group[0][0] + 1), topics)
-
-
-class CandidateTables:
-    """Finds the times of tables that may hold a match, by their zones, before a moment.
-
-    Attributes:
-        ruled_out: whether a table was left out.
-    """
-
-    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
-        self.ruled_out = False
-        self._view = view
-        self._topics = topics
-        self._until = until
-        self._test = ColumnCondition(condition, view.memory.extractor)
-
-    def windows(self) -> Iterator[Candidate]:
-        """Yields the times in which a match can lie, newest first; they do not overlap."""
-        sources = [self._of_topic(topic) for topic in self._topics]
-        topics: set[str] = set()
-        start = stop = self._until
-        for last, first, topic in heapq.merge(*sources, key=lambda table: -table[0]):
-            if topics and last < start:
-                yield Candidate(TimeWindow(start, stop), tuple(sorted(topics)))
-                topics = set()
-            if not topics:
-                stop = min(last + 1, start)
-            topics.add(topic)
-            start = min(start, first)
-        if topics:
-            yield Candidate(TimeWindow(start, stop), tuple(sorted(topics)))
-
-    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, Ns, str]]:
-        for rows in _tables(self._view, topic, self._until, self._may_match):
-            yield min(rows.last, self._until - 1), rows.first, topic
-
-    def _may_match(self, parts: PartZones) -> bool | Mask:
-        found = self._test.may_match(parts)
-        self.ruled_out |= not np.all(found)
-        return found

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.columns.table import joined_texts
 from ros2_memory.columns.words import words_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import blocks, scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -164,7 +165,10 @@ class HeldValues:
     def _runs(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
         """Yields runs in order, or the newest first; those that go on in the next rows joined."""
         waiting: _Run | None = None
-        for together in self._blocks(window, newest_first=newest_first):
+        scanned = scan(
+            self._view, self._topic, window, newest_first=newest_first, reached=self._check
+        )
+        for together in blocks(scanned, newest_first=newest_first):
             parts = [part for rows in together if (part := self._said(rows)) is not None]
             if len(parts) < len(together):
                 runs = self._read(together, window, newest_first=newest_first)
@@ -182,24 +186,6 @@ class HeldValues:
         if waiting is not None:
             yield waiting
 
-    def _blocks(self, window: TimeWindow, *, newest_first: bool) -> Iterator[list[Rows]]:
-        """Yields rows that overlap in time together."""
-        together: list[Rows] = []
-        for rows in scan(
-            self._view, self._topic, window, newest_first=newest_first, reached=self._check
-        ):
-            is_apart = together and (
-                rows.last < min(each.first for each in together)
-                if newest_first
-                else rows.first > max(each.last for each in together)
-            )
-            if is_apart:
-                yield together
-                together = []
-            together.append(rows)
-        if together:
-            yield together
-
     def _check(self, _: Ns) -> None:
         if self._reading.expired():
             raise QueryTimeoutError("out of time")
@@ -207,28 +193,19 @@ class HeldValues:
     def _joined(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
         """Returns the runs of rows that overlap in time, in order."""
         times = np.concatenate([part[0] for part in parts])
-        known: dict[str, int] = {}
-        codes = np.concatenate(
-            [
-                np.array([known.setdefault(word, len(known)) for word in texts.words], np.int64)[
-                    texts.codes
-                ]
-                for _, texts in parts
-            ]
-        )
         if not times.size:
             return []
         order = np.argsort(times, kind="stable")
-        times, codes = times[order], codes[order]
+        texts = joined_texts([part[1] for part in parts]).rows(order)
+        times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
         breaks |= np.diff(np.searchsorted(self._gaps, times)) > 0
         if not self._holds_on:
             breaks |= np.diff(times) > SILENCE_NS
         firsts = np.append(0, np.flatnonzero(breaks) + 1)
         lasts = np.append(firsts[1:], times.size) - 1
-        words = [*known]
         return [
-            _Run(words[code], first, last)
+            _Run(texts.words[code], first, last)
             for code, first, last in zip(
                 codes[firsts].tolist(), times[firsts].tolist(), times[lasts].tolist(), strict=True
             )

@@ -45,24 +45,22 @@ class Tested(NamedTuple):
     met: NDArray[np.uint8]
 
 
-class Block:
-    """Messages of a topic between two log times (inclusive); tested when that is asked for.
+class Block(NamedTuple):
+    """Messages of a topic between two log times (inclusive).
 
     Attributes:
         topic: its name.
         first: no message is earlier.
         last: none is later.
         has_match: whether some message may meet the condition.
+        tested: tests them.
     """
 
-    def __init__(
-        self, topic: str, first: Ns, last: Ns, *, has_match: bool, test: Callable[[], Tested]
-    ) -> None:
-        self.topic = topic
-        self.first = first
-        self.last = last
-        self.has_match = has_match
-        self.tested = test
+    topic: str
+    first: Ns
+    last: Ns
+    has_match: bool
+    tested: Callable[[], Tested]
 
 
 class Matching:
@@ -112,13 +110,13 @@ class Matching:
             def none_met() -> Tested:
                 return Tested(rows.times, np.zeros(len(rows), np.uint8))
 
-            return Block(topic, first, last, has_match=False, test=none_met)
+            return Block(topic, first, last, has_match=False, tested=none_met)
         met, unsure = truth.met, truth.unsure
         if rows.index is not None:
             met, unsure = met[rows.index], unsure[rows.index]
         self.ruled_out |= not (met | unsure).all()
         test = partial(self._tested, topic, rows, met, unsure)
-        return Block(topic, first, last, has_match=bool((met | unsure).any()), test=test)
+        return Block(topic, first, last, has_match=bool((met | unsure).any()), tested=test)
 
     def _tested(
         self, topic: str, rows: Rows, met: NDArray[np.bool_], unsure: NDArray[np.bool_]
@@ -167,7 +165,7 @@ def _joined(parts: Sequence[Tested]) -> Tested:
 
 def _of(topic: str, tested: Tested) -> Block:
     first, last = int(tested.times[0]), int(tested.times[-1])
-    return Block(topic, first, last, has_match=bool(tested.met.any()), test=lambda: tested)
+    return Block(topic, first, last, has_match=bool(tested.met.any()), tested=lambda: tested)
 
 
 class Runs(NamedTuple):

@@ -19,7 +19,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
-from ros2_memory.history.scan import decoded_rows, messages_of, scan
+from ros2_memory.history.scan import blocks, decoded_rows, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -107,22 +107,9 @@ def pose_rows(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     reader = PoseReader(view, failures, beside)
-    together: list[Rows] = []
-    for rows in scan(
-        view, topic, window, newest_first=newest_first, stored=stored, reached=reached
-    ):
-        if not among(rows.recording):
-            continue
-        is_apart = together and (
-            rows.last < min(each.first for each in together)
-            if newest_first
-            else rows.first > max(each.last for each in together)
-        )
-        if is_apart:
-            yield reader.block(together)
-            together = []
-        together.append(rows)
-    if together:
+    scanned = scan(view, topic, window, newest_first=newest_first, stored=stored, reached=reached)
+    counting = (rows for rows in scanned if among(rows.recording))
+    for together in blocks(counting, newest_first=newest_first):
         yield reader.block(together)
 
 

@@ -26,7 +26,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.candidates import CandidateRows, CandidateTables
+from ros2_memory.history.candidates import CandidateRows
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
@@ -235,10 +235,6 @@ class ReverseSearch:
         _require_frame(view, self.topics, condition)
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
-
-    def candidates(self, until: Ns) -> CandidateTables:
-        """Returns the tables that can contain a match before a moment."""
-        return CandidateTables(self._view, self.topics, self.condition, until)
 
     def newest(self, until: Ns) -> StoredMessage | None:
         """Returns the newest match before a moment; notes report what could not be tested.

@@ -78,6 +78,23 @@ def scan(
     return Scan(view.memory.columns, asked).rows(newest_first=newest_first)
 
 
+def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
+    """Yields the rows of a scan, those together that overlap in time: no other lies between."""
+    together: list[Rows] = []
+    for rows in scanned:
+        is_apart = together and (
+            rows.last < min(each.first for each in together)
+            if newest_first
+            else rows.first > max(each.last for each in together)
+        )
+        if is_apart:
+            yield together
+            together = []
+        together.append(rows)
+    if together:
+        yield together
+
+
 def copies(view: View, topic: str) -> Iterator[Rows]:
     """Yields the rows of a topic that do not count, as another recording has them, too.
 

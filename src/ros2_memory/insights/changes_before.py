@@ -9,24 +9,23 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.state_changes import (
-    ACTIVE_GOAL,
+from ros2_memory.analysis.facts import (
     BATTERY,
     CHARGE,
     COMMAND,
+    FLAG,
     GOAL,
     LOG,
     LOW_CHARGES,
     STATUS,
     VELOCITIES,
     charge_of,
-    has_levels,
+    has_changes,
+    has_events,
 )
-from ros2_memory.analysis.topic_events import has_events, joined_events
+from ros2_memory.analysis.topic_events import joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Quoted
@@ -35,15 +34,20 @@ from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.view import ns_argument, open_view
 from ros2_memory.insights.goals import GOAL_WORDS, action_of
-from ros2_memory.insights.topic_events import events_in, events_of_messages, toggled
+from ros2_memory.insights.topic_events import (
+    events_in,
+    events_of_messages,
+    flag_name,
+    note_left_out,
+    toggled,
+)
 from ros2_memory.places.pose_frames import newest_pose, placed, with_place
 from ros2_memory.results import Before, PastChange
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.state_changes import Change, Report, StateChanges
-    from ros2_memory.analysis.topic_events import TopicEvents
+    from ros2_memory.analysis.topic_events import Change, Report, TopicEvents
     from ros2_memory.core.model import Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
@@ -68,8 +72,9 @@ _MOST_AFTER: Final = 3
 _MAX_LOG_CHARS: Final = 100
 
 _LEVELS: Final = ("ok", "warning", "error", "stale")
+_ACTIVE_GOAL: Final = frozenset({1, 2, 3})
+"""Accepted, executing, canceling (action_msgs/msg/GoalStatus)."""
 _ROUTINE: Final = ("goal accepted", "goal succeeded")
-_NO_INTERVALS: Final = IntervalTable()
 
 
 class _Change(NamedTuple):
@@ -86,21 +91,21 @@ class ChangesBefore:
     Attributes:
         looked_at: the topics on which a change would show.
         state: booleans, statuses that are not ok, and the goal of each action, at the end.
-        left_out: by topic, how many changes were too many to be stored.
+        events: by topic, what its messages report in the window and before it.
     """
 
     def __init__(
         self,
         changes: Iterable[_Change],
-        looked_at: tuple[str, ...] = (),
-        state: tuple[tuple[str, bool | str], ...] = (),
-        left_out: Mapping[str, int] | None = None,
+        looked_at: tuple[str, ...],
+        state: tuple[tuple[str, bool | str], ...],
+        events: Mapping[str, TopicEvents],
     ) -> None:
         self._changes = sorted(changes)
         self._longest = max((each.last - each.first for each in self._changes), default=0)
         self.looked_at = looked_at
         self.state = state
-        self.left_out = left_out or {}
+        self.events = events
 
     def after(self, at: Ns, length: Ns, *, slack: Ns = 0) -> tuple[PastChange, ...]:
         """Returns what changed in the time after a moment, nearest first: `before` is negative.
@@ -165,8 +170,7 @@ def changes_in(
         events = _with_lead(view, topic, window, found, types)
         if events is not None:
             joined[topic] = events
-        is_telling = any(each == LOG or has_levels(each) for each in types)
-        if is_telling or (events is not None and events.known):
+        if any(map(has_changes, types)) or (events is not None and events.known):
             looked_at += [topic] if _is_recorded(view, topic, window) else []
     changes: list[_Change] = []
     for topic, events in joined.items():
@@ -180,11 +184,7 @@ def changes_in(
         changes,
         tuple(looked_at),
         tuple(_state(joined)),
-        {
-            topic: events.changes.left_out
-            for topic, events in joined.items()
-            if events.changes.left_out
-        },
+        joined,
     )
 
 
@@ -219,48 +219,45 @@ def _with_lead(
 
     None where neither can have a change: a detector's topic is not read for it.
     """
-    can_change = LOG in types or found is None or found.known or not found.changes.is_empty
-    if not can_change:
+    if not (LOG in types or found is None or found.known):
         return None
     start = max(window.start - _LEAD_NS, MIN_NS)
     newest = view.stream.newest(topic, TimeWindow(max(start - _KNOWN_NS, MIN_NS), start))
     before = None if newest is None else events_of_messages(view, [newest])
     parts = (before, events_in(view, topic, TimeWindow(start, window.start)), found)
-    return joined_events(
-        [replace(part, visible=_NO_INTERVALS, errors=()) for part in parts if part is not None]
-    )
+    return joined_events([part.without_sights() for part in parts if part is not None])
 
 
 def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
-    for toggle in events.toggles:
-        yield _Change(toggle.time, toggle.time, toggled(topic, toggle))
-    for report in events.changes.reports:
+    for report in events.reports:
         yield _Change(report.first, report.last, _reported(report))
-    charge = next((each.first for each in events.changes.known if each.name == CHARGE), 0)
-    for change in events.changes.changes:
+    charge = next((each.first for each in events.known if each.kind == CHARGE), 0)
+    for change in events.changes:
         text = _changed(topic, change, charge)
-        if change.name == CHARGE:
+        if change.kind == CHARGE:
             charge = change.value
         if text:
             yield _Change(change.time, change.time, text)
-    for known in events.changes.known:
+    for known in events.known:
         # A goal is new, and a status that is not ok, where earlier messages are without it.
         if known.at == events.first:
             continue
-        if known.name.startswith(GOAL):
+        if known.kind == GOAL:
             word = GOAL_WORDS.get(known.first, "accepted")
             yield _Change(known.at, known.at, f"{action_of(topic)} goal {word}")
-        elif known.name.startswith(STATUS) and known.first:
+        elif known.kind == STATUS and known.first:
             yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
 
 
 def _changed(topic: str, change: Change, charge: int) -> str:
-    """Returns a sentence for a change of level; empty for one that is not reported."""
-    if change.name.startswith(STATUS):
+    """Returns a sentence for a change; empty for one that is not reported."""
+    if change.kind == FLAG:
+        return toggled(topic, change)
+    if change.kind == STATUS:
         return _status(change.name, change.value, change.text)
-    if change.name.startswith(GOAL) and change.value in GOAL_WORDS:
+    if change.kind == GOAL and change.value in GOAL_WORDS:
         return f"{action_of(topic)} goal {GOAL_WORDS[change.value]}"
-    if change.name == CHARGE and change.value > charge:
+    if change.kind == CHARGE and change.value > charge:
         return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
     return ""
 
@@ -268,8 +265,7 @@ def _changed(topic: str, change: Change, charge: int) -> str:
 def _status(name: str, level: int, text: str) -> str:
     word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
     more = f": {text}" if text else ""
-    text = f"status of {name.removeprefix(STATUS)} became {word}{more}"
-    return Quoted(text[:_MAX_LOG_CHARS])
+    return Quoted(f"status of {name} became {word}{more}"[:_MAX_LOG_CHARS])
 
 
 def _reported(report: Report) -> str:
@@ -283,7 +279,7 @@ class _ActiveGoals:
     """Whether the newest goal of some action was active at a time."""
 
     def __init__(self, events: Iterable[TopicEvents]) -> None:
-        self._actions = [action for each in events if (action := [*_activity(each.changes)])]
+        self._actions = [action for each in events if (action := [*_activity(each)])]
 
     def at(self, time: Ns) -> bool:
         """Returns whether one was."""
@@ -294,27 +290,28 @@ class _ActiveGoals:
         return False
 
 
-def _activity(changes: StateChanges) -> Iterator[tuple[Ns, bool]]:
+def _activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
     """Yields, whenever the status of a goal changes, whether the newest one is active from then on.
 
     An older goal does not count: that it ended may not be recorded.
     """
-    begun = {known.name: known.at for known in changes.known if known.name.startswith(GOAL)}
-    states = [(known.at, known.name, known.first) for known in changes.known]
-    states += [(change.time, change.name, change.value) for change in changes.changes]
+    goals, changes = events.of_kind(GOAL)
+    begun = {goal.name: goal.at for goal in goals}
+    states = [(goal.at, goal.name, goal.first) for goal in goals]
+    states += [(change.time, change.name, change.value) for change in changes]
     newest, active = MIN_NS, set[str]()
-    for time, name, value in sorted(each for each in states if each[1] in begun):
+    for time, name, value in sorted(states):
         if begun[name] > newest:
             newest = begun[name]
             active.clear()
         if begun[name] == newest:
-            (active.add if value in ACTIVE_GOAL else active.discard)(name)
+            (active.add if value in _ACTIVE_GOAL else active.discard)(name)
         yield time, bool(active)
 
 
 def _stopped_commands(topic: str, events: TopicEvents, goals: _ActiveGoals) -> Iterator[_Change]:
-    for change in events.changes.changes:
-        if change.name == COMMAND and not change.value and goals.at(change.time):
+    for change in events.of_kind(COMMAND)[1]:
+        if not change.value and goals.at(change.time):
             text = f"{topic} went to zero while a goal was active"
             yield _Change(change.time, change.time, text)
 
@@ -322,17 +319,17 @@ def _stopped_commands(topic: str, events: TopicEvents, goals: _ActiveGoals) -> I
 def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]]:
     """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end."""
     for topic, events in joined.items():
-        is_battery = any(each.name == CHARGE for each in events.changes.known)
-        for flag in () if is_battery else events.known:
-            yield topic if flag.name == "value" else f"{topic} {flag.name}", bool(flag.last)
-        goals = [each for each in events.changes.known if each.name.startswith(GOAL)]
+        is_battery = any(each.kind == CHARGE for each in events.known)
+        for flag in () if is_battery else events.of_kind(FLAG)[0]:
+            yield flag_name(topic, flag), bool(flag.last)
+        goals, _ = events.of_kind(GOAL)
         if goals:
             newest = max(goals, key=lambda each: each.at)
             yield f"{action_of(topic)} goal", GOAL_WORDS.get(newest.last, "active")
-        for level in events.changes.known:
-            if level.name.startswith(STATUS) and level.last:
-                word = _LEVELS[level.last] if 0 < level.last < len(_LEVELS) else str(level.last)
-                yield Quoted(f"status of {level.name.removeprefix(STATUS)}"), word
+        for status in events.of_kind(STATUS)[0]:
+            if status.last:
+                word = _LEVELS[status.last] if 0 < status.last < len(_LEVELS) else str(status.last)
+                yield Quoted(f"status of {status.name}"), word
 
 
 def before(
@@ -360,8 +357,8 @@ def before(
         view.notes.add("no topic that would show a change is recorded at this time")
     elif not found:
         view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
-    for topic, more in changes.left_out.items():
-        view.notes.add(f"{topic} changes too often to store each change: {more} more")
+    for topic, events in changes.events.items():
+        note_left_out(view, topic, events)
     note_unread(view, window)
     note_edges(view, window)
     return Before(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.topic_events import has_errors
+from ros2_memory.analysis.facts import has_errors
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at

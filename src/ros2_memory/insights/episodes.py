@@ -227,29 +227,25 @@ def topic_changes(
     topic = resolve_topic(view, topic)
     values = HeldValues(view, topic, *fields, asked="changes")
     start, _ = window.asked()
-    found: list[Spell] = []
-    elapsed, is_silent = elapsed_in(view, window), True
     try:
-        for held in values.back(window.stop):
-            if held.stop <= start:
-                break
-            is_silent = False
-            if not held.is_blank:
-                skipped = elapsed.skipped_between(held.start, held.stop)
-                found.append(replace(spell_of(held), skipped=skipped))
-            if held.start <= start:
-                break
-    except QueryTimeoutError:
-        if not found:
+        held = values.during(start, window.stop)
+    except QueryTimeoutError as error:
+        held = values.known[::-1]
+        if not held:
             raise
         view.notes.complete = False
         view.notes.add(
-            f"out of time: only what is after {unix_text(values.reached)} is listed; to see the "
+            f"{error}: only what is after {unix_text(values.reached)} is listed; to see the "
             "rest, ask again with that as end"
         )
-    if is_silent:
+    if not held:
         raise no_data_between(view, (topic,), window)
-    found.reverse()
+    elapsed = elapsed_in(view, window)
+    found = [
+        replace(spell_of(each), skipped=elapsed.skipped_between(each.start, each.stop))
+        for each in held
+        if not each.is_blank
+    ]
     if len(found) > max_samples:
         view.notes.add(
             f"the first {max_samples} of {len(found)} changes: to continue, ask again with "

@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.state_changes import GOAL, GOALS
+from ros2_memory.analysis.facts import GOAL, GOALS
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
@@ -88,7 +88,8 @@ def goals_in(
         # Which goals it listed before: what a window's first message lists need not be new.
         before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
         earlier = None if before is None else events_of_messages(view, [before])
-        old = {} if earlier is None else {each.name: each.last for each in earlier.changes.known}
+        listed = [] if earlier is None else earlier.of_kind(GOAL)[0]
+        old = {goal.name: goal.last for goal in listed}
         yield from _goals(topic, found, old)
 
 
@@ -119,7 +120,7 @@ def goals_asked(
     found = {topic: events_in(view, topic, scope.window) for topic in topics}
     for topic, events in found.items():
         if events is not None:
-            note_limits(view, topic, replace(events, left_out=events.all_left_out))
+            note_limits(view, topic, events)
     goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
     goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
     return [each for each in goals if scope.holds_at(each.last)]
@@ -133,12 +134,13 @@ def _facts(status: int) -> JsonValue:
 def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:
     """Yields the goals of an action, given those that were listed before with their statuses."""
     ends: dict[str, tuple[Ns, int]] = {}
-    for change in found.changes.changes:
-        if change.name.startswith(GOAL) and change.value in _ENDED:
+    goals, changes = found.of_kind(GOAL)
+    for change in changes:
+        if change.value in _ENDED:
             ends.setdefault(change.name, (change.time, change.value))
-    for known in found.changes.known:
+    for known in goals:
         is_listed_first = known.at == found.first
-        if not known.name.startswith(GOAL) or old.get(known.name) in _ENDED:
+        if old.get(known.name) in _ENDED:
             continue
         if known.first in _ENDED:
             if known.name not in old and is_listed_first:
@@ -147,5 +149,4 @@ def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[G
         ended, status = ends.get(known.name, (None, known.last))
         accepted = None if known.name in old else known.at
         last = found.last if ended is None else ended
-        name = known.name.removeprefix(GOAL)
-        yield GoalRun(topic, name, accepted, ended, status, known.at, last)
+        yield GoalRun(topic, known.name, accepted, ended, status, known.at, last)

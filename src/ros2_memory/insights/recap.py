@@ -12,9 +12,10 @@ from collections import Counter
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import united
 from ros2_memory.analysis.motion.standstills import SHORTEST_NS
-from ros2_memory.analysis.topic_events import has_events, joined_events
+from ros2_memory.analysis.topic_events import joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Quoted, counted, listed, repeating
@@ -54,7 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.intervals import IntervalTable
     from ros2_memory.analysis.motion.standstills import Standstill
-    from ros2_memory.analysis.topic_events import ReportedError, TopicEvents
+    from ros2_memory.analysis.topic_events import Change, Report, TopicEvents
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
@@ -341,14 +342,15 @@ def _topic_events(
     last_seen: dict[str, Ns] = {}
     below = 0
     for topic, found in found_of.items():
-        if found is None or found.is_empty:
+        if found is None:
             continue
         seen = found.visible.scoring(min_score) if min_score else found.visible
         below += found.visible.size - seen.size
-        ends: list[Ns] = []
-        if found.toggles:
+        _, toggles = found.of_kind(FLAG)
+        if toggles:
             ends = [begin for begin, _ in unrecorded_times(view, topic, TimeWindow(start, end))]
-        events += [*_flips(topic, found, ends), *map(_error, _errors(view, topic, found, there))]
+            events += _flips(topic, toggles, ends)
+        events += map(_error, _errors(view, topic, found, there))
         visible.append(seen)
         throughout.update(seen.throughout(start, end))
         last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
@@ -403,9 +405,7 @@ def _drops(drive: Drive) -> Iterator[Event]:
         yield Event("drop", time, None, text)
 
 
-def _errors(
-    view: View, topic: str, found: TopicEvents, there: _There | None
-) -> tuple[ReportedError, ...]:
+def _errors(view: View, topic: str, found: TopicEvents, there: _There | None) -> tuple[Report, ...]:
     """Returns the errors of a window; in a region only their reports there count."""
     if there is None or all(there.covers(each.first, each.last) for each in found.errors):
         return found.errors
@@ -427,13 +427,13 @@ def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
 
 
-def _flips(topic: str, events: TopicEvents, ends: Sequence[Ns]) -> Iterator[Event]:
+def _flips(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
     """Yields each toggle with how long its value held: until the next, or beyond the window.
 
     Or as long as it was recorded: `ends` are the times at which the topic ceased to be, in order.
     """
     until: dict[str, Ns] = {}
-    for toggle in reversed(events.toggles):
+    for toggle in reversed(toggles):
         text = toggled(topic, toggle)
         end = until.get(toggle.name)
         ceased = bisect_left(ends, toggle.time)
@@ -461,7 +461,7 @@ def _silences(view: View, window: TimeWindow) -> Iterator[Event]:
         )
 
 
-def _error(error: ReportedError) -> Event:
+def _error(error: Report) -> Event:
     again = f" ({error.reports} times)" if error.reports > 1 else ""
     end = error.last if error.reports > 1 else None
     return Event("error", error.first, end, Quoted(f"error: {error.text}{again}"))

@@ -1,6 +1,7 @@
 """Finds sightings: runs of matches on each topic, the newest first, over columns.
 
 A sighting is message after message of one topic that meets a condition; see `insights.sightings`.
+Where a scope does not hold, a match counts as no match.
 """
 
 from __future__ import annotations
@@ -13,17 +14,18 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.history.matched import Matching, Runs, runs_of
+from ros2_memory.history.matched import MET, NOT_MET, Matching, Tested, runs_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.matched import Block
+    from ros2_memory.history.matched import Block, Runs
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
+    from ros2_memory.places.scope import Scope
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +101,11 @@ class _OfTopic:
         self.runs += found
         self._is_open = bool(runs.counts.size) and runs.goes_back
 
+    def end_in(self, view: View, gap: TimeWindow) -> None:
+        """Ends the oldest run if the topic has a message in a time that was not searched."""
+        if self._is_open and _has_messages(view, self._topic, gap):
+            self._is_open, self._begins = False, MAX_NS
+
     def cut(self) -> list[Run]:
         """Returns the runs, of which the oldest may have begun earlier than is known."""
         if not self._is_open:
@@ -115,21 +122,13 @@ class _OfTopic:
         ][::-1]
 
 
-def find_runs(
-    view: View,
-    search: ReverseSearch,
-    window: TimeWindow,
-    is_log: Callable[[str], bool],
-    *,
-    enough: int | None,
-) -> Found:
-    """Returns the runs of matches in a window, on all topics of a search.
+def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | None) -> Found:
+    """Returns the runs of matches in a scope, on all topics of a search; of a log each message.
 
     Args:
         view: what is searched.
         search: which topics, and for what.
-        window: of log time.
-        is_log: whether each message of a topic is a run of its own.
+        scope: when matches count.
         enough: how many of the newest are wanted: the search ends when no older match can change
             these, and there is one more. None: all of them.
 
@@ -139,15 +138,22 @@ def find_runs(
         QueryTimeoutError: the call's time is over before the first match was found.
     """
     matching = Matching(view, search)
+    # What lies outside of a scope is not read, and may well be decodable.
+    matching.ruled_out = scope.is_bounded
+    is_log = view.snapshot.timeline.is_log
     topics = {topic: _OfTopic(topic, apart=is_log(topic)) for topic in search.topics}
-    reached = window.stop
+    reached = searched = scope.window.stop
     try:
-        for block in _blocks(matching, topics, window):
-            topics[block.topic].add(block)
-            reached = block.first if len(topics) == 1 else block.last
-            if enough is not None and _has_enough(topics, enough, reached):
-                search.note_undecodable(_newest_first(topics)[enough - 1].first)
-                return Found(_newest_first(topics), reached)
+        for window in scope.narrowed():
+            for of_topic in topics.values():
+                of_topic.end_in(view, TimeWindow(window.stop, searched))
+            searched = window.start
+            for block in _blocks(matching, topics, window):
+                topics[block.topic].add(_counting(block, scope) if scope.is_bounded else block)
+                reached = block.first if len(topics) == 1 else block.last
+                if enough is not None and _has_enough(topics, enough, reached):
+                    search.note_undecodable(_newest_first(topics)[enough - 1].first)
+                    return Found(_newest_first(topics), reached)
     except QueryTimeoutError:
         runs = [run for each in topics.values() for run in each.cut()]
         if not runs:
@@ -158,7 +164,7 @@ def find_runs(
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_undecodable(runs[enough - 1].first)
         return Found(runs, reached)
-    search.close(matching, window, found=bool(runs))
+    search.close(matching, scope.window, found=bool(runs))
     return Found(runs)
 
 
@@ -166,6 +172,33 @@ def _blocks(matching: Matching, topics: dict[str, _OfTopic], window: TimeWindow)
     """Returns the blocks of all topics, the newest first."""
     sources = (matching.newest_first(topic, window) for topic in topics)
     return heapq.merge(*sources, key=lambda block: -block.last)
+
+
+def _counting(block: Block, scope: Scope) -> Block:
+    """Returns a block in which only those are matches that count in a scope."""
+
+    def tested() -> Tested:
+        times, met = block.tested()
+        matches = np.flatnonzero(met == MET)[::-1]
+        # The newest first, as a scope reads what the other topic said.
+        counts = np.array([scope.holds_at(time) for time in times[matches].tolist()], np.bool_)
+        met = met.copy()
+        met[matches[~counts]] = NOT_MET
+        return Tested(times, met)
+
+    return block._replace(tested=tested)
+
+
+def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
+    """Whether a topic has a message in a time; by the index where that is enough."""
+    if gap.empty:
+        return False
+    held = view.stream.overlapping_bags([topic], gap)
+    is_alone = len({each.bag.recording for each in held}) == 1
+    counts = is_alone and not view.stream.may_be_relatched([topic])
+    if counts and any(gap.contains(each.first) or gap.contains(each.last) for each in held):
+        return True
+    return bool(held) and view.stream.first([topic], gap) is not None
 
 
 def _has_enough(topics: dict[str, _OfTopic], enough: int, reached: Ns) -> bool:

@@ -9,8 +9,7 @@ status of an action each goal is a sighting, of a log each message.
 from __future__ import annotations
 
 import math
-from collections import OrderedDict, deque
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -29,7 +28,6 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
 )
-from ros2_memory.counts.tested import tested
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.no_data import matching_topics, require_recorded
@@ -58,19 +56,17 @@ from ros2_memory.places.scope import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import JsonValue, Pose
-    from ros2_memory.counts.tested import Tested
-    from ros2_memory.history.candidates import Candidate
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.insights.goals import GoalRun
-    from ros2_memory.insights.sighting_search import Found, Run
+    from ros2_memory.insights.sighting_search import Run
     from ros2_memory.messages.detections import Detection
     from ros2_memory.places.scope import WhileCondition
 
@@ -79,31 +75,6 @@ _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
 """How long the messages of what was found are read after a search ran out of time."""
-MAX_COUNTED: Final = 20_000
-"""Sightings that are counted over time."""
-
-
-@dataclass(slots=True)
-class _Matches:
-    """Consecutive matches on one topic, collected from the newest on.
-
-    Attributes:
-        topic: the topic.
-        last: log time of the last match.
-        first: log time of the earliest match so far.
-        reach: log time of the earliest message so far, also of one that cannot be decoded.
-        begun: whether what came before the earliest match is known.
-        until: log time of the next message, which does not match or count; None where that is not
-            known.
-    """
-
-    topic: str
-    last: Ns
-    first: Ns
-    reach: Ns
-    messages: int = 1
-    begun: bool = False
-    until: Ns | None = None
 
 
 def find_matches(
@@ -259,31 +230,32 @@ def _of_texts(view: View, topic: str, condition: Condition, scope: Scope, shown:
 def _of_matches(
     view: View, search: ReverseSearch, scope: Scope, shown: _Shown, fields: Sequence[str]
 ) -> _Rows:
-    is_log, window = view.snapshot.timeline.is_log, scope.window
-    collected = _Sightings(shown.limit, is_log, oldest_first=shown.oldest_first)
-    if scope.is_bounded:
-        _collect(view, search, scope, collected)
-    else:
-        enough = None if shown.oldest_first else shown.limit
-        collected.take(find_runs(view, search, window, is_log, enough=enough), view)
-    searched = window
-    if collected.cut and collected.selected:
-        searched = TimeWindow(collected.selected[-1].first, window.stop)
+    found = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
+    if found.is_over:
+        view.bags.finish_within(_LEFT_TO_SAY_S)
+        view.notes.complete = False
+        reached = unix_text(found.searched_to or MIN_NS)
+        view.notes.add(
+            f"the search ran out of time at {reached}: to continue, pass that time as end"
+        )
+    runs = found.runs[-shown.limit :][::-1] if shown.oldest_first else found.runs[: shown.limit]
+    searched, is_cut = scope.window, found.searched_to is not None
+    if is_cut:
+        searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_before(searched.start)
     # To say where the robot was takes longest.
     wanted = [
-        (matches, newest)
-        for matches in collected.selected
-        if view.call.wants(matches.last) and (newest := _newest(view, matches)) is not None
+        (run, newest)
+        for run in runs
+        if view.call.wants(run.last) and (newest := _newest(view, run)) is not None
     ]
-    found = tuple(
-        _sighting(view, search.condition, matches, newest, scope=scope, frame_id=shown.frame_id)
-        for matches, newest in wanted
+    sightings = tuple(
+        _sighting(view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id)
+        for run, newest in wanted
     )
     if fields:
-        found = _with_fields(view, found, [newest for _, newest in wanted], fields)
-    total = None if collected.cut else collected.count
-    return _Rows(total, searched, not collected.selected, sightings=found)
+        sightings = _with_fields(view, sightings, [newest for _, newest in wanted], fields)
+    return _Rows(None if is_cut else len(found.runs), searched, not runs, sightings=sightings)
 
 
 def read_sightings(
@@ -304,229 +276,30 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     if says_episodes(view, topics):
         return episode_times(view, topics[0], condition, scope)
-    is_log = view.snapshot.timeline.is_log
-    if not scope.is_bounded:
-        search = ReverseSearch(view, pattern, condition)
-        runs = find_runs(view, search, scope.window, is_log, enough=None)
-        if runs.is_over:
-            view.bags.finish_within(_LEFT_TO_SAY_S)
-        spans = [(run.first, _until(view, run, scope)) for run in reversed(runs.runs)]
-        return spans, spans[0][0] if runs.is_over else None
-    found = _Sightings(MAX_COUNTED, is_log, oldest_first=True)
-    _collect(view, ReverseSearch(view, pattern, condition), scope, found)
-    if found.count > MAX_COUNTED:
-        view.notes.add(f"only the first {MAX_COUNTED} of {found.count} sightings are counted")
-    spans = [(each.first, _until(view, each, scope)) for each in found.selected]
-    return spans, spans[0][0] if found.cut and spans else None
+    found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
+    if found.is_over:
+        view.bags.finish_within(_LEFT_TO_SAY_S)
+    spans = [(run.first, _until(view, run, scope)) for run in reversed(found.runs)]
+    return spans, spans[0][0] if found.is_over else None
 
 
-def _collect(view: View, search: ReverseSearch, scope: Scope, found: _Sightings) -> None:
-    """Collects the matches in a window, newest first, until there are enough.
-
-    Raises:
-        InvalidArgumentsError: no value of the topics can meet the condition.
-        NoDataError: none of the topics' messages can be decoded.
-        QueryTimeoutError: the call's time is over before the first match was found.
-    """
-    window = scope.window
-    candidates = search.candidates(window.stop)
-    before = window.stop
-    try:
-        parts = _parts(candidates.windows(), window)
-        for part, topics in scope.narrowed(parts):
-            found.end_silent(part.stop)
-            _end_in_gap(view, found, TimeWindow(part.stop, max(before, part.stop)))
-            # Only topics that can begin or end a sighting are read: there may be thousands.
-            relevant = sorted({*topics, *found.open_topics()})
-            found.newer.clear()
-            for each in tested(view, search, relevant, part):
-                before = each.time
-                found.end_silent(each.time)
-                # Where the scope does not hold, a match counts as no match.
-                if each.met and scope.holds_at(each.time):
-                    found.add(each)
-                elif each.met is None:
-                    found.skip(each)
-                else:
-                    found.end(each.topic)
-                    found.newer[each.topic] = each.time
-                if found.enough:
-                    _stop(search, found)
-                    return
-            before = part.start
-    except QueryTimeoutError:
-        if not found.count:
-            raise
-        found.cut = True
-        _note_out_of_time(view, before)
-        return
-    for topic in found.open_topics():
-        found.end(topic)
-    if found.enough:
-        _stop(search, found)
-    else:
-        # What lies outside of a scope is not read, and may well be decodable.
-        candidates.ruled_out |= scope.is_bounded
-        search.close(candidates, window, found=bool(found.count))
-
-
-def _note_out_of_time(view: View, reached: Ns) -> None:
-    view.notes.complete = False
-    view.notes.add(
-        f"the search ran out of time at {unix_text(reached)}: to continue, pass that time as end"
-    )
-
-
-def _end_in_gap(view: View, found: _Sightings, gap: TimeWindow) -> None:
-    """Ends the sightings of topics that have a message in a time without a match."""
-    for topic in found.open_topics():
-        if _has_messages(view, topic, gap):
-            found.end(topic)
-
-
-def _stop(search: ReverseSearch, found: _Sightings) -> None:
-    """Ends a search that has enough."""
-    found.cut = True
-    search.note_undecodable(found.selected[-1].first)
-
-
-class _Sightings:
-    """Collects matches that come newest first; selects the newest or the oldest sightings.
-
-    Args:
-        limit: how many are selected.
-        is_log: whether each message of a topic is a sighting of its own.
-        oldest_first: whether the oldest are selected.
-
-    Attributes:
-        count: how many sightings there are so far.
-        cut: whether the search ended before all was searched, or might have.
-        newer: log time of the earliest message of each topic so far that does not count, in the
-            part that is searched.
-    """
-
-    def __init__(self, limit: int, is_log: Callable[[str], bool], *, oldest_first: bool) -> None:
-        self._limit = limit
-        self._is_log = is_log
-        self._oldest_first = oldest_first
-        self._kept: deque[_Matches] = deque(maxlen=limit if oldest_first else None)
-        self._open: OrderedDict[str, _Matches] = OrderedDict()  # least recently matched first
-        self.count = 0
-        self.cut = False
-        self.newer: dict[str, Ns] = {}
-
-    def add(self, found: Tested) -> None:
-        """Adds the next older match; call `end_silent` with its time before."""
-        topic, time = found.topic, found.time
-        matches = self._open.get(topic)
-        if matches is None:
-            until = self.newer.get(topic)
-            matches = _Matches(topic, time, time, time, until=until)
-            self._open[topic] = matches
-            self._kept.append(matches)
-            self.count += 1
-            if self._is_log(topic):
-                self.end(topic)
-        else:
-            matches.first = matches.reach = time
-            matches.messages += 1
-            self._open.move_to_end(topic)
-
-    def take(self, found: Found, view: View) -> None:
-        """Takes runs of matches in place of single ones."""
-        self.cut = found.searched_to is not None
-        self.count = len(found.runs)
-        self._kept.extend(
-            _Matches(run.topic, run.last, run.first, run.first, run.messages, run.begun, run.until)
-            for run in found.runs
-        )
-        if found.is_over:
-            view.bags.finish_within(_LEFT_TO_SAY_S)
-            _note_out_of_time(view, found.searched_to or MIN_NS)
-
-    def skip(self, found: Tested) -> None:
-        """Adds a message that cannot be decoded: no match, but it ends no sighting either."""
-        matches = self._open.get(found.topic)
-        if matches is not None:
-            matches.reach = found.time
-            self._open.move_to_end(found.topic)
-
-    def end_silent(self, until: Ns) -> None:
-        """Ends the sightings to which no message before a moment can belong."""
-        while self._open:
-            matches = next(iter(self._open.values()))
-            if matches.reach - until <= SILENCE_NS:
-                return
-            self.end(matches.topic)
-
-    def end(self, topic: str) -> None:
-        """Ends the sighting of a topic: its next match begins another one."""
-        matches = self._open.pop(topic, None)
-        if matches is not None:
-            matches.begun = True
-
-    def open_topics(self) -> tuple[str, ...]:
-        """Returns the topics whose sighting may have begun earlier."""
-        return tuple(self._open)
-
-    @property
-    def selected(self) -> list[_Matches]:
-        """As many sightings as were asked for, in the order that was asked for."""
-        if self._oldest_first:
-            return [*reversed(self._kept)]
-        return [*islice(self._kept, self._limit)]
-
-    @property
-    def enough(self) -> bool:
-        """Whether no older match can change the sightings that are selected."""
-        return (
-            not self._oldest_first
-            and self.count > self._limit
-            and all(matches.begun for matches in self.selected)
-        )
-
-
-def _parts(
-    windows: Iterator[Candidate], window: TimeWindow
-) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
-    """Yields the parts of a window in which topics can have matches, and these, newest first."""
-    for each in windows:
-        if each.window.stop <= window.start:
-            return
-        part = each.window.intersect(window)
-        if not part.empty:
-            yield part, each.topics
-
-
-def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
-    """Whether a topic has a message in a time; by the index where that is enough."""
-    if gap.empty:
-        return False
-    held = view.stream.overlapping_bags([topic], gap)
-    is_alone = len({each.bag.recording for each in held}) == 1
-    counts = is_alone and not view.stream.may_be_relatched([topic])
-    if counts and any(gap.contains(each.first) or gap.contains(each.last) for each in held):
-        return True
-    return bool(held) and view.stream.first([topic], gap) is not None
-
-
-def _newest(view: View, matches: _Matches) -> StoredMessage | None:
+def _newest(view: View, run: Run) -> StoredMessage | None:
     """Returns the last match; None where its bag was deleted since."""
-    at = TimeWindow(matches.last, matches.last + 1)
-    return view.stream.first([matches.topic], at, newest_first=True)
+    at = TimeWindow(run.last, run.last + 1)
+    return view.stream.first([run.topic], at, newest_first=True)
 
 
-def _until(view: View, matches: _Matches | Run, scope: Scope) -> Ns:
+def _until(view: View, run: Run, scope: Scope) -> Ns:
     """Returns until when a state lasted: to the message that says otherwise, or the window's end.
 
     To its last match where a silence, or the end of a scope, is next; so does a log entry.
     """
-    last, until = matches.last, matches.until
-    if view.snapshot.timeline.is_log(matches.topic):
+    last, until = run.last, run.until
+    if view.snapshot.timeline.is_log(run.topic):
         return last
     if until is None:
         after = TimeWindow(last + 1, last + SILENCE_NS + 1)
-        found = view.stream.first([matches.topic], after)
+        found = view.stream.first([run.topic], after)
         until = last if found is None else found.time
     until = max(last, min(until, scope.window.asked()[1]))
     return until if until - last <= SILENCE_NS and scope.holds_at(until) else last
@@ -535,7 +308,7 @@ def _until(view: View, matches: _Matches | Run, scope: Scope) -> Ns:
 def _sighting(
     view: View,
     condition: Condition,
-    matches: _Matches,
+    run: Run,
     newest: StoredMessage,
     *,
     scope: Scope,
@@ -549,20 +322,18 @@ def _sighting(
     value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
     seen = detections_of(value, view.memory.extractor.frame(message))
     thing, labels = _matching(seen, condition), {each.label for each in seen}
-    robot_at_first = thing is None and matches.begun
-    at = matches.first if robot_at_first else newest.time
+    robot_at_first = thing is None and run.begun
+    at = run.first if robot_at_first else newest.time
     robot = robot_at(view, at, _recording_at(view, newest, at), frame_id)
     return Sighting(
-        topic=matches.topic,
-        first=matches.first,
-        last=matches.last,
-        until=_until(view, matches, scope) if thing is None else matches.last,
-        messages=matches.messages,
-        begun=matches.begun,
+        topic=run.topic,
+        first=run.first,
+        last=run.last,
+        until=_until(view, run, scope) if thing is None else run.last,
+        messages=run.messages,
+        begun=run.begun,
         robot=robot,
-        thing=_spot_of(
-            view, condition, newest, matches.first, robot, thing=thing, frame_id=frame_id
-        ),
+        thing=_spot_of(view, condition, newest, run.first, robot, thing=thing, frame_id=frame_id),
         matched=tuple(
             named(text) if text in labels else Quoted(text)
             for text in matched_texts(condition, value)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.stated import events_of, joined_stated, stated_by
-from ros2_memory.analysis.topic_events import TopicEvents, has_events, joined_events, state_of
+from ros2_memory.analysis.facts import has_events, joined_stated, state_of, stated_by
+from ros2_memory.analysis.topic_events import TopicEvents, events_of, joined_events
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import FragmentKey
@@ -19,14 +19,13 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import messages_of, scan
+from ros2_memory.history.scan import blocks, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.state_changes import Change
-    from ros2_memory.analysis.stated import Stated
-    from ros2_memory.analysis.topic_events import State
+    from ros2_memory.analysis.facts import State, Stated
+    from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
@@ -37,10 +36,14 @@ if TYPE_CHECKING:
 _UNDECODED: Final = Reason("could not be decoded, so their content is missing", "topic")
 
 
+def flag_name(topic: str, flag: KnownState | Change) -> str:
+    """Returns how a boolean of a topic is called."""
+    return topic if flag.name == "value" else f"{topic} {flag.name}"
+
+
 def toggled(topic: str, toggle: Change) -> str:
     """Returns a sentence for a boolean of a topic that toggled."""
-    name = topic if toggle.name == "value" else f"{topic} {toggle.name}"
-    return f"{name} became {'true' if toggle.value else 'false'}"
+    return f"{flag_name(topic, toggle)} became {'true' if toggle.value else 'false'}"
 
 
 def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
@@ -68,13 +71,8 @@ def events_back(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     columns = StatedColumns(view.memory.extractor)
-    together: list[Rows] = []
-    for rows in scan(view, topic, window, newest_first=True, reached=reached):
-        if together and rows.last < min(each.first for each in together):
-            yield from _events(view, columns, together, may_match)
-            together = []
-        together.append(rows)
-    if together:
+    scanned = scan(view, topic, window, newest_first=True, reached=reached)
+    for together in blocks(scanned, newest_first=True):
         yield from _events(view, columns, together, may_match)
 
 
@@ -182,10 +180,15 @@ def _state(view: View, found: StoredMessage) -> State | None:
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:
-    """Adds a note on events of a topic that are left out: too many, or undecodable."""
+    """Adds notes on events of a topic that are left out: too many, or undecodable."""
     if events.undecodable:
         messages = counted(events.undecodable, "message")
         view.notes.add(Note(_UNDECODED, f"{messages} of {topic}"))
+    note_left_out(view, topic, events)
+
+
+def note_left_out(view: View, topic: str, events: TopicEvents) -> None:
+    """Adds notes on events of a topic that are too many."""
     if events.left_out:
         view.notes.add(f"{topic} changes too often to list each change: {events.left_out} more")
     if events.beyond:

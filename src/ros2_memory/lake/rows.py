@@ -12,13 +12,14 @@ import math
 from collections import Counter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.frames import static_at
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut, empty_track, place_at
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.analysis.topic_events import MAX_PER_BAG, has_events
+from ros2_memory.analysis.topic_events import MAX_PER_BAG
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
@@ -241,7 +242,7 @@ class _BagRows:
         for topic, found in events.items():
             for seen in found.visible.intervals():
                 add(topic, "thing", seen.first, seen.label, last_ns=seen.last, value=seen.best)
-            for flip in found.toggles:
+            for flip in found.of_kind(FLAG)[1]:
                 add(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
             for error in found.errors:
                 add(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING
@@ -88,22 +88,15 @@ class Scope:
         """Whether messages in the window may not count."""
         return self._inside is not None or bool(self._states)
 
-    def narrowed(
-        self, parts: Iterable[tuple[TimeWindow, Sequence[str]]]
-    ) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
-        """Yields the parts of a search, newest first, without those in which nothing counts."""
-        for part, topics in parts:
-            if self._inside is None:
-                yield part, topics
-                continue
-            # Those that begin in the part or before, down to the last that ended before it: they
-            # are in order, and do not overlap.
-            first = bisect_left(self._inside, part.start, key=lambda each: each[1])
-            until = bisect_left(self._inside, part.stop, key=lambda each: each[0])
-            for start, stop in reversed(self._inside[first:until]):
-                cut = part.intersect(TimeWindow(start, stop + 1))
-                if not cut.empty:
-                    yield cut, topics
+    def narrowed(self) -> Iterator[TimeWindow]:
+        """Yields the parts of the window in which matches may count, newest first."""
+        if self._inside is None:
+            yield self.window
+            return
+        for start, stop in reversed(self._inside):
+            part = self.window.intersect(TimeWindow(start, stop + 1))
+            if not part.empty:
+                yield part
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether a match at a moment counts."""

@@ -1,26 +1,33 @@
 from __future__ import annotations
 
+import math
+from typing import TYPE_CHECKING
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis import topic_events
-from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.state_changes import Change, Held, StateLevel
-from ros2_memory.analysis.stated import events_of as events_of_stated
-from ros2_memory.analysis.stated import joined_stated, stated_by
-from ros2_memory.analysis.topic_events import (
-    EMPTY_STATE,
-    ReportedError,
+from ros2_memory.analysis.facts import (
+    ERROR,
+    FLAG,
+    LABEL,
+    REPORT,
+    STATUS,
     State,
-    TopicEvents,
-    joined_events,
-    state_of,
+    Word,
+    joined_stated,
+    stated_by,
 )
+from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import events_of as events_of_stated
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import Fragment
-from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S
+
+if TYPE_CHECKING:
+    from ros2_memory.analysis.facts import Fact
 
 Messages = list[tuple[int, State]]
 
@@ -32,27 +39,26 @@ def events_of(messages: Messages) -> TopicEvents | None:
 
 
 def seeing(*labels: str) -> State:
-    return State(labels) if labels else EMPTY_STATE
+    return State(tuple((Word(LABEL, label), math.nan) for label in labels))
 
 
 def each_second(*states: State) -> Messages:
     return [(nth * NS_PER_S, state) for nth, state in enumerate(states)]
 
 
-STATES = st.builds(
-    lambda labels, flags, faults, levels, reports: State(
-        tuple(sorted(labels)), flags, faults, levels=levels, reports=reports
-    ),
-    st.sets(st.sampled_from("abc")),
-    st.sampled_from([(), (("x", True),), (("x", False),), (("x", True), ("y", False))]),
-    st.sampled_from([(), ("hot",), ("cold",), ("hot", "cold")]),
-    st.lists(
-        st.builds(StateLevel, st.sampled_from("mn"), st.integers(0, 2)),
-        max_size=2,
-        unique_by=lambda level: level.name,
-    ).map(tuple),
-    st.sampled_from([(), ("late by 3 s",), ("late by 14 s",), ("no way",)]),
-).map(lambda state: EMPTY_STATE if state.is_empty else state)
+def some_of(*words: Word, values: tuple[float, ...] = (math.nan,)) -> st.SearchStrategy[list[Fact]]:
+    """Some facts, each of another name."""
+    fact = st.tuples(st.sampled_from(words), st.sampled_from(values))
+    return st.lists(fact, max_size=2, unique_by=lambda fact: fact[0].name)
+
+
+STATES = st.tuples(
+    some_of(*(Word(LABEL, label) for label in "abc")),
+    some_of(Word(FLAG, "x"), Word(FLAG, "y"), values=(0, 1)),
+    some_of(Word(ERROR, "hot"), Word(ERROR, "cold")),
+    some_of(Word(STATUS, "x"), Word(STATUS, "y", "hot"), values=(0, 1, 2)),
+    some_of(*(Word(REPORT, text) for text in ("late by 3 s", "late by 14 s", "no way"))),
+).map(lambda kinds: State(tuple(fact for facts in kinds for fact in facts)))
 
 
 @st.composite
@@ -73,14 +79,13 @@ def histories(draw: st.DrawFn) -> tuple[Messages, list[int]]:
 
 
 def _comparable(events: TopicEvents | None) -> object:
-    """Flips of several booleans at one time stand in no order."""
+    """Changes of several states at one time stand in no order."""
     assert events is not None
-    flips = sorted(events.toggles, key=lambda flip: (flip.time, flip.name))
+    changes = sorted(events.changes, key=lambda change: (change.time, change[:2]))
     known = sorted(events.known)
     seen = events.visible.intervals()
-    state = events.changes
-    levels = sorted(state.known), sorted(state.changes), state.reports, state.left_out
-    return (events.first, events.last, seen, known, flips, events.errors, events.left_out, levels)
+    said = events.errors, events.reports
+    return (events.first, events.last, seen, known, changes, said, events.left_out)
 
 
 def _glimpse(label: str, at: int) -> IntervalTable:
@@ -140,40 +145,20 @@ def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(
     parts = []
     for nth in range(15):
         at = nth * 100 * NS_PER_S
-        known = [Held(path, at, first=False, last=True) for path in ("x", "y")]
+        known = [KnownState(FLAG, path, at, 0, 1) for path in ("x", "y")]
         parts.append(
             TopicEvents(
                 at,
                 at + NS_PER_S,
                 visible=_glimpse(f"cup {nth}", at),
                 known=tuple(known),
-                toggles=tuple(Change(each.name, at + 1, True) for each in known),
-                errors=(ReportedError(f"error {nth}", at, at, 1),),
+                changes=tuple(Change(FLAG, each.name, at + 1, 1) for each in known),
+                errors=(Report(f"error {nth}", at, at, 1),),
             )
         )
     events = joined_events(parts)
     assert events is not None
-    assert events.visible.size == len(events.toggles) == len(events.errors) == 10
+    assert events.visible.size == len(events.changes) == len(events.errors) == 10
     assert events.visible.intervals()[0].label == "cup 0"
     flips = 2 * 15 + 2 * 14
     assert events.left_out == (15 - 10) + (flips - 10) + (15 - 10)
-
-
-def test_labels_booleans_and_errors_are_found_in_values() -> None:
-    assert state_of({"detections": [{"label": "cup"}, {"label": "cup"}]}, "x/msg/Y") == State(
-        ("cup",)
-    )
-    assert state_of({"value": True}, "std_msgs/msg/Bool").flags == (("value", True),)
-    assert state_of({"a": {"b": False, "list": [True]}}, "x/msg/Y").flags == (("a.b", False),)
-    log: dict[str, JsonValue] = {"level": 40, "name": "planner", "msg": "no path"}
-    assert state_of(log, "rcl_interfaces/msg/Log").errors == ("planner: no path",)
-    assert not state_of({**log, "level": 30}, "rcl_interfaces/msg/Log").errors
-    assert state_of({**log, "level": 20}, "rcl_interfaces/msg/Log") is EMPTY_STATE
-    status: list[JsonValue] = [
-        {"level": 0, "name": "lidar", "message": "fine"},
-        {"level": 2, "name": "motor", "message": "hot"},
-        {"level": 3, "name": "imu", "message": "stale"},
-    ]
-    found = state_of({"status": status}, "diagnostic_msgs/msg/DiagnosticArray")
-    assert found.errors == ("motor: hot",)
-    assert state_of({"value": 3.5}, "std_msgs/msg/Float64") is EMPTY_STATE

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.stated import stated_by
-from ros2_memory.analysis.topic_events import state_of
+from ros2_memory.analysis.facts import LABEL, state_of, stated_by
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.core.timebase import NS_PER_S
@@ -24,8 +23,7 @@ from tests.unit.columns.drawn_tables import drawn_tables, stored
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.analysis.stated import Facts
-    from ros2_memory.analysis.topic_events import State
+    from ros2_memory.analysis.facts import Facts, State, Word
     from ros2_memory.columns.table import Table
     from tests.unit.columns.drawn_tables import Drawn
 
@@ -43,12 +41,12 @@ SETTLED = (
 )
 
 
-def by_row(facts: Facts, rows: set[int]) -> set[tuple[int, str, str, float | None]]:
+def by_row(facts: Facts, rows: set[int]) -> set[tuple[int, Word, float]]:
     """Facts; of several scores of a label in a message the best one, to four digits."""
-    best: dict[tuple[int, str, str], float] = {}
+    best: dict[tuple[int, Word], float] = {}
     cells = zip(facts.rows.tolist(), facts.codes.tolist(), facts.values.tolist(), strict=True)
     for row, code, value in cells:
-        key = (row, *facts.words[code])
+        key = (row, facts.words[code])
         if row in rows:
             best[key] = max(best.get(key, -math.inf), -math.inf if math.isnan(value) else value)
     return {
@@ -69,8 +67,7 @@ def compared(table: Table, drawn: Drawn) -> int | None:
         return None
     to_read = found.to_read(None).tolist()
     rows = {*range(len(table))} - {*to_read}
-    for one, other in zip(found.stated.facts, expected.facts, strict=True):
-        assert by_row(one, rows) == by_row(other, rows)
+    assert by_row(found.stated.facts, rows) == by_row(expected.facts, rows)
     return len(to_read)
 
 
@@ -85,7 +82,8 @@ def test_columns_state_what_drawn_messages_state(drawn: Drawn) -> None:
 def test_nothing_is_read_where_columns_hold_what_matters(drawn: Drawn) -> None:
     read = compared(drawn.table, drawn)
     if read is None:  # an object without a name may hold detections
-        assert any(state.labels for state in states_of(drawn) if state is not None)
+        facts = [fact for state in states_of(drawn) if state is not None for fact in state.facts]
+        assert any(word.kind == LABEL for word, _ in facts)
     else:
         assert read == 0
 
@@ -119,5 +117,5 @@ def test_of_goals_only_messages_that_list_something_else_are_read(
     # Of those in a window the first, and what changes after it.
     assert found.to_read(np.array([1, 2, 3])).tolist() == [0, 1]
     assert found.to_read(np.array([3])).tolist() == [0]
-    assert not any(facts.rows.size for facts in found.stated.facts)
+    assert not found.stated.facts.rows.size
     assert np.array_equal(found.stated.times, table.log_times)

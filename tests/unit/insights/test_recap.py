@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.topic_events import MAX_FLAGS, MAX_LABELS
+from ros2_memory.analysis.facts import FLAG, LABEL, MOST
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -480,7 +480,7 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
     if recalls:
         memory = with_store(replace(memory), tmp_path)
     [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
-    more = 600 - MAX_FLAGS
+    more = 600 - MOST[FLAG]
     assert note == (
         f"/many has too many booleans or things in one message: {more} more are not followed"
     )
@@ -488,7 +488,7 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
 
 @each_way
 def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
-    labels = [f"thing {nth}" for nth in range(MAX_LABELS + 3)]
+    labels = [f"thing {nth}" for nth in range(MOST[LABEL] + 3)]
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
     memory = memory_of(tmp_path)
     if recalls:

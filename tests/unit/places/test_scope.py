@@ -77,6 +77,21 @@ def test_matches_count_while_another_topic_meets_a_condition(
     assert [(each.first - BEGIN) / S for each in (earlier, later)] == [0.5, 40.5]
 
 
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_matches_of_a_topic_with_two_types_count_whichever_came_last(
+    tmp_path: Path, recalls: bool
+) -> None:
+    flags = [boolean(BEGIN + second * S, True, topic="/mixed") for second in range(3)]
+    words = [text(BEGIN, "undocked", "/dock"), text(BEGIN + 5 * S, "cup", "/mixed")]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*flags, *words])
+    memory = with_store(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
+    undocked = WhileCondition("/dock", "contains", "undocked")
+    [found] = find_matches(
+        memory, Call(), "/mixed", "contains", "cup", during=(undocked,)
+    ).sightings
+    assert found.last == BEGIN + 5 * S
+
+
 def test_a_topic_that_was_never_recorded_bounds_nothing(tmp_path: Path) -> None:
     never = WhileCondition("/never", "equals", False)
     with pytest.raises(NoDataError, match="/never"):

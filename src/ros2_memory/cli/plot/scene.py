@@ -14,7 +14,7 @@ from ros2_memory.analysis.motion.trajectory import Waypoint
 from ros2_memory.cli.output import format_duration
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import without
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call
@@ -477,13 +477,8 @@ def topic_rows(asked: Scene) -> Iterator[TimelineRow]:
     busiest = sorted(messages, key=lambda topic: -messages[topic])[:MOST_TOPICS]
     joined = ns_from_unix(2 * asked.memory.limits.split_duration_s)
     for topic in sorted(busiest):
-        stretches: list[tuple[Ns, Ns]] = []
-        for _, first, last in timeline.extents(topic, asked.window):
-            if stretches and first - stretches[-1][1] <= joined:
-                stretches[-1] = (stretches[-1][0], max(last, stretches[-1][1]))
-            else:
-                stretches.append((first, last))
-        yield TimelineRow(topic, [*map(_unix, stretches)], _TOPIC)
+        extents = ((first, last) for _, first, last in timeline.extents(topic, asked.window))
+        yield TimelineRow(topic, [*map(_unix, united(extents, joined))], _TOPIC)
 
 
 def totals_line(found: Recap | None) -> str:

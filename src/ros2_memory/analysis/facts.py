@@ -1,0 +1,376 @@
+"""What messages state, as facts: of one message, and of many as columns.
+
+A fact is of a kind, is about a name, and has a value: an object in view (with its score), a boolean
+(0 or 1), the level of a diagnostic status, the status of a goal, how low a battery is, whether a
+velocity is commanded; or it is a sentence: an error, or a log entry of WARN and above. The same
+facts are read from whole tables in `columns.stated`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from itertools import chain
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ros2_memory.core.text import shortened
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.timebase import Ns
+
+    Ints: TypeAlias = "NDArray[np.int64]"
+    Floats: TypeAlias = "NDArray[np.float64]"
+
+LOG: Final = "rcl_interfaces/msg/Log"
+DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
+GOALS: Final = "action_msgs/msg/GoalStatusArray"
+BATTERY: Final = "sensor_msgs/msg/BatteryState"
+VELOCITIES: Final = frozenset({"geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"})
+
+LABEL: Final = "label"
+FLAG: Final = "flag"
+"""Named by its dot-path."""
+STATUS: Final = "status"
+GOAL: Final = "goal"
+"""Named by its id in hexadecimal digits."""
+CHARGE: Final = "charge"
+COMMAND: Final = "command"
+ERROR: Final = "error"
+REPORT: Final = "report"
+STATES: Final = frozenset({FLAG, STATUS, GOAL, CHARGE, COMMAND})
+"""Kinds whose values hold until another message says otherwise."""
+
+MOST: Final = {LABEL: 256, FLAG: 512, STATUS: 512, GOAL: 512}
+"""Facts of a kind in one message that are tracked; the rest is counted."""
+LOW_CHARGES: Final = (0.2, 0.1, 0.05)
+"""Fractions of a full battery; the value of its charge is how many of them it is below."""
+
+_PERCENT: Final = 100
+_WARN: Final = 30
+_ERROR: Final = 40
+_LOG_WORDS: Final = ((50, "fatal"), (_ERROR, "error"), (_WARN, "warning"))
+_ERROR_STATUS: Final = 2
+_STALE_STATUS: Final = 3
+_STILL: Final = 1e-3
+"""A commanded velocity (m/s, rad/s) below which it is zero: controllers publish -0.0 and 1e-17."""
+_MAX_CHARS: Final = 120
+_MAX_ERROR_CHARS: Final = 160
+_MEASUREMENT_PACKAGES: Final = ("geometry_msgs/", "nav_msgs/", "sensor_msgs/", "tf2_msgs/")
+"""Packages whose messages are measurements: they contain no events."""
+
+
+class Word(NamedTuple):
+    """What a fact is about; `text` describes its value."""
+
+    kind: str
+    name: str = ""
+    text: str = ""
+
+
+Fact: TypeAlias = tuple[Word, float]
+"""NaN is the value of a sentence, and of a label without a score."""
+
+
+class State(NamedTuple):
+    """The facts of one message, and how many more it has than are tracked."""
+
+    facts: tuple[Fact, ...] = ()
+    beyond: int = 0
+
+
+def has_events(type_name: str) -> bool:
+    """Returns whether messages of a type can contain events."""
+    return type_name == BATTERY or not type_name.startswith(_MEASUREMENT_PACKAGES)
+
+
+def has_errors(type_name: str) -> bool:
+    """Returns whether messages of a type can report errors."""
+    return type_name in {LOG, DIAGNOSTICS}
+
+
+def has_changes(type_name: str) -> bool:
+    """Returns whether messages of a type can show what changed, besides booleans."""
+    return type_name in _OF_TYPE
+
+
+def state_of(value: JsonValue, type_name: str) -> State:
+    """Returns what an extracted message of a type states."""
+    facts: Iterator[Fact] = iter(())
+    if type_name in _OF_TYPE:
+        facts = _OF_TYPE[type_name](value)
+    if has_events(type_name) and not has_errors(type_name):
+        facts = chain(facts, _labels(value), _flags(value, ""))
+    kept: list[Fact] = []
+    counts: Counter[str] = Counter()
+    for fact in facts:
+        kind = fact[0].kind
+        counts[kind] += 1
+        if counts[kind] <= MOST.get(kind, math.inf):
+            kept.append(fact)
+    return State(tuple(kept), counts.total() - len(kept))
+
+
+def charge_of(value: JsonValue) -> float | None:
+    """Returns how full the battery of an extracted message is, 0 to 1; None if it is not known.
+
+    That is where it is NaN or negative. Some drivers publish percent where the message asks for a
+    fraction.
+    """
+    charge = value.get("percentage") if isinstance(value, dict) else None
+    if not isinstance(charge, float) or not 0 <= charge <= _PERCENT:
+        return None
+    return charge / _PERCENT if charge > 1 else charge
+
+
+def charge_levels(charges: Floats) -> Ints:
+    """Returns below how many of `LOW_CHARGES` each charge is; -1 where it is not known."""
+    with np.errstate(invalid="ignore"):
+        part = np.where(charges > 1, charges / _PERCENT, charges)
+        levels = np.sum([part < least for least in LOW_CHARGES], axis=0, dtype=np.int64)
+        return np.where((charges >= 0) & (charges <= _PERCENT), levels, -1)
+
+
+def is_still(numbers: Floats, error: float = 0.0) -> NDArray[np.bool_]:
+    """Returns which numbers of a command are zero even if they are off by `error`."""
+    with np.errstate(invalid="ignore"):
+        return np.abs(numbers) + error < _STILL
+
+
+def _labels(value: JsonValue) -> Iterator[Fact]:
+    """Yields the labels of detections, in order, with the best score of each."""
+    best: dict[str, float] = {}
+    for each in detections_of(value):
+        score = math.nan if each.score is None else each.score
+        known = best.get(each.label, math.nan)
+        best[each.label] = score if math.isnan(known) or score > known else known
+    return ((Word(LABEL, label), score) for label, score in best.items())
+
+
+def _flags(value: JsonValue, path: str) -> Iterator[Fact]:
+    """Yields the booleans of an object and of nested objects; none of lists."""
+    if isinstance(value, bool):
+        yield Word(FLAG, path), value
+    elif isinstance(value, dict):
+        for name, inner in value.items():
+            yield from _flags(inner, f"{path}.{name}" if path else name)
+
+
+def _log_entry(value: JsonValue) -> Iterator[Fact]:
+    """Yields an entry as an error, and with how bad it is as a report."""
+    if not isinstance(value, dict):
+        return
+    level, name, message = value.get("level"), value.get("name"), value.get("msg")
+    if not isinstance(level, int) or level < _WARN:
+        return
+    if level >= _ERROR:
+        yield _error(name, message), math.nan
+    word = next(word for least, word in _LOG_WORDS if level >= least)
+    who = f"{word} of {name}" if isinstance(name, str) and name else word
+    text = f"{who}: {message}" if isinstance(message, str) else who
+    yield Word(REPORT, shortened(text, _MAX_CHARS)), math.nan
+
+
+def _diagnostics(value: JsonValue) -> Iterator[Fact]:
+    for each in _listed(value, "status"):
+        name, level, message = each.get("name"), each.get("level"), each.get("message")
+        if not isinstance(level, int):
+            continue
+        if isinstance(name, str):
+            text = message if level and isinstance(message, str) else ""
+            word = Word(STATUS, shortened(name, _MAX_CHARS), shortened(text, _MAX_CHARS))
+            yield word, level
+        if level >= _ERROR_STATUS and level != _STALE_STATUS:
+            yield _error(name, message), math.nan
+
+
+def _error(*parts: JsonValue) -> Word:
+    """Returns an error as a sentence: who reports it, and what."""
+    text = ": ".join(part for part in parts if isinstance(part, str) and part)
+    return Word(ERROR, shortened(text, _MAX_ERROR_CHARS))
+
+
+def _goals(value: JsonValue) -> Iterator[Fact]:
+    for each in _listed(value, "status_list"):
+        status, info = each.get("status"), each.get("goal_info")
+        goal_id = info.get("goal_id") if isinstance(info, dict) else None
+        uuid = goal_id.get("uuid") if isinstance(goal_id, dict) else None
+        if isinstance(status, int) and isinstance(uuid, list):
+            parts = (part for part in uuid if isinstance(part, int))
+            yield Word(GOAL, "".join(f"{part:02x}" for part in parts)), status
+
+
+def _listed(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
+    listed = value.get(key) if isinstance(value, dict) else None
+    for each in listed if isinstance(listed, list) else ():
+        if isinstance(each, dict):
+            yield each
+
+
+def _charge(value: JsonValue) -> Iterator[Fact]:
+    charge = charge_of(value)
+    if charge is not None:
+        yield Word(CHARGE), sum(charge < least for least in LOW_CHARGES)
+
+
+def _command(value: JsonValue) -> Iterator[Fact]:
+    yield Word(COMMAND), not all(abs(number) < _STILL for number in _floats(value))
+
+
+def _floats(value: JsonValue) -> Iterator[float]:
+    """Yields the floats of a value; what is no number counts as one that is not zero."""
+    if isinstance(value, dict):
+        for inner in value.values():
+            yield from _floats(inner)
+    elif isinstance(value, float):
+        yield value
+    elif value is None:
+        yield math.nan
+
+
+_OF_TYPE: Final = {
+    LOG: _log_entry,
+    DIAGNOSTICS: _diagnostics,
+    GOALS: _goals,
+    BATTERY: _charge,
+    **dict.fromkeys(VELOCITIES, _command),
+}
+
+
+class Facts(NamedTuple):
+    """Facts of many messages, by message, and in a message in its order.
+
+    Attributes:
+        rows: the message of each, ascending.
+        codes: what it is about, by the place in `words`.
+        values: see `Fact`.
+        words: each once.
+    """
+
+    rows: Ints
+    codes: Ints
+    values: Floats
+    words: Sequence[Word]
+
+    @classmethod
+    def of(cls, found: Sequence[tuple[int, Fact]]) -> Facts:
+        """Returns facts, each given with its row."""
+        known: dict[Word, int] = {}
+        return cls(
+            np.array([row for row, _ in found], np.int64),
+            np.array([known.setdefault(word, len(known)) for _, (word, _) in found], np.int64),
+            np.array([value for _, (_, value) in found], np.float64),
+            tuple(known),
+        )
+
+    def of_kinds(self, kinds: Collection[str]) -> Facts:
+        """Returns those of some kinds."""
+        wanted = np.array([word.kind in kinds for word in self.words], np.bool_)
+        return self if wanted.all() else self._chosen(wanted[self.codes])
+
+    def at(self, rows: Ints) -> Facts:
+        """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
+        place = np.searchsorted(rows, self.rows)
+        kept = place < rows.size
+        kept[kept] = rows[place[kept]] == self.rows[kept]
+        return self._replace(rows=place)._chosen(kept)
+
+    def _chosen(self, kept: NDArray[np.bool_]) -> Facts:
+        return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)
+
+
+NOTHING: Final = Facts.of(())
+
+
+def joined_facts(parts: Sequence[Facts]) -> Facts:
+    """Returns the facts of all parts, by their messages."""
+    parts = [part for part in parts if part.rows.size]
+    if len(parts) <= 1:
+        return parts[0] if parts else NOTHING
+    known: dict[Word, int] = {}
+    codes = []
+    for part in parts:
+        new = [known.setdefault(word, len(known)) for word in part.words]
+        codes.append(np.array(new, np.int64)[part.codes])
+    rows = np.concatenate([part.rows for part in parts])
+    order = np.argsort(rows, kind="stable")
+    values = np.concatenate([part.values for part in parts])
+    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(known))
+
+
+class Stated(NamedTuple):
+    """What messages of a topic state, in the order of their log times.
+
+    Attributes:
+        times: log times of the messages that can be decoded.
+        facts: of these.
+        undecodable: log times of the others.
+        beyond: facts of one message that are not tracked, at most.
+    """
+
+    times: Ints
+    facts: Facts = NOTHING
+    undecodable: Ints = np.empty(0, np.int64)
+    beyond: int = 0
+
+    def at(self, rows: Ints) -> Stated:
+        """Returns what some of the messages that can be decoded state."""
+        return self._replace(times=self.times[rows], facts=self.facts.at(rows))
+
+    def unchanging(self, first: Ns, last: Ns) -> Stated | None:
+        """Returns the same by two messages, without looking at times, where all state the same.
+
+        None where some message states something else than the first.
+        """
+        facts = self.facts
+        is_told_twice = len({word[:2] for word in facts.words}) < len(facts.words)
+        if is_told_twice or facts.of_kinds(STATES).rows.size < facts.rows.size:
+            return None
+        order = np.argsort(facts.codes, kind="stable")
+        is_first = np.diff(facts.codes[order], prepend=-1) != 0
+        changes = (np.diff(facts.values[order], prepend=0.0) != 0) & ~is_first
+        if changes.any() or facts.rows[order][is_first].any():
+            return None
+        times = np.array([first, last], np.int64)
+        return self._replace(times=times, facts=facts.at(np.zeros(1, np.int64)))
+
+
+def stated_by(times: Sequence[Ns], states: Sequence[State | None]) -> Stated:
+    """Returns what messages state, one by one; None is one that cannot be decoded."""
+    known = [state for state in states if state is not None]
+    decoded = np.array([state is not None for state in states], np.bool_)
+    all_times = np.array(times, np.int64)
+    return Stated(
+        all_times[decoded],
+        Facts.of([(row, fact) for row, state in enumerate(known) for fact in state.facts]),
+        all_times[~decoded],
+        max((state.beyond for state in known), default=0),
+    )
+
+
+def joined_stated(parts: Sequence[Stated]) -> Stated:
+    """Returns what the messages of all parts state, which may overlap in time."""
+    if len(parts) == 1:
+        return parts[0]
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    place = np.empty(order.size, np.int64)
+    place[order] = np.arange(order.size)
+    begins = np.cumsum([0, *(part.times.size for part in parts)]).tolist()
+    moved = [
+        part.facts._replace(rows=place[begin + part.facts.rows])
+        for begin, part in zip(begins, parts, strict=False)
+    ]
+    return Stated(
+        times[order],
+        joined_facts(moved),
+        np.sort(np.concatenate([part.undecodable for part in parts])),
+        max(part.beyond for part in parts),
+    )

@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.facts import (
+    BATTERY,
+    CHARGE,
+    COMMAND,
+    DIAGNOSTICS,
+    ERROR,
+    FLAG,
+    GOAL,
+    GOALS,
+    LABEL,
+    LOG,
+    REPORT,
+    STATUS,
+    Word,
+    charge_levels,
+    charge_of,
+    is_still,
+    state_of,
+)
+from ros2_memory.core.model import JsonValue
+
+TWIST = "geometry_msgs/msg/Twist"
+
+
+def stated(value: JsonValue, type_name: str) -> dict[Word, float]:
+    """The facts of a message, without the NaN of those that have no value."""
+    facts = state_of(value, type_name).facts
+    return {word: 0 if math.isnan(value) else value for word, value in facts}
+
+
+def test_labels_and_booleans_are_found_in_values() -> None:
+    cups: JsonValue = {
+        "detections": [
+            {"label": "cup"},
+            {"label": "cup", "score": 0.5},
+            {"label": "cup", "score": 0.7},
+            {"label": "cup", "score": 0.6},
+        ]
+    }
+    assert stated(cups, "x/msg/Y") == {Word(LABEL, "cup"): 0.7}
+    assert stated({"value": True}, "std_msgs/msg/Bool") == {Word(FLAG, "value"): 1}
+    assert stated({"a": {"b": False, "list": [True]}}, "x/msg/Y") == {Word(FLAG, "a.b"): 0}
+    assert stated({"value": 3.5}, "std_msgs/msg/Float64") == {}
+
+
+def test_log_entries_are_reports_from_warnings_on_and_errors_above() -> None:
+    log: dict[str, JsonValue] = {"name": "planner", "msg": "no path"}
+    warning = Word(REPORT, "warning of planner: no path")
+    assert stated({**log, "level": 20}, LOG) == {}
+    assert stated({**log, "level": 30}, LOG) == {warning: 0}
+    assert stated({**log, "level": 40}, LOG) == {
+        Word(ERROR, "planner: no path"): 0,
+        Word(REPORT, "error of planner: no path"): 0,
+    }
+
+
+def test_statuses_and_goals_have_a_value_each() -> None:
+    status: JsonValue = {
+        "status": [
+            {"name": "motor", "level": 1, "message": "hot"},
+            {"name": "camera", "level": 0, "message": "30 frames/s"},
+            {"name": "arm", "level": 2, "message": "stuck"},
+            {"name": "imu", "level": 3, "message": "stale"},
+            {"name": 5, "level": 0},
+            "none",
+        ]
+    }
+    assert stated(status, DIAGNOSTICS) == {
+        Word(STATUS, "motor", "hot"): 1,
+        Word(STATUS, "camera"): 0,
+        Word(STATUS, "arm", "stuck"): 2,
+        Word(ERROR, "arm: stuck"): 0,
+        Word(STATUS, "imu", "stale"): 3,
+    }
+    goal: JsonValue = {"goal_info": {"goal_id": {"uuid": [0, 255]}}, "status": 2}
+    listed: JsonValue = {"status_list": [goal, {"status": 1}, None]}
+    assert stated(listed, GOALS) == {Word(GOAL, "00ff"): 2}
+    assert stated(None, DIAGNOSTICS) == stated(7, GOALS) == {}
+
+
+def test_statuses_that_are_too_many_to_track_are_counted() -> None:
+    status: JsonValue = {"status": [{"name": f"{nth}", "level": 0} for nth in range(515)]}
+    found = state_of(status, DIAGNOSTICS)
+    assert (len(found.facts), found.beyond) == (512, 3)
+
+
+@pytest.mark.parametrize("charge", [math.nan, -1.0, 101.0, math.inf, None, "full", True])
+def test_a_charge_that_is_not_known_is_no_fact(charge: JsonValue) -> None:
+    assert charge_of({"percentage": charge}) is None
+    assert Word(CHARGE) not in stated({"percentage": charge}, BATTERY)
+
+
+numbers = st.sampled_from([0.0, -0.0, 1e-5, 0.04, 0.15, 0.3, 1.0, 80.0, -2.0, math.nan, math.inf])
+
+
+@given(st.lists(numbers, max_size=8))
+def test_values_of_columns_are_those_of_the_messages(rows: list[float]) -> None:
+    column = np.array(rows, np.float64)
+    charges = [stated({"percentage": number}, BATTERY).get(Word(CHARGE), -1) for number in rows]
+    assert charge_levels(column).tolist() == charges
+    commands = [stated({"linear": {"x": number}}, TWIST)[Word(COMMAND)] for number in rows]
+    assert (~is_still(column)).tolist() == commands
