@@ -13,8 +13,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
+from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
-from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,

@@ -1,36 +1,42 @@
-"""The frames of a stretch of time: where each is in a target frame, at many times at once.
+"""Where frames are in a target frame, at many times at once: tf2's rules over recorded transforms.
 
-By the rules of `transform_tree`, over the transforms of one session as arrays. Where a frame has no
-transform for longer than tf2 remembers, the last one before and the first one after are valid for
-`HOLD_NS`: localisers date transforms up to a second ahead, and a robot's last second is no secret.
+As in tf2 (`buffer_core.cpp`, `time_cache.cpp`, `static_cache.cpp` of ros2/geometry2):
 
-Chains whose frames keep one parent each, as nearly all do, are computed as arrays; any other is
-looked up time by time.
+- A child has one history, whatever its parents. At a message's own time that message is used;
+  between two messages the transform is interpolated, unless they name different parents: then
+  the earlier one is valid until the later. Of two messages for one time the later received is used.
+- Nothing is extrapolated. tf2 forgets after 10 s, so it never interpolates across more; neither
+  does this (`TF_CACHE_NS`).
+- A leading slash of a frame name is dropped; a transform from a frame to itself or with an empty
+  name is left out.
+
+Different from tf2, because a memory holds more than one run of a robot: a static transform is valid
+until the next one of its child, the first of them also before; a child that is published both ways
+is dynamic wherever its dynamic messages reach, static elsewhere (tf2 keeps the kind received last);
+and a time that went through a float of seconds is granted the slack of `timebase`.
 """
 
 from __future__ import annotations
 
+import difflib
 from collections import defaultdict
-from dataclasses import dataclass, replace
-from itertools import pairwise
-from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from dataclasses import dataclass
+from functools import reduce
+from itertools import takewhile
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.transform_tree import AGREEMENT_NS, TF_CACHE_NS, FrameGraph, TfClock
-from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.geometry import IDENTITY, alike, multiply, normalised
-from ros2_memory.core.model import StampedTransform, Transform
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.geometry import multiply, rotate, slerp
+from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
+from ros2_memory.core.text import listed
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
-    from typing import Literal
 
     from numpy.typing import NDArray
-
-    from ros2_memory.core.model import Quaternion, Vector3
 
 Times: TypeAlias = "NDArray[np.int64]"
 Floats: TypeAlias = "NDArray[np.float64]"
@@ -38,10 +44,29 @@ Mask: TypeAlias = "NDArray[np.bool_]"
 Vectors: TypeAlias = "tuple[Floats, Floats, Floats]"
 Rotations: TypeAlias = "tuple[Floats, Floats, Floats, Floats]"
 
-HOLD_NS: Final[Ns] = 2 * NS_PER_S
-"""How long a transform of a frame is valid beyond the times between which it is known."""
+TfClock: TypeAlias = Literal["stamp", "log"]
+"""Which of a transform's two times is used: its header stamp, or when it was recorded."""
 
-_PARALLEL_COSINE: Final = 1 - 1e-10
+ClockOfTransforms: TypeAlias = Literal["auto", "stamp", "log"]
+"""Which of the two is asked for; `auto`: as `agreeing_clock` finds."""
+
+TF_CACHE_NS: Final[Ns] = 10 * NS_PER_S
+"""tf2's default buffer length: messages farther apart are never interpolated."""
+
+AGREEMENT_NS: Final[Ns] = 2 * NS_PER_S
+"""How far stamps may be from log times and still be of the same clock.
+
+Localisers date their transforms up to a second ahead (`transform_tolerance`); transports add some
+tenths. Simulated and replayed clocks are off by far more.
+"""
+
+HOLD_NS: Final[Ns] = 2 * NS_PER_S
+"""How long tracks take a transform as valid beyond the times between which it is known.
+
+Localisers date transforms up to a second ahead, and a robot's last second is no secret.
+"""
+
+_MAX_NAMES: Final = 12
 
 
 class Poses(NamedTuple):
@@ -53,7 +78,15 @@ class Poses(NamedTuple):
 
     def points(self, points: Vectors) -> Vectors:
         """Returns points (m) of the frame, one for each time, in the other frame."""
-        return _add(_rotate(self.rotation, points), self.translation)
+        x, y, z = rotate(self.rotation, points)
+        dx, dy, dz = self.translation
+        return x + dx, y + dy, z + dz
+
+    def at(self, nth: int | tuple[()] = ()) -> Transform:
+        """Returns the pose at one of the times; of an array without dimensions at the only one."""
+        x, y, z = (float(part[nth]) for part in self.translation)
+        qx, qy, qz, qw = (float(part[nth]) for part in self.rotation)
+        return Transform((x, y, z), (qx, qy, qz, qw))
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,12 +107,33 @@ class Edge:
 
     @classmethod
     def of(cls, transforms: Sequence[StampedTransform]) -> Edge:
-        """Returns transforms of one edge, of which there is at least one, as arrays."""
+        """Returns transforms, of which there is at least one, as arrays."""
         return cls(
             np.array([each.stamp for each in transforms], np.int64),
             np.array([each.log_time for each in transforms], np.int64),
             np.array([each.transform.translation for each in transforms], np.float64),
             np.array([each.transform.rotation for each in transforms], np.float64),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Edge]) -> Edge:
+        """Returns the transforms of some parts, of which there is at least one, in their order."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(
+            np.concatenate([each.stamps for each in parts]),
+            np.concatenate([each.log_times for each in parts]),
+            np.concatenate([each.translation for each in parts]),
+            np.concatenate([each.rotation for each in parts]),
+        )
+
+    def rows(self, index: Times | slice[int, int, None]) -> Edge:
+        """Returns some of them."""
+        return Edge(
+            self.stamps[index],
+            self.log_times[index],
+            self.translation[index],
+            self.rotation[index],
         )
 
 
@@ -92,57 +146,130 @@ def edges_of(transforms: Iterable[StampedTransform]) -> dict[tuple[str, str], Ed
     found: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
     for one in transforms:
         found[one.parent.lstrip("/"), one.child.lstrip("/")].append(one)
-    return {pair: Edge.of(some) for pair, some in found.items() if all(pair) and pair[0] != pair[1]}
+    return {pair: Edge.of(some) for pair, some in found.items() if is_edge(pair)}
+
+
+def is_edge(pair: tuple[str, str]) -> bool:
+    """Whether tf2 takes a parent and a child for an edge of the tree."""
+    parent, child = (name.lstrip("/") for name in pair)
+    return bool(parent and child) and parent != child
 
 
 def joined_edges(parts: Sequence[Edges]) -> Edges:
     """Returns the transforms of several tables, each edge in the order of the tables."""
-    if len(parts) == 1:
-        return parts[0]
     found: dict[tuple[str, str], list[Edge]] = defaultdict(list)
     for part in parts:
         for pair, edge in part.items():
             found[pair].append(edge)
-    return {
-        pair: Edge(
-            np.concatenate([one.stamps for one in some]),
-            np.concatenate([one.log_times for one in some]),
-            np.concatenate([one.translation for one in some]),
-            np.concatenate([one.rotation for one in some]),
-        )
-        for pair, some in found.items()
-    }
+    return {pair: Edge.joined(some) for pair, some in found.items()}
 
 
-@dataclass(slots=True)
 class _History:
-    """The moving transforms of one child in its only parent, ascending, one for each time."""
+    """The transforms of one child: moving ones ascending, one for each time, then static ones.
 
-    times: Times
-    translation: Floats
-    rotation: Floats
-    static: Transform | None
+    Args:
+        child: its name.
+        moving: by parent.
+        static: in the order in which they were received.
+        clock: which time of the moving ones counts.
+    """
 
-    def at(self, times: Times) -> Poses:
-        """Returns the transforms at some times, by tf2's rules and with `HOLD_NS` at the ends."""
-        last = len(self.times) - 1
-        after = np.searchsorted(self.times, times, side="right")
-        before = np.clip(after - 1, 0, last)
-        after = np.clip(after, 0, last)
-        start, stop = self.times[before], self.times[after]
-        span = np.maximum(stop - start, 1)
-        ratio = np.where(start == stop, 0.0, (times - start) / span)
-        exact = start == times
-        inside = (after > before) & (stop - start <= TF_CACHE_NS)
-        near = np.abs(times - start) <= np.abs(stop - times)
-        held = np.minimum(np.abs(times - start), np.abs(stop - times)) <= HOLD_NS
-        ratio = np.where(exact | ~inside, np.where(near | exact, 0.0, 1.0), ratio)
-        a, b = self.translation[before], self.translation[after]
-        moved = a + (b - a) * ratio[:, None]
-        turned = _slerp(self.rotation[before], self.rotation[after], ratio)
-        valid = exact | inside | held
-        poses = Poses(_columns3(moved), _columns4(turned), valid)
-        return poses if self.static is None else _filled(poses, self.static)
+    def __init__(
+        self,
+        child: str,
+        moving: Mapping[str, Edge],
+        static: Sequence[StampedTransform],
+        clock: TfClock,
+    ) -> None:
+        self._child = child
+        names = [*moving, *(each.parent.lstrip("/") for each in static)]
+        counts = [*(len(edge.stamps) for edge in moving.values()), *(1 for _ in static)]
+        self.parents = list(dict.fromkeys(names))
+        every = Edge.joined([*moving.values(), *([Edge.of(static)] if static else [])])
+        count = len(every.stamps) - len(static)
+        times = (every.stamps if clock == "stamp" else every.log_times)[:count]
+        order = np.lexsort((every.log_times[:count], times))
+        # Of several for one time the last received counts.
+        is_last = np.ones(count, np.bool_)
+        is_last[:-1] = times[order[1:]] != times[order[:-1]]
+        order = order[is_last]
+        self._times = times[order]
+        self._since = every.log_times[count:] - AT_OR_BEFORE_SLACK_NS
+        rows = np.concatenate((order, np.arange(count, len(every.stamps))))
+        self._translation = every.translation[rows]
+        self._rotation = every.rotation[rows]
+        self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
+
+    def at(self, times: Times, hold_ns: Ns) -> Poses:
+        """Returns the transforms at some times; beyond those that are known, for so long."""
+        one, other, ratio, valid = self._rows(times, hold_ns)
+        x, y, z = self._translation[one].T
+        to_x, to_y, to_z = self._translation[other].T
+        moved = x + (to_x - x) * ratio, y + (to_y - y) * ratio, z + (to_z - z) * ratio
+        qx, qy, qz, qw = self._rotation[one].T
+        to_qx, to_qy, to_qz, to_qw = self._rotation[other].T
+        turned = slerp((qx, qy, qz, qw), (to_qx, to_qy, to_qz, to_qw), ratio)
+        return Poses(moved, turned, valid)
+
+    def parents_at(self, times: Times, hold_ns: Ns) -> Times:
+        """Returns which of the parents the child is in at some times, by their numbers."""
+        return self._parent[self._rows(times, hold_ns).one]
+
+    def newest_parent(self) -> str:
+        """Returns the parent where no time is given."""
+        return self.parents[int(self._parent[len(self._times) - 1])]
+
+    def nothing_at(self, time: Ns) -> NoDataError:
+        """Returns why no transform is valid at a time: `OUTSIDE_RANGE` or `GAP`."""
+        later = int(self._times.searchsorted(time, "right"))
+        nearest = min(max(later - 1, 0), len(self._times) - 1)
+        parent, times = self.parents[self._parent[nearest]], self._times.tolist()
+        if 0 < later < len(times):
+            before, after = times[later - 1], times[later]
+            return NoDataError(
+                NoDataReason.GAP,
+                f"no transform of '{self._child}' in '{parent}' at {_unix(time)}: the nearest are"
+                f" at {_unix(before)} ({_s(time - before)} before) and {_unix(after)}"
+                f" ({_s(after - time)} after), and a gap longer than {_s(TF_CACHE_NS)} is not"
+                " interpolated; ask for one of these two times",
+            )
+        first, last = times[0], times[-1]
+        off = f"{_s(first - time)} after" if time < first else f"{_s(time - last)} before"
+        span = f"only at {_unix(first)}" if first == last else f"{_unix(first)} to {_unix(last)}"
+        return NoDataError(
+            NoDataReason.OUTSIDE_RANGE,
+            f"no transform of '{self._child}' in '{parent}' at {_unix(time)}: around then it is"
+            f" recorded {span} (Unix seconds), {off} the time asked, and nothing is"
+            " extrapolated; ask for a time in that range",
+        )
+
+    def _rows(self, times: Times, hold_ns: Ns) -> _Rows:
+        count = len(self._times)
+        # The first static transform holds before it was received, too.
+        static = count - 1 + np.maximum(self._since.searchsorted(times, "right"), 1)
+        if not count:
+            return _Rows(static, static, 0.0 * static, static >= 0)
+        after = self._times.searchsorted(times, "right")
+        before, after = np.maximum(after - 1, 0), np.minimum(after, count - 1)
+        start, stop = self._times[before], self._times[after]
+        since, until = abs(times - start), abs(stop - times)
+        is_between = (after > before) & (stop - start <= TF_CACHE_NS)
+        valid = is_between | (np.minimum(since, until) <= hold_ns)
+        one = np.where(is_between | (since <= until), before, after)
+        is_mixed = is_between & (since > 0) & (self._parent[before] == self._parent[after])
+        ratio = is_mixed * since / np.maximum(stop - start, 1)
+        if len(self._since):
+            one, valid = np.where(valid, one, static), static >= 0
+        return _Rows(one, np.where(is_mixed, after, one), ratio, valid)
+
+
+class _Rows(NamedTuple):
+    """Which rows of a history are valid at some times: two, the other one with this weight."""
+
+    one: Times
+    other: Times
+    ratio: Floats
+    valid: Mask
 
 
 class Frames:
@@ -152,232 +279,198 @@ class Frames:
         static: its static transforms in log-time order; each holds until the next one of its child.
         moving: the moving ones, in the times that are asked about and around these.
         target: the frame in which the others are looked up.
-        clock: which time of the transforms counts; None: as `agreeing_clock` finds.
+        clock: which time of the moving ones counts; `auto`: as `agreeing_clock` finds.
+        hold_ns: how long a transform is valid beyond the times between which it is known.
 
     Attributes:
         target: the name of that frame.
-        clock: which time counts.
+        clock: which time counts, and which clock lookups are in.
     """
 
     def __init__(
         self,
-        static: Sequence[StampedTransform],
+        static: Iterable[StampedTransform],
         moving: Edges,
         target: str,
-        clock: TfClock | None = None,
+        clock: ClockOfTransforms = "auto",
+        hold_ns: Ns = HOLD_NS,
     ) -> None:
         self.target = target.lstrip("/")
-        moving = {pair: edge for pair, edge in moving.items() if all(pair)}
-        self.clock: TfClock = clock or _agreeing(moving.values())
-        self._changes = static_changes(static)
-        self._periods = [
-            _Period(static_at(static, since), moving, self.target, self.clock)
-            for since in (MIN_NS, *self._changes)
-        ]
+        self.clock: TfClock = agreeing_clock(moving) if clock == "auto" else clock
+        self._hold_ns = hold_ns
+        self._moving: defaultdict[str, dict[str, Edge]] = defaultdict(dict)
+        self._static: defaultdict[str, list[StampedTransform]] = defaultdict(list)
+        self._pairs = dict.fromkeys(filter(is_edge, moving))
+        for parent, child in self._pairs:
+            self._moving[child][parent] = moving[parent, child]
+        for each in static:
+            pair = each.parent.lstrip("/"), each.child.lstrip("/")
+            if is_edge(pair):
+                self._static[pair[1]].append(each)
+                self._pairs[pair] = None
+        self._histories: dict[str, _History] = {}
 
     def reaches(self, frame: str) -> bool:
         """Returns whether transforms connect a frame with the target, at whatever time."""
-        return any(period.reaches(frame.lstrip("/")) for period in self._periods)
-
-    def pose(self, frame: str, time: Ns) -> Transform | None:
-        """Returns the pose of a frame in the target at one time; None where it is not known."""
-        found = self.poses(frame, np.array([time], np.int64))
-        if found is None or not found.valid[0]:
-            return None
-        x, y, z = (float(part[0]) for part in found.translation)
-        qx, qy, qz, qw = (float(part[0]) for part in found.rotation)
-        return Transform((x, y, z), (qx, qy, qz, qw))
+        return frame.lstrip("/") in connected_with(self.target, self._pairs)
 
     def poses(self, frame: str, times: Times) -> Poses | None:
         """Returns the poses of a frame in the target at some times.
 
-        None where no transform connects them at any time.
+        Composed along the tree through their common ancestor, in either direction. None where no
+        transform connects them at any time.
         """
         name = frame.lstrip("/")
-        if not self._changes:
-            return self._periods[0].poses(name, times)
-        found: Poses | None = None
-        numbers = np.searchsorted(self._changes, times + AT_OR_BEFORE_SLACK_NS, side="right")
-        for number in np.unique(numbers).tolist():
-            then = np.flatnonzero(numbers == number)
-            part = self._periods[number].poses(name, times[then])
-            if part is None:
+        is_known = name == self.target or self.reaches(name)
+        return self._poses(name, times) if is_known else None
+
+    def lookup(self, frame: str, time: Ns) -> Transform:
+        """Returns the pose of a frame in the target at one time (tf2: source and target).
+
+        Raises:
+            NoDataError: `FRAME_UNKNOWN`, `FRAMES_NOT_CONNECTED`, `OUTSIDE_RANGE` or `GAP`.
+        """
+        name = frame.lstrip("/")
+        known = {name for pair in self._pairs for name in pair}
+        for one in (self.target, name):
+            if one not in known:
+                raise _unknown(one, sorted(known))
+        # Of damaged bags, times may be centuries apart: they wrap, and are not near.
+        with np.errstate(over="ignore"):
+            found = self._poses(name, np.array(time, np.int64))
+            if not found.valid:
+                raise self._nothing_at(name, time)
+        return found.at()
+
+    def _poses(self, name: str, times: Times) -> Poses:
+        found = _identity(times, valid=False)
+        waiting = [np.arange(times.size).reshape(times.shape)]
+        for rows in waiting:
+            then = times.ravel()[rows]
+            up, down = self._chain(name, then), self._chain(self.target, then)
+            common = next((frame for frame in up if frame in down), None)
+            if common is None:
+                waiting += self._apart(rows, then, (*up, *down))
                 continue
-            if found is None:
-                nowhere = _identity(len(times))
-                found = Poses(nowhere.translation, nowhere.rotation, ~nowhere.valid)
+            part = self._below(common, up, then)
+            if common != self.target:
+                part = _composed(_inverted(self._below(common, down, then)), part)
+            if rows.shape == times.shape:
+                return part
             for whole, some in zip(
-                (*found.translation, *found.rotation),
-                (*part.translation, *part.rotation),
+                (*found.translation, *found.rotation, found.valid),
+                (*part.translation, *part.rotation, part.valid),
                 strict=True,
             ):
-                whole[then] = some
-            found.valid[then] = part.valid
+                whole[rows] = some
         return found
 
-
-class _Period:
-    """Frames while no static transform changes."""
-
-    def __init__(
-        self, static: Sequence[StampedTransform], moving: Edges, target: str, clock: TfClock
-    ) -> None:
-        self.target = target
-        self._edges = moving
-        self._clock = clock
-        self._static = {
-            each.child.lstrip("/"): each for each in static if normalised(each.transform.rotation)
-        }
-        self._parents: dict[str, set[str]] = defaultdict(set)
-        for parent, child in self._edges:
-            self._parents[child].add(parent)
-        for child, each in self._static.items():
-            self._parents[child].add(each.parent.lstrip("/"))
-        self._histories: dict[str, _History | None] = {}
-        self._graph: FrameGraph | None = None
-
-    def reaches(self, frame: str) -> bool:
-        """Returns whether transforms connect a frame with the target, at whatever time."""
-        beside: dict[str, set[str]] = defaultdict(set)
-        for child, parents in self._parents.items():
-            for parent in parents:
-                beside[child].add(parent)
-                beside[parent].add(child)
-        reached, waiting = {self.target}, [self.target]
-        while waiting:
-            fresh = beside[waiting.pop()] - reached
-            reached |= fresh
-            waiting += fresh
-        return frame in reached
-
-    def poses(self, name: str, times: Times) -> Poses | None:
-        """Returns the poses of a frame at some times; None where nothing ever connects them."""
-        if name == self.target:
-            return _identity(len(times))
-        if not self.reaches(name):
-            return None
-        up, down = self._chain(name), self._chain(self.target)
-        if up is None or down is None:
-            return self._one_by_one(name, times)
-        common = next((each for each in up if each in set(down)), None)
-        if common is None:
-            return None
-        source = self._along(up[: up.index(common)], times)
-        target = self._along(down[: down.index(common)], times)
-        return _compose(_invert(target), source)
-
-    def _chain(self, frame: str) -> list[str] | None:
-        """Returns the frames from one up to its root; None where a frame has several parents."""
-        chain = [frame]
-        while parents := self._parents.get(chain[-1]):
-            [parent, *others] = parents
-            if others or parent in chain:
-                return None
-            chain.append(parent)
+    def _chain(self, frame: str, times: Times) -> dict[str, None]:
+        """Returns the frames from one upwards, as far as they are the same at some times."""
+        chain = {frame: None}
+        while len(parents := self._parents_at(frame, times)) == 1 and parents[0] not in chain:
+            [frame] = parents
+            chain[frame] = None
         return chain
 
-    def _along(self, chain: Sequence[str], times: Times) -> Poses:
-        """Returns the pose of the first frame of a chain in the parent of its last."""
-        poses = _identity(len(times))
-        for child in chain:
-            history = self._history(child)
-            edge = _held(self._static[child].transform, len(times)) if history is None else None
-            poses = _compose(history.at(times) if history else edge or poses, poses)
-        return poses
+    def _apart(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
+        """Returns rows of times apart in which the first frame that has several parents has one."""
+        for frame in frames:
+            if len(self._parents_at(frame, times)) > 1:
+                numbers = self._histories[frame].parents_at(times, self._hold_ns)
+                return [rows[numbers == number] for number in np.unique(numbers)]
+        return []
+
+    def _below(self, ancestor: str, chain: Iterable[str], times: Times) -> Poses:
+        """Returns the pose of the first frame of a chain in one of the frames above it."""
+        below = takewhile(lambda frame: frame != ancestor, chain)
+        steps = [self._histories[frame].at(times, self._hold_ns) for frame in below]
+        return reduce(_composed, reversed(steps)) if steps else _identity(times)
+
+    def _parents_at(self, child: str, times: Times) -> Sequence[str]:
+        """Returns the parents that a frame has at some times; none, if it is a root."""
+        history = self._history(child)
+        if history is None:
+            return ()
+        if len(history.parents) == 1:
+            return history.parents
+        return [history.parents[n] for n in np.unique(history.parents_at(times, self._hold_ns))]
 
     def _history(self, child: str) -> _History | None:
-        """Returns the moving transforms of a child; None where it is only static."""
-        if child not in self._histories:
-            [parent] = self._parents[child]
-            block = self._edges.get((parent, child))
-            static = self._static.get(child)
-            fixed = None if static is None else static.transform
-            self._histories[child] = None if block is None else _history(block, self._clock, fixed)
-        return self._histories[child]
+        """Returns the transforms of a frame in those above it; None, if it is a root."""
+        if child not in self._histories and (child in self._moving or child in self._static):
+            moving, static = self._moving.get(child, {}), self._static.get(child, ())
+            self._histories[child] = _History(child, moving, static, self.clock)
+        return self._histories.get(child)
 
-    def _one_by_one(self, frame: str, times: Times) -> Poses:
-        """Looks up each time by itself, as `transform_tree` does."""
-        if self._graph is None:
-            moving = [each for edge in self._edges.items() for each in _rows(*edge)]
-            held = _with_held_ends(moving, self._clock)
-            self._graph = FrameGraph([*self._static.values(), *held], self._clock)
-        rows: list[tuple[float, ...]] = []
-        valid: list[bool] = []
-        for time in times.tolist():
-            try:
-                found = self._graph.lookup(self.target, frame, time)
-            except NoDataError:
-                found = None
-            valid.append(found is not None)
-            pose = IDENTITY if found is None else found
-            rows.append((*pose.translation, *pose.rotation))
-        table = np.array(rows, np.float64).reshape(len(rows), 7)
-        return Poses(
-            _columns3(table[:, :3]), _columns4(table[:, 3:]), np.array(valid, dtype=np.bool_)
-        )
+    def _nothing_at(self, name: str, time: Ns) -> NoDataError:
+        """Returns why there is no transform at a time, though both frames are known."""
+        tree = connected_with(self.target, self._pairs)
+        if name in tree:
+            for frame in (name, self.target):
+                lacking = self._lacking(frame, time)
+                if lacking is not None:
+                    return lacking
+        roots = self._root_of(self.target), self._root_of(name)
+        if name in tree:
+            detail = (
+                f"frames '{self.target}' and '{name}' were not connected at {_unix(time)}, because"
+                f" the tree changes or contains a loop; the newest known roots are"
+                f" '{roots[0]}' and '{roots[1]}'; ask about another time"
+            )
+        else:
+            others = sorted(connected_with(name, self._pairs) - {name})
+            detail = (
+                f"frames '{self.target}' and '{name}' are not connected: '{self.target}' is in the"
+                f" tree of '{roots[0]}', '{name}' in that of '{roots[1]}', and no recorded"
+                f" transform joins them; connected to '{name}':"
+                f" {listed(others, at_most=_MAX_NAMES)}"
+            )
+        return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
+    def _lacking(self, frame: str, time: Ns) -> NoDataError | None:
+        """Returns why a walk from a frame up to its root ends at a time; None if it does not."""
+        at = np.array(time, np.int64)
+        for each in self._chain(frame, at):
+            history = self._history(each)
+            if history is not None and not history.at(at, self._hold_ns).valid:
+                return history.nothing_at(time)
+        return None
 
-def _history(block: Edge, clock: TfClock, static: Transform | None) -> _History:
-    times = block.stamps if clock == "stamp" else block.log_times
-    order = np.lexsort((np.arange(len(times)), block.log_times, times))
-    # Of several for one time the last received counts.
-    ordered = times[order]
-    last = np.append(ordered[1:] != ordered[:-1], [True])
-    chosen = order[last]
-    return _History(times[chosen], block.translation[chosen], block.rotation[chosen], static)
-
-
-def _rows(edge: tuple[str, str], block: Edge) -> Iterable[StampedTransform]:
-    """Yields the transforms of a block one by one."""
-    columns = (block.stamps, block.log_times, block.translation, block.rotation)
-    for stamp, log_time, (x, y, z), (qx, qy, qz, qw) in zip(
-        *(each.tolist() for each in columns), strict=True
-    ):
-        yield StampedTransform(
-            *edge, stamp, log_time, Transform((x, y, z), (qx, qy, qz, qw)), static=False
-        )
+    def _root_of(self, frame: str) -> str:
+        """Returns the newest known root above a frame; in a loop, the frame where it closes."""
+        seen: set[str] = set()
+        while frame not in seen and (history := self._history(frame)) is not None:
+            seen.add(frame)
+            frame = history.newest_parent()
+        return frame
 
 
-def _with_held_ends(rows: Sequence[StampedTransform], clock: TfClock) -> list[StampedTransform]:
-    """Returns transforms, those at each end and beside each gap repeated `HOLD_NS` beyond it."""
-    by_child: dict[str, list[StampedTransform]] = defaultdict(list)
-    for row in rows:
-        by_child[row.child].append(row)
-    time = attrgetter("stamp" if clock == "stamp" else "log_time")
-    held: list[StampedTransform] = []
-    for some in by_child.values():
-        some.sort(key=time)
-        ends = [(some[0], -HOLD_NS), (some[-1], HOLD_NS)]
-        for before, after in pairwise(some):
-            if time(after) - time(before) > TF_CACHE_NS:
-                ends += [(before, HOLD_NS), (after, -HOLD_NS)]
-        held += [
-            replace(end, stamp=end.stamp + off, log_time=end.log_time + off) for end, off in ends
-        ]
-    return [*rows, *held]
+def agreeing_clock(moving: Edges) -> TfClock:
+    """Returns `stamp` where header stamps of moving transforms agree with log time, else `log`.
 
-
-def _agreeing(blocks: Iterable[Edge]) -> Literal["stamp", "log"]:
-    """Returns the clock as `agreeing_clock` does."""
-    off = [np.abs(block.log_times - block.stamps) for block in blocks]
-    every = np.concatenate(off) if off else np.zeros(0, np.int64)
-    if not len(every):
+    They agree when the median distance between the two is within `AGREEMENT_NS`. Without any:
+    `stamp`.
+    """
+    if not moving:
         return "stamp"
-    middle = (len(every) - 1) // 2
-    return "stamp" if int(np.partition(every, middle)[middle]) <= AGREEMENT_NS else "log"
+    off = np.concatenate([np.abs(edge.log_times - edge.stamps) for edge in moving.values()])
+    middle = (len(off) - 1) // 2
+    return "stamp" if int(np.partition(off, middle)[middle]) <= AGREEMENT_NS else "log"
 
 
-def sorted_edges(edges: Edges) -> Edges:
-    """Returns transforms by log time, as those of bags come in the order of these."""
-    found: dict[tuple[str, str], Edge] = {}
-    for pair, edge in edges.items():
-        order = np.argsort(edge.log_times, kind="stable")
-        found[pair] = Edge(
-            edge.stamps[order],
-            edge.log_times[order],
-            edge.translation[order],
-            edge.rotation[order],
-        )
+def connected_with(frame: str, pairs: Iterable[tuple[str, str]]) -> set[str]:
+    """Returns the frames that pairs of a parent and a child lead to from one; itself, if any."""
+    beside: defaultdict[str, set[str]] = defaultdict(set)
+    for parent, child in pairs:
+        beside[parent].add(child)
+        beside[child].add(parent)
+    found: set[str] = set()
+    waiting = [frame]
+    while waiting:
+        fresh = beside[waiting.pop()] - found
+        found |= fresh
+        waiting += fresh
     return found
 
 
@@ -395,20 +488,10 @@ def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransfo
     return list(newest.values())
 
 
-def static_changes(static: Sequence[StampedTransform]) -> list[Ns]:
-    """Returns the log times at which a child's static transform differs from the one before."""
-    changes: dict[Ns, None] = {}
-    latest: dict[str, StampedTransform] = {}
-    for each in static:
-        child = each.child.lstrip("/")
-        before = latest.get(child)
-        if before is not None and not (
-            before.parent.lstrip("/") == each.parent.lstrip("/")
-            and alike(before.transform, each.transform)
-        ):
-            changes[each.log_time] = None
-        latest[child] = each
-    return [*changes]
+def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
+    """Returns, of static transforms in log-time order, those that hold in a window."""
+    received = (each for each in static if window.contains(each.log_time))
+    return [*static_at(static, window.start), *received]
 
 
 def unit_quaternions(rotations: Floats) -> Floats:
@@ -424,75 +507,45 @@ def unit_quaternions(rotations: Floats) -> Floats:
     return made
 
 
-def _slerp(a: Floats, b: Floats, ratio: Floats) -> Floats:
-    cosine = (a * b).sum(axis=1)
-    sign = np.where(cosine < 0, -1.0, 1.0)
-    cosine = np.minimum(cosine * sign, 1.0)
-    straight = cosine > _PARALLEL_COSINE
-    angle = np.arccos(np.where(straight, 0.0, cosine))
-    sine = np.where(straight, 1.0, np.sin(angle))
-    from_a = np.where(straight, 1 - ratio, np.sin((1 - ratio) * angle) / sine)
-    from_b = np.where(straight, ratio, np.sin(ratio * angle) / sine) * sign
-    mixed = a * from_a[:, None] + b * from_b[:, None]
-    made: Floats = mixed / np.sqrt((mixed * mixed).sum(axis=1))[:, None]
-    return made
+def _identity(times: Times, *, valid: bool = True) -> Poses:
+    x, y, z, qx, qy, qz = np.zeros((6, *times.shape))
+    return Poses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
 
 
-def _columns3(table: Floats) -> Vectors:
-    return table[:, 0], table[:, 1], table[:, 2]
-
-
-def _columns4(table: Floats) -> Rotations:
-    return table[:, 0], table[:, 1], table[:, 2], table[:, 3]
-
-
-def _identity(count: int) -> Poses:
-    return _held(IDENTITY, count)
-
-
-def _held(transform: Transform, count: int) -> Poses:
-    """Returns one transform at all of some times."""
-    vector: Vector3 = transform.translation
-    turn: Quaternion = normalised(transform.rotation) or (0.0, 0.0, 0.0, 1.0)
-    x, y, z = (np.full(count, each, np.float64) for each in vector)
-    qx, qy, qz, qw = (np.full(count, each, np.float64) for each in turn)
-    return Poses((x, y, z), (qx, qy, qz, qw), np.ones(count, np.bool_))
-
-
-def _filled(poses: Poses, static: Transform) -> Poses:
-    """Returns the poses with a static transform where they are not valid."""
-    held = _held(static, len(poses.valid))
-    x, y, z = (
-        np.where(poses.valid, *pair)
-        for pair in zip(poses.translation, held.translation, strict=True)
-    )
-    qx, qy, qz, qw = (
-        np.where(poses.valid, *pair) for pair in zip(poses.rotation, held.rotation, strict=True)
-    )
-    return Poses((x, y, z), (qx, qy, qz, qw), held.valid)
-
-
-def _rotate(q: Rotations, v: Vectors) -> Vectors:
-    x, y, z, w = q
-    vx, vy, vz = v
-    cx, cy, cz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return (
-        vx + w * cx + y * cz - z * cy,
-        vy + w * cy + z * cx - x * cz,
-        vz + w * cz + x * cy - y * cx,
-    )
-
-
-def _add(a: Vectors, b: Vectors) -> Vectors:
-    return a[0] + b[0], a[1] + b[1], a[2] + b[2]
-
-
-def _compose(a: Poses, b: Poses) -> Poses:
+def _composed(a: Poses, b: Poses) -> Poses:
     return Poses(a.points(b.translation), multiply(a.rotation, b.rotation), a.valid & b.valid)
 
 
-def _invert(poses: Poses) -> Poses:
+def _inverted(poses: Poses) -> Poses:
     x, y, z, w = poses.rotation
     back = (-x, -y, -z, w)
-    tx, ty, tz = _rotate(back, poses.translation)
+    tx, ty, tz = rotate(back, poses.translation)
     return Poses((-tx, -ty, -tz), back, poses.valid)
+
+
+def _unknown(name: str, known: Sequence[str]) -> NoDataError:
+    if not known:
+        detail = f"frame '{name}' is unknown: no transforms are recorded there"
+    elif similar := _similar(name, known):
+        detail = f"no transform names a frame '{name}'; similar: {listed(similar)}"
+    else:
+        names = listed(known, at_most=_MAX_NAMES)
+        detail = f"no transform names a frame '{name}'; there are: {names}"
+    return NoDataError(NoDataReason.FRAME_UNKNOWN, detail)
+
+
+def _similar(name: str, known: Sequence[str]) -> list[str]:
+    """Returns names that contain this one or are part of it, then those spelled alike."""
+    asked = name.casefold()
+    by_fold = {frame.casefold(): frame for frame in known}
+    parts = [frame for fold, frame in by_fold.items() if asked and (asked in fold or fold in asked)]
+    alike = difflib.get_close_matches(asked, list(by_fold), n=3, cutoff=0.6)
+    return list(dict.fromkeys([*parts[:3], *(by_fold[fold] for fold in alike)]))[:3]
+
+
+def _unix(moment: Ns) -> str:
+    return f"{unix_from_ns(moment):.6f}"
+
+
+def _s(duration: Ns) -> str:
+    return f"{unix_from_ns(duration):.3f} s"

@@ -1,4 +1,4 @@
-"""Rotations, rigid transforms and paths in plain floats.
+"""Rotations, rigid transforms and paths.
 
 Quaternions are (x, y, z, w) with Hamilton's product, and must be of unit length unless a function
 documents otherwise: `normalised` makes them so. A `Transform` is the pose of a child in its parent.
@@ -13,21 +13,19 @@ from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.model import Quaternion, Transform, Vector3
-
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ros2_memory.core.model import Quaternion, Transform, Vector3
+
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 N = TypeVar("N", float, "NDArray[np.float64]")
-
-IDENTITY: Final = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 GIMBAL_LOCK_SINE: Final = 1 - 1e-14
 """Beyond this sine of pitch, roll and yaw share one axis to within 1.5e-7 rad."""
 
 _PARALLEL_COSINE: Final = 1 - 1e-10
-"""Beyond this, slerp divides two tiny sines, and a lerp differs from it by less than 1e-14."""
+"""Beyond this, slerp would divide two tiny sines; an angle as if it were this moves it by 1e-15."""
 
 _MOST_LOPSIDED: Final = 64
 """How often, on average, a point may be looked at before intervals are halved instead."""
@@ -87,8 +85,8 @@ def multiply(a: tuple[N, N, N, N], b: tuple[N, N, N, N]) -> tuple[N, N, N, N]:
     )
 
 
-def rotate(q: Quaternion, v: Vector3) -> Vector3:
-    """Returns `v` rotated by `q`."""
+def rotate(q: tuple[N, N, N, N], v: tuple[N, N, N]) -> tuple[N, N, N]:
+    """Returns `v` rotated by `q`; of numbers, or of arrays of them."""
     x, y, z, w = q
     vx, vy, vz = v
     cx = 2 * (y * vz - z * vy)
@@ -108,46 +106,25 @@ def transform_point(t: Transform, point: Vector3) -> Vector3:
     return (x + dx, y + dy, z + dz)
 
 
-def compose(a: Transform, b: Transform) -> Transform:
-    """Returns the pose of b's child in a's parent."""
-    return Transform(transform_point(a, b.translation), multiply(a.rotation, b.rotation))
-
-
-def invert(t: Transform) -> Transform:
-    """Returns the pose of the parent in the child."""
-    qx, qy, qz, qw = t.rotation
-    back = (-qx, -qy, -qz, qw)
-    x, y, z = rotate(back, t.translation)
-    return Transform((-x, -y, -z), back)
-
-
 def alike(one: Transform, other: Transform) -> bool:
     """Returns whether two transforms differ by less than 1 um and 3 mrad."""
-    apart = compose(invert(one), other)
-    off = distance(apart.translation, (0.0, 0.0, 0.0))
-    return off < _SAME_M and abs(apart.rotation[3]) > 1 - _SAME_M
+    cosine = sum(p * q for p, q in zip(one.rotation, other.rotation, strict=True))
+    return distance(one.translation, other.translation) < _SAME_M and abs(cosine) > 1 - _SAME_M
 
 
-def slerp(a: Quaternion, b: Quaternion, ratio: float) -> Quaternion:
-    """Returns the rotation between `a` (ratio 0) and `b` (1), the shorter way, at even speed."""
-    cosine = sum(p * q for p, q in zip(a, b, strict=True))
-    sign = -1.0 if cosine < 0 else 1.0
-    cosine *= sign
-    if cosine > _PARALLEL_COSINE:
-        from_a, from_b = 1 - ratio, ratio * sign
-    else:
-        angle = math.acos(cosine)
-        from_a = math.sin((1 - ratio) * angle) / math.sin(angle)
-        from_b = math.sin(ratio * angle) / math.sin(angle) * sign
+def slerp(a: tuple[N, N, N, N], b: tuple[N, N, N, N], ratio: N) -> tuple[N, N, N, N]:
+    """Returns the rotation between `a` (ratio 0) and `b` (1), the shorter way, at even speed.
+
+    Of numbers, or of arrays of them.
+    """
+    cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+    angle = np.arccos(np.minimum(abs(cosine), _PARALLEL_COSINE))
+    sine = np.sin(angle)
+    from_a = np.sin((1 - ratio) * angle) / sine
+    from_b = np.copysign(np.sin(ratio * angle) / sine, cosine)
     x, y, z, w = (from_a * p + from_b * q for p, q in zip(a, b, strict=True))
-    length = math.sqrt(x * x + y * y + z * z + w * w)
+    length = np.sqrt(x * x + y * y + z * z + w * w)
     return (x / length, y / length, z / length, w / length)
-
-
-def interpolate(a: Transform, b: Transform, ratio: float) -> Transform:
-    """Returns the transform between `a` (ratio 0) and `b` (1) as tf2: linear, and `slerp`."""
-    x, y, z = (p + (q - p) * ratio for p, q in zip(a.translation, b.translation, strict=True))
-    return Transform((x, y, z), slerp(a.rotation, b.rotation, ratio))
 
 
 def distance(a: Vector3, b: Vector3) -> float:

@@ -234,6 +234,15 @@ class Transform:
 
 
 @dataclass(frozen=True, slots=True)
+class FrameEdge:
+    """A parent and child pair; `static` where no dynamic message names the pair."""
+
+    parent: str
+    child: str
+    static: bool
+
+
+@dataclass(frozen=True, slots=True)
 class StampedTransform:
     """One edge of the frame graph as published, with its header stamp and its log time."""
 

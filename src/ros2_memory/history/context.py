@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
+    from ros2_memory.analysis.frames import ClockOfTransforms
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader
 
-ClockOfTransforms = Literal["auto", "stamp", "log"]
 NowOfMemory = Literal["wall", "latest"]
 _LISTINGS: Final[Key[Listings]] = Key()
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.transform_tree import AGREEMENT_NS
+from ros2_memory.analysis.frames import AGREEMENT_NS
 from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.errors import UndecodableError

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.frames import static_at, static_changes
+import numpy as np
+
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     SLICE_NS,
@@ -38,10 +38,9 @@ from ros2_memory.history.no_data import (
 from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, slices_back
 from ros2_memory.history.robots import beside_path
 from ros2_memory.history.transforms import (
-    clock_of,
     decoded_transforms,
     edges,
-    graph_of,
+    frames_of,
     moving_in,
     sessions_of,
     static_transforms,
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
-    from ros2_memory.analysis.transform_tree import FrameGraph
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
@@ -362,7 +360,8 @@ def newest_of_body(
         for each in decoded_transforms(view, found):
             if each.child.lstrip("/") != body.child or (own and not sessions.has(own, found)):
                 continue
-            moment = each.stamp if clock_of(view, [each]) == "stamp" else each.log_time
+            clock = frames_of(view, (), [each], parent).clock
+            moment = each.stamp if clock == "stamp" else each.log_time
             by = found.bag.recording
             with suppress(NoDataError):  # as in `poses_of_body`
                 there = transform_at(view, parent, body.child, moment, by, explains=False).transform
@@ -392,28 +391,22 @@ def poses_of_body(
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions = sessions_of(view)
+    sessions, parent = sessions_of(view), frame_id or body.parent
     for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
         moving = moving_in(view, window, session)
-        static = static_transforms(view, session)
-        changes = static_changes(static)
-        graphs: dict[int, FrameGraph] = {}
+        frames = frames_of(view, static_transforms(view, session), moving, parent)
+        own = [each for each in moving if each.child.lstrip("/") == body.child]
+        own = [each for each in own if window.contains(each.log_time)]
+        moments = [each.stamp if frames.clock == "stamp" else each.log_time for each in own]
+        found = frames.poses(body.child, np.array(moments, np.int64))
+        if found is None:
+            continue
         last = MIN_NS
-        for each in moving:
-            at = each.log_time
-            is_due = window.contains(at) and at - last >= _STEP_NS
-            if not is_due or each.child.lstrip("/") != body.child:
-                continue
-            number = bisect_right(changes, at)
-            if number not in graphs:
-                valid_then = static_at(static, changes[number - 1] if number else MIN_NS)
-                graphs[number] = graph_of(view, valid_then, moving)
-            graph = graphs[number]
-            parent = frame_id or body.parent
-            moment = each.stamp if graph.clock == "stamp" else at
-            with suppress(NoDataError):  # before the first transform of the map, or in its gap
-                found = graph.lookup(parent, body.child, moment)
-                poses[at] = Pose(found.translation, found.rotation, parent)
-                last = at
+        # None is before the first transform of the map, or in its gap.
+        for nth in np.flatnonzero(found.valid).tolist():
+            if own[nth].log_time - last >= _STEP_NS:
+                last = own[nth].log_time
+                there = found.at(nth)
+                poses[last] = Pose(there.translation, there.rotation, parent)
         view.bags.check_deadline()
     return sorted(poses.items())

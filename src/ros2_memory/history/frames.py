@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.analysis.frames import Frames, edges_of, joined_edges, sorted_edges, static_at
-from ros2_memory.analysis.transform_tree import TF_CACHE_NS
+import numpy as np
+
+from ros2_memory.analysis.frames import (
+    TF_CACHE_NS,
+    Frames,
+    edges_of,
+    joined_edges,
+    static_in,
+)
 from ros2_memory.columns.transforms import edges_in
 from ros2_memory.history.scan import decoded_rows, messages_of, scan
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
@@ -56,7 +63,11 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
     decoded = [edges_in(some.table, some.times, some.index) for some in decoded_rows(view, rows)]
     known = [edges for edges in decoded if edges is not None]
     if decoded and len(known) == len(decoded):
-        return sorted_edges(joined_edges(known))
+        # As those of bags come in the order of their log times.
+        return {
+            pair: edge.rows(np.argsort(edge.log_times, kind="stable"))
+            for pair, edge in joined_edges(known).items()
+        }
     return _by_message(view, messages_of(view, rows))
 
 
@@ -76,11 +87,8 @@ def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> 
         for topic in limits.tf_topics
         for _, edges in transform_rows(view, topic, around, among)
     ]
-    recorded = static_transforms(view, among)
-    static = static_at(recorded, window.start)
-    static += [one for one in recorded if window.contains(one.log_time)]
-    clock = None if limits.tf_clock == "auto" else limits.tf_clock
-    return Frames(static, joined_edges(moving), target, clock)
+    static = static_in(static_transforms(view, among), window)
+    return Frames(static, joined_edges(moving), target, limits.tf_clock)
 
 
 def _by_message(view: View, messages: Iterable[StoredMessage]) -> Edges:

@@ -14,7 +14,7 @@ are of one robot, so a reply that uses borrowed transforms has to note it.
 from __future__ import annotations
 
 from itertools import chain, combinations
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.handover_file import read_handover
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.transform_tree import FrameEdge
-    from ros2_memory.core.model import BagFile, StampedTransform
+    from ros2_memory.core.model import BagFile, FrameEdge, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -38,8 +37,24 @@ Session: TypeAlias = frozenset[str]
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
-_CHAINS: Final[Key[Mapping[str, Session]]] = Key()
-"""Of a timeline: sidecars are read for them."""
+
+
+class _Recorded(NamedTuple):
+    """What sessions follow from: folders, with the log times of their first and last messages.
+
+    Attributes:
+        kinds: those of moving and of static transforms.
+        poses: those of the robot's own poses.
+        joined: by folder, all that are joined with it by handovers.
+    """
+
+    kinds: tuple[Mapping[str, tuple[Ns, Ns]], Mapping[str, tuple[Ns, Ns]]]
+    poses: Sequence[tuple[str, tuple[Ns, Ns]]]
+    joined: Mapping[str, Session]
+
+
+_RECORDED: Final[Key[_Recorded]] = Key()
+"""Of a timeline: sidecars are read for it."""
 
 
 class Sessions:
@@ -59,18 +74,11 @@ class Sessions:
 
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
         self._view = view
-        limits = view.memory.limits
-        self._topics = (*limits.tf_topics, *limits.tf_static_topics, view.pose_topic)
         self._children = children
         self._names = HardLinks(view.memory.index.bag_dir)
         self._root = str(view.memory.index.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._spans = {
-            "moving": self._spans_of(limits.tf_topics),
-            "static": self._spans_of(limits.tf_static_topics),
-        }
-        self._joined = view.snapshot.timeline.memo.of(_CHAINS, self._chains)
-        self._poses = [*self._spans_of((view.pose_topic,)).items()]
+        self._recorded = view.snapshot.timeline.memo.of(_RECORDED, self._find_recorded)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
         self.linked: set[tuple[tuple[str, str], Session | None]] = set()
@@ -113,7 +121,7 @@ class Sessions:
 
     def has_all_kinds(self, session: Session) -> bool:
         """Whether a session holds moving and static transforms: then it borrows none."""
-        return len(self._kinds(session)) == len(self._spans)
+        return len(self._kinds(session)) == len(self._recorded.kinds)
 
     def is_carried(self, bag: BagFile) -> bool:
         """Whether a bag holds carried messages, which are of several sessions."""
@@ -164,14 +172,14 @@ class Sessions:
 
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
-        spans = [span for by_folder in self._spans.values() for span in by_folder.items()]
+        spans = [span for by_folder in self._recorded.kinds for span in by_folder.items()]
         near = sorted(spans, key=lambda each: (_distance(each[1], moment), each[0]))
         return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
 
     def _completed(self, own: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
         kinds = self._kinds(own)
-        if len(kinds) == len(self._spans) or self._are_two_robots(at):
+        if self.has_all_kinds(own) or self._are_two_robots(at):
             return own if kinds else frozenset()
         beside = [each for each in self._around(at) if each != own and self._kinds(each)]
         if kinds:
@@ -186,7 +194,7 @@ class Sessions:
 
     def _are_two_robots(self, at: Ns) -> bool:
         """Whether two sessions near a moment hold poses of the same time."""
-        near = [each for each in self._poses if _distance(each[1], at) <= _AROUND_NS]
+        near = [each for each in self._recorded.poses if _distance(each[1], at) <= _AROUND_NS]
         return any(
             max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
             for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
@@ -198,9 +206,10 @@ class Sessions:
             return False
         return not self._children(one) & self._children(other)
 
-    def _kinds(self, session: Session) -> frozenset[str]:
+    def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
-        return frozenset(kind for kind, spans in self._spans.items() if session & spans.keys())
+        kinds = enumerate(self._recorded.kinds)
+        return frozenset(kind for kind, spans in kinds if session & spans.keys())
 
     def _around(self, moment: Ns) -> list[Session]:
         """Returns the sessions that were being recorded at a moment."""
@@ -214,7 +223,7 @@ class Sessions:
     def _of(self, folder: str) -> Session:
         if folder == self._carried:
             return frozenset({folder})
-        return self._joined.get(folder) or frozenset({folder, self._carried})
+        return self._recorded.joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         spans: dict[str, tuple[Ns, Ns]] = {}
@@ -225,12 +234,17 @@ class Sessions:
                 spans[folder] = min(first, known[0]), max(last, known[1])
         return spans
 
-    def _chains(self) -> Mapping[str, Session]:
-        """Returns, by folder, the recordings with transforms or poses joined by handovers."""
-        recordings = map(self._view.snapshot.timeline.recordings, self._topics)
+    def _find_recorded(self) -> _Recorded:
+        limits, pose_topic = self._view.memory.limits, self._view.pose_topic
+        topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
+        recordings = map(self._view.snapshot.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
         chains = _joined(paths) if len(paths) > 1 else {}
-        return {folder: frozenset(each | {self._carried}) for folder, each in chains.items()}
+        return _Recorded(
+            (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
+            [*self._spans_of((pose_topic,)).items()],
+            {folder: frozenset(each | {self._carried}) for folder, each in chains.items()},
+        )
 
 
 def _joined(paths: Mapping[str, Path]) -> dict[str, set[str]]:

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import static_at
-from ros2_memory.analysis.transform_tree import (
+from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
-    FrameEdge,
-    FrameGraph,
+    Frames,
     TfClock,
-    agreeing_clock,
+    connected_with,
+    edges_of,
+    is_edge,
+    static_at,
 )
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.transforms import (
@@ -35,9 +36,10 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.geometry import alike
-from ros2_memory.core.model import StampedTransform, TimeWindow
+from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     NS_PER_MS,
     NS_PER_S,
@@ -53,7 +55,7 @@ from ros2_memory.history.no_data import (
     seconds,
 )
 from ros2_memory.history.scan import decoded_rows, messages_of, scan
-from ros2_memory.history.sessions import Sessions, components
+from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -174,12 +176,12 @@ def _transform_in(
     view: View, among: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
     """Does as `transform_at`, by the transforms of one session."""
-    limits = view.memory.limits
+    limits, (parent, child) = view.memory.limits, frames
     static = static_at(static_transforms(view, among), at)
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
-        graph = graph_of(view, static, moving)
-        return FoundTransform(graph.lookup(*frames, at), clock_of(view, moving))
+        found = frames_of(view, static, moving, parent)
+        return FoundTransform(found.lookup(child, at), found.clock)
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
@@ -205,17 +207,15 @@ def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTra
     return list(_transforms(view, topics, window.widened(TF_CACHE_NS), among))
 
 
-def graph_of(
-    view: View, static: Sequence[StampedTransform], moving: Sequence[StampedTransform]
-) -> FrameGraph:
-    """Returns the transforms as a graph, in the clock of `data.tf_clock`."""
-    return FrameGraph([*static, *moving], clock_of(view, moving))
-
-
-def clock_of(view: View, moving: Sequence[StampedTransform]) -> TfClock:
-    """Returns the clock of `data.tf_clock`, or the one that moving transforms agree with."""
-    configured = view.memory.limits.tf_clock
-    return agreeing_clock(moving) if configured == "auto" else configured
+def frames_of(
+    view: View,
+    static: Sequence[StampedTransform],
+    moving: Iterable[StampedTransform],
+    target: str,
+) -> Frames:
+    """Returns frames in a target frame by some transforms, of which none holds on."""
+    clock = view.memory.limits.tf_clock
+    return Frames(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
 
 def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
@@ -227,11 +227,11 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    topics = _recorded(view, view.memory.limits.tf_static_topics)
     sessions, timeline, scanner = sessions_of(view), view.snapshot.timeline, view.memory.columns
     known = sessions.statics.get(among)
     if known is not None:
         return known
+    topics = _recorded(view, view.memory.limits.tf_static_topics)
     key = (among, topics)
     kept = scanner.statics.get(key)
     if kept is not None and kept[0] is timeline:
@@ -343,7 +343,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
         return sessions.edges
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
     pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
-    named = [each for each in sorted(pairs.items()) if _is_edge(each[0])]
+    named = [each for each in sorted(pairs.items()) if is_edge(each[0])]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
     sessions.edges = tuple(FrameEdge(*pair, is_static) for pair, is_static in named)
@@ -400,12 +400,6 @@ def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
 def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
     read = (one for each in messages for one in decoded_transforms(view, each))
     return frozenset((one.parent, one.child) for one in read)
-
-
-def _is_edge(pair: tuple[str, str]) -> bool:
-    """Whether tf2 takes a parent and a child for an edge of the tree."""
-    parent, child = (name.lstrip("/") for name in pair)
-    return bool(parent and child) and parent != child
 
 
 def _explained(
@@ -494,8 +488,8 @@ def connects(
 def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
     """Whether pairs of a parent and a child lead from one frame to the other."""
     origin, target = (name.lstrip("/") for name in frames)
-    linked = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(_is_edge, pairs))
-    return target in components(linked).get(origin, ())
+    linked = [(parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(is_edge, pairs)]
+    return target in connected_with(origin, linked)
 
 
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:

@@ -14,8 +14,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.analysis.conditions import NearPosition, matched_texts
+from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,

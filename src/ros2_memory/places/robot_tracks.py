@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Edge, Frames, joined_edges, static_at
+from ros2_memory.analysis.frames import TF_CACHE_NS, Frames, joined_edges, static_in
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     STRETCH_NS,
@@ -25,7 +25,6 @@ from ros2_memory.analysis.motion.robot_track import (
     track_part,
 )
 from ros2_memory.analysis.poses import headings
-from ros2_memory.analysis.transform_tree import TF_CACHE_NS
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.tracks import TRACKS
@@ -127,7 +126,6 @@ class RobotTracks:
         self._is_own = self._body is None and own == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
-        self._statics: dict[Session, Sequence[StampedTransform]] = {}
 
     def over(self, window: TimeWindow) -> JoinedTrack:
         """Returns the track in a window, and a little beyond.
@@ -255,16 +253,9 @@ class RobotTracks:
         for (since, session), end in zip(lenders, ends, strict=True):
             span = TimeWindow(max(since, rows.first), min(end, rows.last + 1))
             used = [source for source in sources if source.is_of(self._view, session)]
-            groups.append(_Group(since, span, session, self._static(session, span), used))
+            static = static_in(static_transforms(self._view, session), span)
+            groups.append(_Group(since, span, session, tuple(static), used))
         return groups
-
-    def _static(self, session: Session, span: TimeWindow) -> tuple[StampedTransform, ...]:
-        """Returns the static transforms that hold in a span."""
-        if session not in self._statics:
-            self._statics[session] = static_transforms(self._view, session)
-        recorded = self._statics[session]
-        static = static_at(recorded, span.start)
-        return (*static, *(one for one in recorded if span.contains(one.log_time)))
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
@@ -323,9 +314,7 @@ class RobotTracks:
             _within(source.edges(self._view, group.session), around) for source in group.sources
         ]
         clock = self._view.memory.limits.tf_clock
-        return Frames(
-            group.static, joined_edges(moving), self._frame_id, None if clock == "auto" else clock
-        )
+        return Frames(group.static, joined_edges(moving), self._frame_id, clock)
 
 
 class _Group(NamedTuple):
@@ -507,12 +496,7 @@ def _within(edges: Edges, window: TimeWindow) -> Edges:
     for pair, edge in edges.items():
         begin, end = np.searchsorted(edge.log_times, (window.start, window.stop)).tolist()
         if begin < end:
-            found[pair] = Edge(
-                edge.stamps[begin:end],
-                edge.log_times[begin:end],
-                edge.translation[begin:end],
-                edge.rotation[begin:end],
-            )
+            found[pair] = edge.rows(slice(begin, end))
     return found
 
 

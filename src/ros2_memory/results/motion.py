@@ -35,8 +35,15 @@ from ros2_memory.results.base import AnswerWithNotes
 
 if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
-    from ros2_memory.analysis.transform_tree import FrameEdge
-    from ros2_memory.core.model import Geodetic, JsonValue, Pose, Quaternion, Transform, Twist
+    from ros2_memory.core.model import (
+        FrameEdge,
+        Geodetic,
+        JsonValue,
+        Pose,
+        Quaternion,
+        Transform,
+        Twist,
+    )
 
 _GEODETIC: Final = keys(digits(8)("latitude"), digits(8)("longitude"), digits(4)("altitude"))
 

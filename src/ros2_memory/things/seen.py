@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import static_at
+from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import BagFile, StampedTransform
+    from ros2_memory.core.model import BagFile
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
@@ -514,10 +514,3 @@ def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int
     every = [rows.times // STRETCH_NS for topic in topics for rows in scan(view, topic, window)]
     found: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *every])).tolist()
     return found
-
-
-def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
-    """Returns the static transforms of a session that hold in a window."""
-    return static_at(static, window.start) + [
-        one for one in static if window.contains(one.log_time)
-    ]

@@ -1,123 +1,519 @@
-"""The frames of one bag as arrays: equal to the transform tree's answers, one by one."""
+"""Frames in a target frame: tf2's rules, at one time and at many."""
 
 from __future__ import annotations
 
+import json
 import math
-from dataclasses import replace
-from random import Random
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
 
-from ros2_memory.analysis.frames import HOLD_NS, Frames, edges_of
-from ros2_memory.analysis.transform_tree import FrameGraph
-from ros2_memory.core.errors import NoDataError
+from ros2_memory.analysis.frames import (
+    HOLD_NS,
+    TF_CACHE_NS,
+    ClockOfTransforms,
+    Frames,
+    agreeing_clock,
+    edges_of,
+)
+from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import StampedTransform, Transform
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, ns_from_unix
+from tests.support.rosbags_oracle import stamped_transforms
+from tests.support.shared_bags import REAL, needs_real
+from tests.support.strategies import transforms
 
-S = 10**9
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+S = NS_PER_S
+IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+FILES = {
+    "evo_tf_example_db3": "evo_tf_example_db3/tf_example.db3",
+    "cougars_auv_mcap": "cougars_auv_mcap/SO_bag_0.mcap",
+}
 
 
-def turn(yaw: float) -> tuple[float, float, float, float]:
-    return (0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
-
-
-def moving(
-    parent: str, child: str, at: int, x: float = 0.0, yaw: float = 0.0, late: int = 0
+def edge(
+    parent: str,
+    child: str,
+    time: int,
+    transform: Transform | float = IDENTITY,
+    *,
+    log_time: int | None = None,
+    static: bool = False,
 ) -> StampedTransform:
+    """An edge stamped at `time`; a number stands for a shift along x."""
+    held = (
+        transform
+        if isinstance(transform, Transform)
+        else Transform((transform, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    )
     return StampedTransform(
-        parent, child, at, at + late, Transform((x, x / 2, 0.1), turn(yaw)), static=False
+        parent, child, time, time if log_time is None else log_time, held, static
     )
 
 
-def static(parent: str, child: str, x: float = 0.0, yaw: float = 0.0) -> StampedTransform:
-    return StampedTransform(parent, child, 0, 0, Transform((x, 0.0, 0.5), turn(yaw)), static=True)
+@dataclass(frozen=True)
+class Tree:
+    """Transforms in any order, looked up as for one moment: nothing holds on."""
+
+    transforms: Sequence[StampedTransform]
+    clock: ClockOfTransforms = "stamp"
+
+    def frames(self, target: str, hold_ns: int = AT_OR_BEFORE_SLACK_NS) -> Frames:
+        static = sorted((e for e in self.transforms if e.static), key=lambda e: e.log_time)
+        moving = edges_of(e for e in self.transforms if not e.static)
+        return Frames(static, moving, target, self.clock, hold_ns)
+
+    def lookup(self, parent: str, child: str, time: int) -> Transform:
+        return self.frames(parent).lookup(child, time)
 
 
-def drawn(draw: Random) -> list[StampedTransform]:
-    """Some seconds of odometry and of corrections, with a silence longer than tf2's buffer."""
-    found = []
-    for parent, child, step in (("map", "odom", S), ("odom", "base", S // 5)):
-        at = draw.randrange(S)
-        for _ in range(60):
-            at += draw.choice([step, step, 3 * step, 11 * S if draw.random() < 0.05 else step])
-            found.append(moving(parent, child, at, draw.uniform(-3, 3), draw.uniform(-4, 4)))
-    return found
+def shift(tree: Tree, parent: str, child: str, time: int) -> float:
+    return tree.lookup(parent, child, time).translation[0]
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_a_pose_inside_of_the_bag_is_that_of_the_transform_tree(seed: int) -> None:
-    draw = Random(seed)
-    transforms = drawn(draw)
-    mount = static("base", "camera", 0.3, 1.0)
-    frames = Frames([mount], edges_of(transforms), "map", "stamp")
-    graph = FrameGraph([mount, *transforms])
-    first = max(min(e.stamp for e in transforms if e.child == c) for c in ("odom", "base"))
-    last = min(max(e.stamp for e in transforms if e.child == c) for c in ("odom", "base"))
-    times = np.array(sorted(draw.randrange(first, last) for _ in range(200)), np.int64)
-    found = frames.poses("camera", times)
-    assert found is not None
-    points = np.stack(found.points((np.ones(200), np.ones(200), np.ones(200))), axis=1)
-    for at, valid, point in zip(times.tolist(), found.valid.tolist(), points, strict=True):
-        try:
-            expected = graph.lookup("map", "camera", at)
-        except NoDataError:
-            assert not valid or any(abs(one.stamp - at) <= HOLD_NS for one in transforms)
-            continue
-        one = frames.pose("camera", at)
-        assert valid
-        assert one is not None
-        assert one.translation == pytest.approx(expected.translation, abs=1e-9)
-        assert abs(sum(a * b for a, b in zip(one.rotation, expected.rotation, strict=True))) > (
-            1 - 1e-12
-        )
-        assert np.isfinite(point).all()
+def refusal(tree: Tree, parent: str, child: str, time: int) -> NoDataError:
+    with pytest.raises(NoDataError) as refused:
+        tree.lookup(parent, child, time)
+    return refused.value
 
 
-def test_the_first_and_last_transform_hold_a_little_beyond_the_bag() -> None:
-    frames = Frames([], edges_of([moving("map", "odom", 10 * S, 1.0)]), "map")
-    assert frames.pose("odom", 10 * S - HOLD_NS) is not None
-    assert frames.pose("odom", 10 * S + HOLD_NS) is not None
-    assert frames.pose("odom", 10 * S + HOLD_NS + 1) is None
+def moving(child: str = "base", parent: str = "odom") -> list[StampedTransform]:
+    """One metre a second along x, at 100 to 105 s."""
+    return [edge(parent, child, (100 + i) * S, float(i)) for i in range(6)]
 
 
-def test_a_child_that_changes_its_parent_is_looked_up_time_by_time() -> None:
-    transforms = [
-        moving("map", "odom", 1 * S, 1.0),
-        moving("map", "odom", 2 * S, 2.0),
-        moving("earth", "odom", 3 * S, 5.0),
-        moving("map", "odom", 4 * S, 2.0),
+# Composition
+
+
+@st.composite
+def trees(draw: st.DrawFn) -> list[StampedTransform]:
+    """A random tree of static edges: the parent of frame i is some earlier frame."""
+    count = draw(st.integers(2, 8))
+    return [
+        edge(f"f{draw(st.integers(0, i - 1))}", f"f{i}", 0, draw(transforms), static=True)
+        for i in range(1, count)
     ]
-    frames = Frames([static("map", "earth", 10.0)], edges_of(transforms), "map", "stamp")
-    places = [frames.pose("odom", at) for at in (3 * S // 2, 3 * S, 4 * S)]
-    assert [each and each.translation[0] for each in places] == [1.5, 15.0, 2.0]
 
 
-def test_stamps_of_another_clock_are_not_used() -> None:
-    transforms = [moving("map", "odom", at * S, at, late=900 * S) for at in (1, 2)]
-    frames = Frames([], edges_of(transforms), "map")
-    assert [frames.pose("odom", at * S) is not None for at in (1, 901)] == [False, True]
+def matrix(t: Transform) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    homogeneous = np.eye(4)
+    homogeneous[:3, :3] = Rotation.from_quat(t.rotation).as_matrix()
+    homogeneous[:3, 3] = t.translation
+    return homogeneous
 
 
-def test_a_transform_holds_a_little_into_a_gap_that_tf2_does_not_bridge() -> None:
-    frames = Frames([], edges_of([moving("map", "odom", at * S, at) for at in (10, 40)]), "map")
-    at = [12, 13, 37, 38]
-    found = frames.poses("odom", np.array([each * S for each in at], np.int64))
-    assert found is not None
-    assert found.valid.tolist() == [True, False, False, True]
-    assert found.translation[0][found.valid].tolist() == [10.0, 40.0]
+@given(trees(), st.data())
+def test_a_lookup_is_the_product_of_the_matrices_on_the_way(
+    tree: list[StampedTransform], data: st.DataObject
+) -> None:
+    in_root = {"f0": np.eye(4)}
+    for held in tree:
+        in_root[held.child] = in_root[held.parent] @ matrix(held.transform)
+    names = st.sampled_from(sorted(in_root))
+    parent, child = data.draw(names), data.draw(names)
+    found = Tree(tree).lookup(parent, child, 5)
+    assert np.allclose(matrix(found), np.linalg.inv(in_root[parent]) @ in_root[child], atol=1e-7)
+
+
+def test_a_frame_in_itself_is_the_identity_whenever_it_is_asked() -> None:
+    assert Tree(moving()).lookup("base", "base", 7) == IDENTITY
+
+
+def test_frames_on_two_branches_meet_at_their_common_ancestor() -> None:
+    # The edge above the common ancestor knows nothing of this time, and need not.
+    tree = Tree(
+        [
+            edge("map", "odom", 1 * S),
+            edge("odom", "base", 100 * S, 3.0),
+            edge("base", "laser", 0, 0.5, static=True),
+            edge("base", "camera", 0, 2.0, static=True),
+        ]
+    )
+    assert shift(tree, "laser", "camera", 100 * S) == 1.5
+    assert shift(tree, "odom", "camera", 100 * S) == 5.0
+
+
+# Interpolation
+
+
+@given(transforms, transforms, st.integers(0, TF_CACHE_NS))
+def test_between_two_messages_translation_is_linear_and_rotation_slerp(
+    first: Transform, second: Transform, after: int
+) -> None:
+    start = 1_700_000_000 * S
+    tree = Tree([edge("a", "b", start, first), edge("a", "b", start + TF_CACHE_NS, second)])
+    found = tree.lookup("a", "b", start + after)
+    ratio = after / TF_CACHE_NS
+    ends = Rotation.from_quat([first.rotation, second.rotation])
+    line = np.array(first.translation) * (1 - ratio) + np.array(second.translation) * ratio
+    assert found.translation == pytest.approx(tuple(line), abs=1e-8)
+    if (ends[0].inv() * ends[1]).magnitude() < math.pi - 1e-3:
+        expected = Slerp([0, 1], ends)(ratio)
+        assert (Rotation.from_quat(found.rotation).inv() * expected).magnitude() < 1e-6
+
+
+@given(st.permutations(moving()), st.integers(100 * S, 105 * S))
+def test_messages_may_come_in_any_order(shuffled: list[StampedTransform], time: int) -> None:
+    assert shift(Tree(shuffled), "odom", "base", time) == pytest.approx(time / S - 100)
+
+
+def test_at_a_messages_own_time_its_transform_is_returned_exactly() -> None:
+    odd = Transform((0.1, 0.2, 0.3), (0.5, 0.5, 0.5, 0.5))
+    tree = Tree([edge("a", "b", 1, 1.0), edge("a", "b", 2, odd), edge("a", "b", 3, 1.0)])
+    assert tree.lookup("a", "b", 2) == odd
+
+
+def test_of_two_messages_for_one_time_the_later_received_is_used() -> None:
+    first, second = edge("a", "b", 5, 1.0, log_time=10), edge("a", "b", 5, 2.0, log_time=11)
+    for order in ([first, second], [second, first]):
+        assert shift(Tree(order), "a", "b", 5) == 2.0
+
+
+def test_of_two_transforms_in_one_message_the_last_is_used() -> None:
+    assert shift(Tree([edge("a", "b", 5, 1.0), edge("a", "b", 5, 2.0)]), "a", "b", 5) == 2.0
+
+
+# Parents that change
+
+
+def picked_up() -> Tree:
+    """A cup stands on the table (at 1 m) at 10 and 12 s, and is in the gripper at 14 and 16 s."""
+    return Tree(
+        [
+            edge("map", "table", 0, 1.0, static=True),
+            edge("map", "gripper", 0, 5.0, static=True),
+            edge("table", "cup", 10 * S, 0.0),
+            edge("table", "cup", 12 * S, 0.2),
+            edge("gripper", "cup", 14 * S, 0.0),
+            edge("gripper", "cup", 16 * S, 0.2),
+        ]
+    )
+
+
+@pytest.mark.parametrize(
+    ("second", "place"), [(11, 1.1), (12, 1.2), (13, 1.2), (14, 5.0), (15, 5.1)]
+)
+def test_between_two_parents_the_earlier_message_is_used(second: int, place: float) -> None:
+    assert shift(picked_up(), "map", "cup", second * S) == pytest.approx(place)
+
+
+def test_frames_that_the_tree_connects_only_at_other_times_are_not_connected_then() -> None:
+    tree = Tree([edge("a", "cup", 10 * S), edge("a", "cup", 12 * S), edge("b", "cup", 14 * S)])
+    assert shift(tree, "b", "cup", 14 * S) == 0.0
+    refused = refusal(tree, "b", "cup", 11 * S)
+    assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert "were not connected at 11.000000" in refused.detail
+
+
+@pytest.mark.parametrize("static", [True, False])
+def test_a_loop_is_an_answer_and_not_an_endless_walk(static: bool) -> None:
+    tree = Tree(
+        [
+            edge("b", "a", 5, 1.0, static=static),
+            edge("c", "b", 5, 1.0, static=static),
+            edge("b", "c", 5, 1.0, static=static),
+            edge("other", "thing", 5, static=static),
+        ]
+    )
+    assert refusal(tree, "thing", "a", 5).reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert shift(tree, "b", "a", 5) == 1.0
+
+
+# Static transforms
+
+
+@pytest.mark.parametrize("time", [0, 10**18, 2**62])
+def test_a_static_transform_is_valid_at_all_times(time: int) -> None:
+    tree = Tree([edge("base", "laser", 500 * S, 0.3, static=True)])
+    assert shift(tree, "base", "laser", time) == 0.3
+
+
+def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> None:
+    tree = Tree([edge("odom", "base", 0, 9.0, static=True), *moving()])
+    assert shift(tree, "odom", "base", 102 * S) == 2.0
+    assert shift(tree, "odom", "base", 99 * S) == 9.0
+
+
+# What is left out
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        edge("base", "/base", 103 * S + 1),
+        edge("base", "/base", 103 * S + 1, static=True),
+        edge("", "base", 103 * S + 1),
+        edge("", "odom", 103 * S + 1, static=True),
+        edge("odom", "/", 103 * S + 1),
+    ],
+)
+def test_an_invalid_transform_is_left_out(bad: StampedTransform) -> None:
+    tree = Tree([*moving(), bad])
+    assert "there are: base, odom" in refusal(tree, "odom", "zzz", 103 * S).detail
+    assert shift(tree, "odom", "base", 103 * S + 1) == pytest.approx(3.0)
+
+
+def test_a_leading_slash_is_no_part_of_a_name() -> None:
+    tree = Tree([edge("/odom", "base", 5, 1.0), edge("base", "/laser", 5, 1.0)])
+    assert shift(tree, "odom", "/laser", 5) == 2.0
+
+
+# Refusals
+
+
+def test_an_unknown_frame_is_named_with_those_spelled_alike() -> None:
+    tree = Tree([edge("odom", "base_link", 5), edge("base_link", "robot1/camera", 5)])
+    refused = refusal(tree, "odom", "bas_link", 5)
+    assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    assert "'bas_link'" in refused.detail
+    assert "similar: base_link" in refused.detail
+    assert "robot1/camera" in refusal(tree, "Camera", "odom", 5).detail
+
+
+def test_an_unknown_frame_that_is_like_none_lists_those_there_are() -> None:
+    refused = refusal(Tree(moving()), "odom", "zzz", 5)
+    assert "there are: base, odom" in refused.detail
+    many = Tree([edge("odom", f"wheel_{i:02}", 5) for i in range(30)])
+    assert refusal(many, "odom", "zzz", 5).detail.endswith("and 19 more")
+
+
+def test_an_unknown_frame_in_itself_is_unknown_too() -> None:
+    assert refusal(Tree(moving()), "x", "x", 5).reason is NoDataReason.FRAME_UNKNOWN
+
+
+def test_without_any_transform_every_frame_is_unknown() -> None:
+    refused = refusal(Tree([]), "odom", "base", 5)
+    assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    assert "no transforms are recorded" in refused.detail
+
+
+def test_frames_of_two_trees_are_refused_with_their_roots() -> None:
+    tree = Tree([*moving(), edge("map", "goal", 5), edge("goal", "tip", 5)])
+    refused = refusal(tree, "tip", "base", 102 * S)
+    assert refused.reason is NoDataReason.FRAMES_NOT_CONNECTED
+    assert "'tip' is in the tree of 'map', 'base' in that of 'odom'" in refused.detail
+    assert "connected to 'base': odom" in refused.detail
+
+
+@pytest.mark.parametrize(("time", "off"), [(90 * S, "10.000 s after"), (107 * S, "2.000 s before")])
+def test_nothing_is_extrapolated_and_the_range_of_the_edge_is_named(time: int, off: str) -> None:
+    tree = Tree([*moving(), edge("map", "odom", 0, static=True)])
+    refused = refusal(tree, "map", "base", time)
+    assert refused.reason is NoDataReason.OUTSIDE_RANGE
+    assert "no transform of 'base' in 'odom'" in refused.detail
+    assert f"100.000000 to 105.000000 (Unix seconds), {off} the time asked" in refused.detail
+    assert refusal(tree, "base", "map", time).detail == refused.detail
+
+
+def test_a_single_message_answers_at_its_own_time_only() -> None:
+    tree = Tree([edge("odom", "base", 5 * S, 1.0)])
+    assert shift(tree, "odom", "base", 5 * S) == 1.0
+    assert "only at 5.000000" in refusal(tree, "odom", "base", 6 * S).detail
+
+
+def test_a_gap_wider_than_the_cache_is_refused_with_both_its_edges() -> None:
+    tree = Tree([edge("odom", "base", 100 * S, 1.0), edge("odom", "base", 111 * S, 2.0)])
+    refused = refusal(tree, "odom", "base", 104 * S)
+    assert refused.reason is NoDataReason.GAP
+    assert "100.000000 (4.000 s before) and 111.000000 (7.000 s after)" in refused.detail
+    assert "10.000 s is not interpolated" in refused.detail
+
+
+def test_a_refusal_names_the_parent_of_the_nearest_message() -> None:
+    assert "of 'cup' in 'table' at 9.0" in refusal(picked_up(), "map", "cup", 9 * S).detail
+    assert "of 'cup' in 'gripper' at 17.0" in refusal(picked_up(), "map", "cup", 17 * S).detail
+    tree = Tree([edge("a", "cup", 0), edge("b", "cup", 20 * S), edge("c", "cup", 21 * S)])
+    assert "of 'cup' in 'a' at 5.0" in refusal(tree, "a", "cup", 5 * S).detail
+
+
+@given(st.integers(1_600_000_000 * S, 1_800_000_000 * S), st.integers(11 * S, 10**6 * S))
+def test_every_time_that_a_refusal_offers_can_be_asked(first: int, width: int) -> None:
+    tree = Tree([edge("odom", "base", first), edge("odom", "base", first + width)])
+    for asked in (first - 60 * S, first + width // 2, first + width + 60 * S):
+        detail = refusal(tree, "odom", "base", asked).detail
+        offered = [float(text) for text in re.findall(r"\d{10}\.\d{6}", detail)]
+        assert len(offered) == 3  # the time asked, and both of those offered
+        for seconds in offered[1:]:
+            assert tree.lookup("odom", "base", ns_from_unix(seconds)) == IDENTITY
+
+
+# Clocks
+
+
+def replayed(off: int, count: int = 5) -> list[StampedTransform]:
+    return [replace(held, log_time=held.stamp + off) for held in moving()[:count]]
+
+
+@pytest.mark.parametrize("off", [0, 20_000_000, -S, 2 * S])
+def test_stamps_near_log_time_are_the_clock(off: int) -> None:
+    assert agreeing_clock(edges_of(replayed(off))) == "stamp"
+
+
+@pytest.mark.parametrize("off", [2 * S + 1, -3 * S, 515_219 * S])
+def test_stamps_of_another_clock_give_way_to_log_time(off: int) -> None:
+    assert agreeing_clock(edges_of(replayed(off))) == "log"
+
+
+def test_a_few_odd_stamps_do_not_decide() -> None:
+    assert agreeing_clock(edges_of([*replayed(0, 4), *replayed(99 * S, 2)])) == "stamp"
+
+
+def test_static_transforms_say_nothing_of_the_clock() -> None:
+    latched = [edge("a", "b", 0, log_time=10**18, static=True) for _ in range(9)]
+    assert Tree([*latched, *replayed(0)], "auto").frames("a").clock == "stamp"
+    assert Tree(latched, "auto").frames("a").clock == "stamp"
+
+
+def test_a_tree_on_log_time_is_asked_in_log_time() -> None:
+    tree = Tree(replayed(1000 * S), "log")
+    assert shift(tree, "odom", "base", 1101 * S) == 1.0
+    assert refusal(tree, "odom", "base", 101 * S).reason is NoDataReason.OUTSIDE_RANGE
+
+
+# Public robots
+
+
+def _expected() -> list[object]:
+    if not REAL.is_dir():
+        return []
+    sets = json.loads((REAL / "expected.json").read_text())
+    return [
+        pytest.param(name, case, id=f"{name}-{case['target']}-{case['source']}-{case['stamp_ns']}")
+        for name in FILES
+        for case in sets[name]["expected"]["tf_lookup"]
+    ]
+
+
+@needs_real
+@pytest.mark.parametrize(("name", "case"), _expected())
+def test_lookups_on_public_bags_are_those_of_independent_tools(
+    name: str, case: dict[str, object]
+) -> None:
+    tree = Tree(stamped_transforms(FILES[name]), "stamp")
+    target, source, stamp = str(case["target"]), str(case["source"]), case["stamp_ns"]
+    assert isinstance(stamp, int)
+    if "error" not in case:
+        found = tree.lookup(target, source, stamp)
+        assert found.translation == pytest.approx(case["translation"], abs=2e-6)
+        turned = Rotation.from_quat(found.rotation).inv() * Rotation.from_quat(case["q_xyzw"])
+        assert turned.magnitude() < 5e-6
+        return
+    refused = refusal(tree, target, source, stamp)
+    if case["error"] == "not connected":
+        assert refused.reason is NoDataReason.FRAME_UNKNOWN
+    else:
+        assert refused.reason is NoDataReason.OUTSIDE_RANGE
+
+
+@needs_real
+@pytest.mark.parametrize(
+    ("name", "clock"), [("cougars_auv_mcap", "log"), ("evo_tf_example_db3", "stamp")]
+)
+def test_the_clock_of_a_replayed_robot_is_log_time(name: str, clock: str) -> None:
+    assert Tree(stamped_transforms(FILES[name]), "auto").frames("map").clock == clock
+
+
+def test_a_yaw_between_two_messages_turns_the_shorter_way() -> None:
+    turns = [(0.0, 0.0, math.sin(half), math.cos(half)) for half in (1.5, -1.5)]
+    ends = [Transform((0.0, 0.0, 0.0), turn) for turn in turns]
+    tree = Tree([edge("a", "b", 0, ends[0]), edge("a", "b", 2, ends[1])])
+    turned = Rotation.from_quat(tree.lookup("a", "b", 1).rotation)
+    assert abs(turned.as_euler("xyz")[2]) == pytest.approx(math.pi)
+
+
+# Many times at once
+
+
+@given(st.data())
+def test_the_poses_at_many_times_are_those_of_each_time(data: st.DataObject) -> None:
+    """Odometry, corrections of the map, a cup that changes hands, and silences."""
+    found: list[StampedTransform] = []
+    for parents, child in ((["map"], "odom"), (["odom"], "base"), (["base", "map"], "cup")):
+        at = data.draw(st.integers(0, S))
+        for shift_m, parent, step in data.draw(
+            st.lists(
+                st.tuples(
+                    st.floats(-3, 3),
+                    st.sampled_from(parents),
+                    st.sampled_from([S // 5, S, 3 * S, 11 * S]),
+                ),
+                min_size=1,
+                max_size=12,
+            )
+        ):
+            turned = (0.0, 0.0, math.sin(shift_m), math.cos(shift_m))
+            found.append(edge(parent, child, at, Transform((shift_m, 0.1, 0.2), turned)))
+            at += step
+    tree = Tree([*found, edge("cup", "tea", 0, 0.3, static=True)])
+    times = data.draw(st.lists(st.integers(-3 * S, 60 * S), min_size=1, max_size=20))
+    for target, source in (("map", "tea"), ("base", "tea"), ("tea", "map"), ("odom", "base")):
+        poses = tree.frames(target).poses(source, np.array(times, np.int64))
+        assert poses is not None
+        for nth, at in enumerate(times):
+            try:
+                expected = tree.lookup(target, source, at)
+            except NoDataError:
+                assert not poses.valid[nth]
+            else:
+                assert poses.valid[nth]
+                one = poses.at(nth)
+                assert one.translation == pytest.approx(expected.translation, abs=1e-9)
+                assert one.rotation == pytest.approx(expected.rotation, abs=1e-9)
+
+
+def held(tree: Tree, target: str, source: str, times: Sequence[int]) -> list[float | None]:
+    """How far along x a frame is at some times; None where it is not known."""
+    poses = tree.frames(target, HOLD_NS).poses(source, np.array(times, np.int64))
+    assert poses is not None
+    places = zip(poses.translation[0].tolist(), poses.valid.tolist(), strict=True)
+    return [x if valid else None for x, valid in places]
+
+
+def test_the_first_and_last_transform_of_a_track_hold_a_little_longer() -> None:
+    tree = Tree([edge("map", "odom", 10 * S, 1.0)])
+    times = [10 * S - HOLD_NS - 1, 10 * S - HOLD_NS, 10 * S + HOLD_NS, 10 * S + HOLD_NS + 1]
+    assert held(tree, "map", "odom", times) == [None, 1.0, 1.0, None]
+
+
+@pytest.mark.parametrize("parents", [("map", "map"), ("map", "earth")])
+def test_a_transform_of_a_track_holds_a_little_into_a_gap(parents: tuple[str, str]) -> None:
+    ends = [edge(parent, "odom", at * S, at) for parent, at in zip(parents, (10, 22), strict=True)]
+    tree = Tree([*ends, edge("map", "earth", 0, 100.0, static=True)])
+    last = 22.0 if parents[1] == "map" else 122.0
+    times = [at * S for at in (12, 13, 19, 20)]
+    assert held(tree, "map", "odom", times) == [10.0, None, None, last]
 
 
 def test_a_static_transform_holds_until_the_next_one_of_its_child() -> None:
-    later = replace(static("base", "camera", 5.0), log_time=20 * S)
-    frames = Frames([static("base", "camera", 1.0), later], {}, "base")
-    found = frames.poses("camera", np.array([-S, 19 * S, 20 * S, 30 * S], np.int64))
-    assert found is not None
-    assert found.valid.all()
-    assert found.translation[0].tolist() == [1.0, 1.0, 5.0, 5.0]
+    tree = Tree(
+        [
+            edge("base", "camera", 0, 1.0, static=True),
+            edge("base", "camera", 0, 5.0, log_time=20 * S, static=True),
+            edge("torso", "camera", 0, 7.0, log_time=40 * S, static=True),
+        ]
+    )
+    times = [-S, 19 * S, 20 * S, 30 * S, 40 * S]
+    assert held(tree, "base", "camera", times) == [1.0, 1.0, 5.0, 5.0, None]
+    assert held(tree, "torso", "camera", times) == [None, None, None, None, 7.0]
 
 
-def test_frames_without_a_connection_have_no_pose() -> None:
-    frames = Frames([static("base", "camera")], {}, "map")
+def test_of_static_transforms_of_one_moment_the_last_is_used() -> None:
+    tree = Tree([edge("base", "laser", 900, x, log_time=10 * S, static=True) for x in (1.0, 3.0)])
+    assert shift(tree, "base", "laser", 0) == 1.0
+    assert shift(tree, "base", "laser", 10 * S) == 3.0
+
+
+def test_frames_without_a_connection_have_no_poses() -> None:
+    frames = Tree([edge("base", "camera", 0, static=True)]).frames("map")
     assert frames.poses("camera", np.array([1], np.int64)) is None
     assert not frames.reaches("camera")
-    assert frames.pose("map", 1) is not None
+    assert frames.poses("map", np.array([1], np.int64)) is not None

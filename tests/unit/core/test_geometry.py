@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
 
 from ros2_memory.core.geometry import (
-    IDENTITY,
-    compose,
     distance,
-    interpolate,
-    invert,
     multiply,
     normalised,
     rotate,
@@ -24,8 +20,8 @@ from ros2_memory.core.geometry import (
     slerp,
     yaw,
 )
-from ros2_memory.core.model import Quaternion, Transform, Vector3
-from tests.support.strategies import angles, points, quaternions, ratios, transforms
+from ros2_memory.core.model import Quaternion, Vector3
+from tests.support.strategies import angles, points, quaternions, ratios
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,13 +36,6 @@ any_paths = st.one_of(paths, grid_paths)
 def angle_between(a: Quaternion, b: Quaternion) -> float:
     """Radians between two rotations, by an independent library."""
     return float((Rotation.from_quat(a).inv() * Rotation.from_quat(b)).magnitude())
-
-
-def matrix(t: Transform) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    homogeneous = np.eye(4)
-    homogeneous[:3, :3] = Rotation.from_quat(t.rotation).as_matrix()
-    homogeneous[:3, 3] = t.translation
-    return homogeneous
 
 
 def about_z(angle: float) -> Quaternion:
@@ -143,38 +132,6 @@ def test_a_vector_is_turned_as_by_the_rotation_matrix(q: Quaternion, v: Vector3)
     assert rotate(q, v) == pytest.approx(tuple(Rotation.from_quat(q).apply(v)), abs=1e-9)
 
 
-# Transforms
-
-
-@given(transforms, transforms)
-def test_composition_is_the_product_of_matrices(a: Transform, b: Transform) -> None:
-    assert np.allclose(matrix(compose(a, b)), matrix(a) @ matrix(b), atol=1e-8)
-
-
-@given(transforms)
-def test_inversion_is_the_inverse_matrix(t: Transform) -> None:
-    assert np.allclose(matrix(invert(t)), np.linalg.inv(matrix(t)), atol=1e-8)
-
-
-@given(transforms)
-def test_a_transform_and_its_inverse_compose_to_nothing(t: Transform) -> None:
-    for both in (compose(t, invert(t)), compose(invert(t), t)):
-        assert both.translation == pytest.approx((0.0, 0.0, 0.0), abs=1e-8)
-        assert angle_between(both.rotation, IDENTITY.rotation) < 1e-7
-
-
-@given(transforms)
-def test_the_identity_changes_nothing(t: Transform) -> None:
-    assert compose(IDENTITY, t) == t
-    assert compose(t, IDENTITY) == t
-
-
-@given(transforms, transforms, transforms)
-def test_composition_is_associative(a: Transform, b: Transform, c: Transform) -> None:
-    left, right = compose(compose(a, b), c), compose(a, compose(b, c))
-    assert np.allclose(matrix(left), matrix(right), atol=1e-7)
-
-
 @given(quaternions, quaternions, ratios)
 def test_slerp_is_the_one_of_an_independent_library(
     a: Quaternion, b: Quaternion, ratio: float
@@ -214,16 +171,6 @@ def test_slerp_goes_the_shorter_way(a: Quaternion, b: Quaternion, ratio: float) 
     assert angle_between(a, between) == pytest.approx(ratio * whole, abs=1e-6)
     x, y, z, w = b
     assert angle_between(between, slerp(a, (-x, -y, -z, -w), ratio)) < 1e-6 or whole > 3.14
-
-
-@given(transforms, transforms, ratios)
-def test_an_interpolated_translation_lies_on_the_straight_line(
-    a: Transform, b: Transform, ratio: float
-) -> None:
-    between = interpolate(a, b, ratio)
-    expected = np.array(a.translation) * (1 - ratio) + np.array(b.translation) * ratio
-    assert between.translation == pytest.approx(tuple(expected), abs=1e-9)
-    assert between.rotation == slerp(a.rotation, b.rotation, ratio)
 
 
 # Paths

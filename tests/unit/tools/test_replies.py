@@ -15,7 +15,6 @@ from ros2_memory import results
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import End
 from ros2_memory.analysis.motion.trajectory import Trajectory, Waypoint
-from ros2_memory.analysis.transform_tree import FrameEdge
 from ros2_memory.core.errors import (
     BagVanishedError,
     ConfigError,
@@ -26,7 +25,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.model import Pose, Sample, SetAside, Transform, Twist
+from ros2_memory.core.model import FrameEdge, Pose, Sample, SetAside, Transform, Twist
 from ros2_memory.core.reply import LocalTimes
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
 from ros2_memory.results import Answer
