@@ -42,6 +42,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import keeper_of, recording_now
+from tests.support.log_lines import with_checks
 from tests.support.memories import memory_of
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, words
 
@@ -137,9 +138,10 @@ def huge(path: Path) -> None:
 
 
 def surrogates(path: Path) -> None:
-    text = re.sub(', "crc32": "........"', "", path.read_text())
+    text, checks = re.subn(', "crc32": "........"', "", path.read_text())
     changed = text.replace('"rec_', '"\\ud800rec_').replace('"/', '"/\\ud800')
-    path.write_text(changed.replace(":null", ':"\\ud800"'))
+    changed = changed.replace(":null", ':"\\ud800"')
+    path.write_text(with_checks(changed) if checks else changed)
 
 
 SHAPES: Final[list[Callable[[Path], object]]] = [

@@ -2,8 +2,8 @@
 
 A log is one object a line. Rows are appended and flushed, all of them or none, so a power cut
 leaves at most a part of the last line, which the next append ends. A line ends with a check, so
-that a flipped bit makes no other number; older versions wrote none. A line that is damaged, or of
-another version, spoils no other. A document is one object, which is replaced by rename.
+that a flipped bit makes no other number; one without is not believed. A line that is damaged, or
+of another version, spoils no other. A document is one object, which is replaced by rename.
 
 They stay files, not a database: a person reads them, and so does a server that may not write here,
 while the recorder is killed; SQLite needs to write before it can read what a kill left.
@@ -301,10 +301,10 @@ def _with_check(begun: bytes) -> bytes:
 
 
 def _require_check(line: bytes) -> None:
-    """Raises ValueError where a line has a check, and that fails."""
-    begun, has_check, _ = line.rpartition(_CHECK)
-    if has_check and line != _with_check(begun):
-        raise ValueError("its check (crc32) fails: the line is damaged, or was edited")
+    """Raises ValueError where a line has no check, or that fails."""
+    begun, _, _ = line.rpartition(_CHECK)
+    if line != _with_check(begun):
+        raise ValueError("its check (crc32) is missing or fails: it is damaged, or was edited")
 
 
 def is_integer(value: object) -> TypeGuard[int]:

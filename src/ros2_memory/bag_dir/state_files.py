@@ -51,10 +51,14 @@ _Seconds: TypeAlias = Annotated[float, Field(strict=True, ge=0, le=1e9)]
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """The total recorded time when a recording (its path in the bag directory) last grew."""
+    """The total recorded time when a recording (its path in the bag directory) last grew.
+
+    `clock_right`: the system clock was synchronised while it grew, and was not set.
+    """
 
     recording: str
     recorded_s: _Seconds
+    clock_right: StrictBool = False
 
 
 RECORDED: Final = JsonLog(RECORDED_FILE, Recorded)

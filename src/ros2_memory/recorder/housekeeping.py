@@ -265,7 +265,7 @@ class Housekeeping(Housekeeper):
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
         """Counts the time for which these recordings are written."""
-        self._recorded.note(recordings, bytes_written, monotonic_s)
+        self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
     def _describe_held(self, held: int) -> str | None:
         if not held:

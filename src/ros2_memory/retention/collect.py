@@ -226,21 +226,26 @@ class GarbageCollector:
     def _with_clocks(
         self, stock: RetentionStock, limits: RetentionLimits, run: _Pass
     ) -> RetentionStock:
-        """Adds how long was recorded after each, their order, and whether the clock is right."""
+        """Adds how long was recorded after each, their order, and where the clock was right."""
         names = {
             bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
         }
         since = self._recorded.since(names.values())
+        doubtful = self._recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self._own.in_order())}
         stock = replace(
             stock,
             recorded_since={path: since[name] for path, name in names.items()},
+            doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
         )
         old = ages(stock, limits)
         # Asking starts a program, so only where it matters.
-        if old.by_dates != old.by_recording and run.synchronised is None:
+        matters = old.by_dates != old.by_recording or self._recorded.asks_for_clock()
+        if matters and run.synchronised is None:
             run.synchronised = self._is_synchronised()
+            if run.synchronised:
+                self._recorded.confirm_clock()
         synchronised = bool(run.synchronised)
         run.result.held = len(old.held(synchronised=synchronised) - stock.unshipped)
         return replace(stock, synchronised=synchronised)

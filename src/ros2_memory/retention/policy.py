@@ -2,7 +2,8 @@
 
 Age deletes only by a clock that is known to be right. If the system clock is synchronised, dates
 count; else the monotonic clock does: a bag is too old when more than `max_age_ns` has been recorded
-after it. A bag that only its dates make too old is held.
+after it. A bag that only its dates make too old is held. Where the clock was not known to be right
+when a bag was recorded, its dates never make it old: the monotonic clock alone does.
 
 Nor does age delete what rules may still need, or, where bags must be shipped, what is in no lake.
 The budget and the disk do, the oldest first as ever.
@@ -134,6 +135,7 @@ class RetentionStock:
         saved: the files of moments, which are never deleted; bags may be other names of them.
         recorded_since: how long was recorded after each recording, by the monotonic clock; a
             recording that is missing counts as new.
+        doubtful: the recordings whose dates are not known to be right.
         synchronised: whether the system clock is synchronised.
         foreign_bytes: the size of bags of other programs, which no limit counts.
         state_bytes: how much of `other_bytes` is no recording: `.episodic` and logs.
@@ -150,6 +152,7 @@ class RetentionStock:
     free_bytes: int | None = None
     saved: Sequence[StoredFile] = ()
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
+    doubtful: frozenset[str] = frozenset()
     synchronised: bool = False
     foreign_bytes: int = 0
     state_bytes: int = 0
@@ -159,7 +162,10 @@ class RetentionStock:
 
 
 class Ages(NamedTuple):
-    """The bags that are too old by their dates, and by the time that was recorded after them."""
+    """The bags that are too old by their dates, and by the time that was recorded after them.
+
+    A bag with doubtful dates is too old by both, or by none.
+    """
 
     by_dates: frozenset[str]
     by_recording: frozenset[str]
@@ -372,9 +378,10 @@ def _dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
 
 def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
     old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
-    by_recording = (bag.path for bag in stock.bags if bag.recording in old) if old else ()
-    by_dates = _aged(stock.bags, eras, max_age_ns)
-    return Ages(frozenset(by_dates), frozenset(by_recording))
+    by_recording = frozenset(bag.path for bag in stock.bags if bag.recording in old)
+    doubtful = {bag.path for bag in stock.bags if bag.recording in stock.doubtful}
+    by_dates = _aged(stock.bags, eras, max_age_ns) - doubtful | by_recording & doubtful
+    return Ages(frozenset(by_dates), by_recording)
 
 
 def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:

@@ -1,10 +1,14 @@
-"""Measures the time recorded since each recording ended, independently of the wall clock.
+"""Measures the time recorded since each recording ended, and which of them have right dates.
 
 The monotonic clock starts again at every boot, so recorded time is added up and stored in
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
 with the total recorded time when it last grew. The last line of a recording counts. A recording
 without a line counts as recorded when it is first asked about: nothing shows that it is older. A
 damaged line is ignored, and named in the log.
+
+The dates of a recording are right if the clock was synchronised while it grew, and went along with
+the monotonic clock from its beginning. Those of a recording without a line are doubtful, unless
+there is no file at all, as after a restore: then nothing speaks against any date.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import structlog
 
 from ros2_memory.bag_dir.layout import RECORDED_FILE
 from ros2_memory.bag_dir.state_files import RECORDED, Recorded
-from ros2_memory.core.timebase import Ns, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
@@ -28,6 +32,8 @@ SAVE_S: Final = 60.0
 """A crash loses at most so much of the recorded time, and so bags are kept for longer."""
 LONGEST_SILENCE_S: Final = 60.0
 """A pause in which nothing reached the disk counts as recorded for at most so long."""
+STEP_NS: Final[Ns] = 60 * NS_PER_S
+"""If the clock was set by less, dates are right enough to age by."""
 _MOST_LINES: Final = 20_000
 _MAX_NAMED: Final = 5
 
@@ -48,6 +54,11 @@ class RecordedTime:
         self._loaded = False
         self._total_s = 0.0
         self._last_grew_s: dict[str, float] = {}
+        self._right: set[str] = set()
+        self._was_set: set[str] = set()
+        self._leads: dict[str, Ns] = {}
+        self._synchronised = False
+        self._has_file = True
         self._unsaved: set[str] = set()
         self._lines = 0
         self._grew: tuple[float, int] | None = None
@@ -55,13 +66,16 @@ class RecordedTime:
         self._saved_at_s = -math.inf
         self._reported: str | None = None
 
-    def note(self, recordings: Collection[str], bytes_written: int, monotonic_s: float) -> None:
+    def note(
+        self, recordings: Collection[str], bytes_written: int, monotonic_s: float, now: Ns
+    ) -> None:
         """Counts the time since the last call, if recordings grew in it.
 
         Args:
             recordings: those that are being written.
             bytes_written: how much all recordings wrote since the recorder started.
             monotonic_s: the monotonic clock, in seconds.
+            now: the wall clock.
         """
         with self._lock:
             self._load()
@@ -77,7 +91,8 @@ class RecordedTime:
                 self._last_grew_s[name] = self._total_s
             self._unsaved |= self._recording
             # While nothing is recorded the disk may be away.
-            changed = self._recording != before
+            judged = self._judge_clock(now - ns_from_unix(monotonic_s))
+            changed = judged or self._recording != before
             if recordings and (changed or monotonic_s - self._saved_at_s >= SAVE_S):
                 self._saved_at_s = monotonic_s
                 self._save()
@@ -90,17 +105,59 @@ class RecordedTime:
                 name: ns_from_unix(self._total_s - self._last_grew(name)) for name in recordings
             }
 
+    def doubtful(self, recordings: Iterable[str]) -> frozenset[str]:
+        """Returns those of some recordings whose dates are not known to be right."""
+        with self._lock:
+            self._load()
+            for name in recordings:
+                self._last_grew(name)
+            return frozenset(recordings) - self._right
+
+    def asks_for_clock(self) -> bool:
+        """Whether a recording is being written that a synchronised clock would show to be right."""
+        with self._lock:
+            return not self._recording <= self._right | self._was_set
+
+    def confirm_clock(self) -> None:
+        """Notes that the clock is synchronised, for what is written at the next call of `note`."""
+        with self._lock:
+            self._synchronised = True
+
+    def _judge_clock(self, lead: Ns) -> bool:
+        """Judges the dates of what is being written; returns whether that changed anything.
+
+        `lead` is the wall clock minus the monotonic clock, which changes when the clock is set.
+        """
+        synchronised, self._synchronised = self._synchronised, False
+        if not self._recording:
+            return False
+        before = self._right.copy()
+        self._right -= self._recording - self._leads.keys()
+        self._leads = {name: self._leads.get(name, lead) for name in self._recording}
+        self._was_set &= self._recording
+        self._was_set |= {
+            name for name, begun in self._leads.items() if abs(lead - begun) >= STEP_NS
+        }
+        if synchronised:
+            self._right |= self._recording
+        self._right -= self._was_set
+        return self._right != before
+
     def _last_grew(self, name: str) -> float:
         if name not in self._last_grew_s:
             self._last_grew_s[name] = self._total_s
             self._unsaved.add(name)
+            if not self._has_file:
+                self._right.add(name)
         return self._last_grew_s[name]
 
     def _load(self) -> None:
         if self._loaded:
             return
         self._loaded = True
-        self._last_grew_s = {row.recording: row.recorded_s for row in self._read()}
+        last = {row.recording: row for row in self._read()}
+        self._last_grew_s = {name: row.recorded_s for name, row in last.items()}
+        self._right = {name for name, row in last.items() if row.clock_right}
         if not self._last_grew_s:
             return
         self._total_s = max(self._last_grew_s.values())
@@ -117,6 +174,7 @@ class RecordedTime:
         try:
             lines = [*RECORDED.lines(self._bag_dir)]
         except FileNotFoundError:
+            self._has_file = False
             return []
         except (OSError, ValueError) as error:
             _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
@@ -150,7 +208,9 @@ class RecordedTime:
             self._reported = None
 
     def _rows(self, names: Iterable[str]) -> list[Recorded]:
-        return [Recorded(name, round(self._last_grew_s[name], 3)) for name in names]
+        return [
+            Recorded(name, round(self._last_grew_s[name], 3), name in self._right) for name in names
+        ]
 
 
 def relative_recording(recording: str, bag_dir: Path) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -17,7 +18,7 @@ from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import LIST, ListRow, OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
@@ -26,6 +27,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples
 from tests.support.housekeepers import OURS, embedding, lines, made_moment, own_all
+from tests.support.log_lines import with_checks
 from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:
@@ -306,7 +308,7 @@ class TestWhatAKillLeaves:
     def test_a_line_that_says_nothing_is_left_out_and_told(self, tmp_path: Path, line: Any) -> None:
         own_all(tmp_path)
         with (tmp_path / LIST_FILE).open("a") as stream:
-            stream.write(json.dumps(line) + "\n")
+            stream.write(with_checks(json.dumps(line)))
         with structlog.testing.capture_logs() as logs:
             assert not OwnRecordings(tmp_path).names()
         assert events_named(logs, "recordings_list_damaged")
@@ -497,9 +499,7 @@ class TestBags:
         own = claimed(tmp_path)
         identity = identity_of(tmp_path / A)
         assert identity is not None
-        with (tmp_path / LIST_FILE).open("a") as stream:
-            line = {"recording": A, "inode": identity.inode, "generation": identity.generation}
-            stream.write(json.dumps(line) + "\n")
+        LIST.append(tmp_path, [ListRow("", A, identity.inode, identity.generation)])
         for _ in range(2):
             assert own.owns_bag(path)
             assert not own.owns_bag(other)
@@ -520,9 +520,7 @@ class TestBags:
     ) -> None:
         path = embedding(tmp_path / "runs" / "x_0.mcap", None)
         own_all(tmp_path)
-        rows = [json.loads(line) for line in (tmp_path / LIST_FILE).read_text().splitlines()]
-        kept = [{k: v for k, v in row.items() if k not in {"bags", "crc32"}} for row in rows]
-        (tmp_path / LIST_FILE).write_text("".join(f"{json.dumps(row)}\n" for row in kept))
+        LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
         assert OwnRecordings(tmp_path).owns_bag(path)
 
     def test_carried_messages_and_moments(self, tmp_path: Path) -> None:

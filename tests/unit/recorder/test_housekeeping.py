@@ -23,6 +23,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import (
     PLENTY,
     files_in,
@@ -173,6 +174,29 @@ class TestRetention:
         keeper.apply()
         assert files_in(tmp_path / "b") == ["b_0.mcap"]
         assert not old.exists()
+
+    def test_a_first_boot_with_a_clock_that_is_behind_costs_nothing_once_it_is_right(
+        self, tmp_path: Path
+    ) -> None:
+        hour, clock, is_right = 3600, SettableClock(T0 - 165 * HOUR), Mock(return_value=False)
+        keeper = keeper_of(tmp_path, max_age_h=168, clock=clock, is_synchronised=is_right)
+        behind = bag(tmp_path / "a/a_0.mcap", -165 * hour)
+        keeper.note_recorded(["a"], 0, 0.0)
+        keeper.apply()
+        is_right.return_value = True
+        clock.at = T0 + 4 * HOUR
+        keeper.note_recorded(["b"], 1, 4.0 * hour)
+        right = bag(tmp_path / "b/b_0.mcap", 2 * hour)
+        bag(tmp_path / "b/b_1.mcap", 4 * hour)
+        keeper.apply()
+        assert behind.exists()
+        keeper.note_recorded(["b"], 2, 4.0 * hour)
+        for name, at_h in (("c", 100), ("d", 173)):
+            clock.at = T0 + at_h * HOUR
+            keeper.note_recorded([name], at_h, float(at_h * hour))
+            bag(tmp_path / f"{name}/{name}_0.mcap", at_h * hour)
+        keeper.apply()
+        assert (behind.exists(), right.exists()) == (True, False)
 
     def test_it_is_reported_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)

@@ -8,17 +8,26 @@ from pathlib import Path
 import pytest
 import structlog
 
+from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
+from tests.support.log_lines import with_checks
 
 S = 10**9
+T0_S = 1_790_000_000.0
 FILE = ".episodic/recorded.jsonl"
 
 
-def recorded(time: RecordedTime, name: str, seconds: int, *, since_s: float = 0.0) -> float:
-    """Has one recording grow every second; the monotonic time at its end."""
+def recorded(
+    time: RecordedTime, name: str, seconds: int, *, since_s: float = 0.0, lead_s: float = T0_S
+) -> float:
+    """Has one recording grow every second; the monotonic time at its end.
+
+    The wall clock is so far ahead of the monotonic one.
+    """
     for second in range(seconds + 1):
-        time.note([name], round(since_s) + second, since_s + second)
+        at_s = since_s + second
+        time.note([name], round(since_s) + second, at_s, ns_from_unix(lead_s + at_s))
     return since_s + seconds
 
 
@@ -63,23 +72,72 @@ def test_what_was_never_seen_is_new(tmp_path: Path) -> None:
 def test_silence_does_not_count_for_more_than_a_minute(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     time = RecordedTime(tmp_path)
-    time.note(["a"], 0, 0.0)
-    time.note(["b"], 1, 1.0)
-    time.note(["b"], 1, 3000.0)
+    time.note(["a"], 0, 0.0, 0)
+    time.note(["b"], 1, 1.0, 0)
+    time.note(["b"], 1, 3000.0, 0)
     assert time.since(["a"]) == {"a": 1 * S}
-    time.note(["b"], 2, 3600.0)
+    time.note(["b"], 2, 3600.0, 0)
     assert time.since(["a"]) == {"a": 61 * S}
 
 
 def test_pauses_do_not_count_and_write_nothing(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     time = RecordedTime(tmp_path)
-    time.note([], 0, 0.0)
+    time.note([], 0, 0.0, 0)
     assert not (tmp_path / ".episodic").exists()
     end = recorded(time, "a", 10)
-    time.note([], 1000, end + 1)
+    time.note([], 1000, end + 1, 0)
     recorded(time, "b", 5, since_s=end + 5000)
     assert time.since(["a"]) == {"a": 5 * S}
+
+
+def test_dates_are_right_once_a_synchronised_clock_confirms_them(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    time = RecordedTime(tmp_path)
+    end = recorded(time, "a", 20)
+    assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset("a"), True)
+    time.confirm_clock()
+    end = recorded(time, "a", 20, since_s=end)
+    assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset(), False)
+    recorded(time, "b", 20, since_s=end)
+    assert (time.doubtful("ab"), time.asks_for_clock()) == (frozenset("b"), True)
+    assert RecordedTime(tmp_path).doubtful("ab") == {"b"}
+
+
+def test_dates_of_a_recording_in_which_the_clock_was_set_stay_doubtful(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    for before, after in ((T0_S - 3600, T0_S), (T0_S, T0_S + 3600)):
+        time = RecordedTime(tmp_path)
+        end = recorded(time, "a", 20, lead_s=before)
+        time.confirm_clock()
+        end = recorded(time, "a", 20, since_s=end, lead_s=after)
+        end = recorded(time, "a", 20, since_s=end, lead_s=before)
+        time.confirm_clock()
+        end = recorded(time, "a", 20, since_s=end, lead_s=after)
+        assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset("a"), False)
+        time.confirm_clock()
+        recorded(time, "b", 20, since_s=end, lead_s=after)
+        assert RecordedTime(tmp_path).doubtful("ab") == {"a"}
+
+
+def test_a_step_of_a_second_leaves_dates_right(tmp_path: Path) -> None:
+    folders(tmp_path, "a")
+    time = RecordedTime(tmp_path)
+    end = recorded(time, "a", 20)
+    time.confirm_clock()
+    recorded(time, "a", 20, since_s=end, lead_s=T0_S + 1)
+    assert time.doubtful(["a"]) == frozenset()
+
+
+def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    assert RecordedTime(tmp_path).doubtful("ab") == frozenset()
+    (tmp_path / ".episodic").mkdir()
+    (tmp_path / FILE).write_text('{"recording": "a", "recorded_s": 90, "clock_right": true}\n')
+    time = RecordedTime(tmp_path)
+    assert time.doubtful("ab") == {"a", "b"}
+    recorded(time, "c", 20)
+    assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
 
 
 def test_lines_that_mean_nothing_are_passed_by(tmp_path: Path) -> None:
@@ -88,7 +146,7 @@ def test_lines_that_mean_nothing_are_passed_by(tmp_path: Path) -> None:
     odd = ['{"recording": "c", "recor', "[1]", '{"recording": 3, "recorded_s": 9}', "[" * 5000]
     odd += ['{"recording": "b", "recorded_s": 1e999}', '{"recording": "b", "recorded_s": NaN}', "é"]
     lines = ['{"recording": "a", "recorded_s": 100}', *odd, '{"recording": "b", "recorded_s": 150}']
-    (tmp_path / FILE).write_text("\n".join(lines))
+    (tmp_path / FILE).write_text(with_checks("\n".join(lines)))
     time = RecordedTime(tmp_path)
     assert time.since(["a", "b", "c"]) == {"a": 50 * S, "b": 0, "c": 0}
 
@@ -107,7 +165,9 @@ def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: 
         flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)
         with structlog.testing.capture_logs() as captured:
-            found = RecordedTime(tmp_path).since("abc")
+            spoiled = RecordedTime(tmp_path)
+            found = spoiled.since("abc")
+        assert spoiled.doubtful("abc") == {*"abc"}
         # A flipped line end spoils two lines, and the one before these is two minutes older.
         assert all(found[name] <= right[name] + 2 * SAVE_S * S for name in "abc")
         if found != right:
@@ -116,12 +176,20 @@ def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: 
             assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
 
 
+def test_a_line_without_a_check_makes_nothing_older(tmp_path: Path) -> None:
+    folders(tmp_path, "a", "b")
+    (tmp_path / ".episodic").mkdir()
+    whole = with_checks('{"recording": "a", "recorded_s": 100}')
+    (tmp_path / FILE).write_text(whole + '{"recording": "b", "recorded_s": 90000}\n')
+    assert RecordedTime(tmp_path).since("ab") == {"a": 0, "b": 0}
+
+
 def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:
     folders(tmp_path, "b", "c")
     (tmp_path / ".episodic").mkdir()
     given = {"gone": 10, "b": 100, "gone too": 200}
     lines = [json.dumps({"recording": n, "recorded_s": s}) for n, s in given.items()]
-    (tmp_path / FILE).write_text("\n".join(lines))
+    (tmp_path / FILE).write_text(with_checks("\n".join(lines)))
     time = RecordedTime(tmp_path)
     recorded(time, "c", 1)
     kept = [json.loads(line) for line in (tmp_path / FILE).read_text().split("\n") if line]

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.bag_dir.layout import RECORDED_FILE
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
 from ros2_memory.retention.policy import (
@@ -127,21 +128,30 @@ class TestAClockThatWasBehind:
 def test_a_clock_that_was_behind_ages_nothing_young(
     drawn: list[tuple[int, bool, int, bool]], limit_days: int
 ) -> None:
+    """It recorded without a pause; the dates of a clock that was behind are doubtful."""
     limits, now = RetentionLimits(PLENTY, limit_days * DAY), T0
-    bags, true_ends = list[StoredBag](), dict[str, int]()
+    bags, true_ends, doubtful = list[StoredBag](), dict[str, int](), set[str]()
     for nth, (off_days, is_behind, by_days, is_empty) in enumerate(drawn):
         now += off_days * DAY
-        newest = max((each.end for each in bags if each.has_dates), default=now)
-        # A clock that shows a time after the newest before it cannot be told from a right one.
-        end = newest - S - by_days * DAY if is_behind and bags else now
+        end = now - by_days * DAY if is_behind else now
         span = (MAX_NS, MIN_NS) if is_empty and bags else (end - S, end)
         bags.append(bag(f"rec_{nth}", nth, *span)._replace(written=end))
         true_ends[bags[-1].path] = now
+        if is_behind:
+            doubtful.add(bags[-1].recording)
     places = {each.recording: place for place, each in enumerate(bags)}
-    stock = RetentionStock(bags, now, places=places, synchronised=True)
-    aged = expired(stock, limits)
-    assert all(now - true_ends[each.path] > limits.max_age_ns for each in aged)
-    assert set(aged) <= set(bags)
+    stock = RetentionStock(
+        bags,
+        now,
+        places=places,
+        synchronised=True,
+        recorded_since={each.recording: now - true_ends[each.path] for each in bags},
+        doubtful=frozenset(doubtful),
+    )
+    aged = set(expired(stock, limits))
+    old = {each for each in bags if now - true_ends[each.path] > limits.max_age_ns}
+    assert aged <= old
+    assert len({each for each in old if each.recording in doubtful} - aged) <= 1, "the newest stays"
 
 
 def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
@@ -180,48 +190,73 @@ def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
 class Life:
     """A robot that records a minute at a time, whose clock shows what it likes.
 
-    `lived` is the true recorded time; `after` is by bag how much of it lay before its end.
+    `lead` is how far its clock is ahead of the true time. `lived_s` is the recorded time, and
+    `ended_s` how much of it lay before the end of each bag; `true_ends` is when that was.
     """
 
     root: Path
     wall: int = T0
+    lead: int = 0
     monotonic_s: float = 0.0
     lived_s: float = 0.0
     bytes_written: int = 0
     bags: list[StoredBag] = field(default_factory=list)
     ended_s: dict[str, float] = field(default_factory=dict)
+    true_ends: dict[str, int] = field(default_factory=dict)
+    right: set[str] = field(default_factory=set)
     recordings: int = 0
 
     def __post_init__(self) -> None:
         self.recorded = RecordedTime(self.root)
+
+    @property
+    def true_now(self) -> int:
+        return self.wall - self.lead
 
     def boot(self) -> None:
         """Without a word: what was not saved is forgotten."""
         self.recorded = RecordedTime(self.root)
         self.monotonic_s, self.bytes_written = 3.0, 0
 
-    def record(self, minutes: int, step: int = 0) -> None:
-        """So many recordings of a minute; the clock steps in the middle of the last."""
+    def record(self, minutes: int, step: int = 0, *, has_server: bool = True) -> None:
+        """So many recordings of a minute; the clock steps in the middle of the last.
+
+        `has_server`: a time server says so where the clock is right.
+        """
         for nth in range(minutes):
             self.recordings += 1
             name = f"rec_{self.recordings}"
             (self.root / name).mkdir()
             start = self.wall
-            self.recorded.note([name], self.bytes_written, self.monotonic_s)
-            self.wall += MINUTE + (step if nth == minutes - 1 else 0)
+            self.note(name, has_server=has_server)
+            is_right, stepped = not self.lead, step if nth == minutes - 1 else 0
+            self.lead += stepped
+            self.wall += MINUTE + stepped
             self.monotonic_s += 60.0
             self.lived_s += 60.0
             self.bytes_written += 10
-            self.recorded.note([name], self.bytes_written, self.monotonic_s)
+            self.note(name, has_server=has_server)
             first, last = sorted((start, self.wall))
             made = bag(name, self.recordings, first, last)._replace(written=self.wall)
             self.bags.append(made)
             self.ended_s[made.path] = self.lived_s
+            self.true_ends[made.path] = self.true_now
+            if has_server and is_right and not stepped:
+                self.right.add(made.path)
+
+    def note(self, recording: str, *, has_server: bool) -> None:
+        if has_server and not self.lead:
+            self.recorded.confirm_clock()
+        self.recorded.note([recording], self.bytes_written, self.monotonic_s, self.wall)
 
     def stock(self, *, synchronised: bool) -> RetentionStock:
-        since = self.recorded.since({bag.recording for bag in self.bags})
+        names = {bag.recording for bag in self.bags}
         return RetentionStock(
-            tuple(self.bags), self.wall, recorded_since=since, synchronised=synchronised
+            tuple(self.bags),
+            self.wall,
+            recorded_since=self.recorded.since(names),
+            doubtful=self.recorded.doubtful(names),
+            synchronised=synchronised,
         )
 
     def recorded_after(self, bag: StoredBag) -> int:
@@ -256,32 +291,66 @@ def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(
     limits = RetentionLimits(size, AGE)
     with tempfile.TemporaryDirectory() as folder:
         life = Life(Path(folder))
-        true_lead = 0
-        for (event, amount, step), synchronised in drawn:
+        for (event, amount, step), has_server in drawn:
             if event == "record":
-                life.record(amount, step)
-                true_lead += step
+                life.record(amount, step, has_server=has_server)
             elif event == "off":
                 life.wall += amount * DAY
                 life.boot()
             elif event == "no clock":
-                true_lead -= life.wall - 30 * S
+                life.lead -= life.wall - 30 * S
                 life.wall = 30 * S
                 life.boot()
             else:
-                life.wall -= true_lead
-                true_lead = 0
+                life.wall -= life.lead
+                life.lead = 0
+            synchronised = has_server and not life.lead
             held = life.stock(synchronised=synchronised)
             aged = set(expired(held, RetentionLimits(PLENTY, AGE)))
-            if synchronised:
-                assert {bag.path for bag in aged} == too_old_by_dates(life.bags, life.wall, AGE)
-            else:
-                assert all(life.recorded_after(bag) > AGE for bag in aged)
-                # Each boot may have forgotten a minute of it.
-                boots = sum(each[0][0] in {"off", "no clock"} for each in drawn)
-                sure = AGE + boots * MINUTE
-                old = {bag for bag in life.bags if life.recorded_after(bag) > sure}
-                assert len(old - aged) <= 1, "the newest alone stays"
+            assert all(life.true_now - life.true_ends[bag.path] > AGE for bag in aged)
+            right = life.right if synchronised else set[str]()
+            by_dates = too_old_by_dates(life.bags, life.wall, AGE) & right
+            assert {bag.path for bag in aged if bag.path in right} == by_dates
+            doubtful = {bag for bag in life.bags if bag.path not in right}
+            assert all(life.recorded_after(bag) > AGE for bag in aged & doubtful)
+            # Each boot may have forgotten a minute of it.
+            boots = sum(each[0][0] in {"off", "no clock"} for each in drawn)
+            sure = AGE + boots * MINUTE
+            old = {bag for bag in doubtful if life.recorded_after(bag) > sure}
+            assert len(old - aged) <= 1, "the newest alone stays"
             life.delete(expired(held, limits))
             left = life.stock(synchronised=synchronised)
             assert plan_deletions(left, limits).total_bytes <= size or len(life.bags) == 1
+
+
+@given(
+    st.lists(
+        st.one_of(
+            st.tuples(st.just("record"), st.integers(1, 12)),
+            st.tuples(st.just("off"), st.integers(1, 40)),
+            st.tuples(st.just("record lost"), st.just(0)),
+        ),
+        min_size=1,
+        max_size=14,
+    )
+)
+@settings(deadline=None)
+def test_where_the_clock_was_always_right_age_deletes_by_dates_whatever_was_restored(
+    drawn: list[tuple[str, int]],
+) -> None:
+    limits = RetentionLimits(PLENTY, AGE)
+    with tempfile.TemporaryDirectory() as folder:
+        life = Life(Path(folder))
+        for event, amount in drawn:
+            if event == "record":
+                life.record(amount)
+            elif event == "off":
+                life.wall += amount * 5 * MINUTE
+                life.boot()
+            else:
+                (life.root / RECORDED_FILE).unlink(missing_ok=True)
+                life.boot()
+            aged = expired(life.stock(synchronised=True), limits)
+            expected = too_old_by_dates(life.bags, life.wall, AGE)
+            assert {bag.path for bag in aged} == expected
+            life.delete(aged)
