@@ -42,6 +42,7 @@ from tests.support.lakes import (
     ship,
     write_bag,
 )
+from tests.support.log_lines import with_checks
 
 MARKER = "zyxwv-9876"
 """Short enough for the bounds of a column, which are cut after 16 characters."""
@@ -214,7 +215,8 @@ def test_a_list_of_what_was_forgotten_that_cannot_be_read_keeps_its_robot_from_b
     write_bag(other, 0)
     path = bag_dir / FORGOTTEN_FILE
     # A crash cut the first line short.
-    path.write_text('{"start": 1, "sto\n{"start": 1, "stop": 2, "topics": ["/a"]}\n')
+    whole = with_checks('{"start": 1, "stop": 2, "topics": ["/a"]}')
+    path.write_text('{"start": 1, "sto\n' + whole)
     assert read_forgettings(bag_dir) == [Forgetting(1, 2, ("/a",))]
     path.write_text('{"start": 1, "stop": 2}\n')
     done = ship(tmp_path / "lake", [robot_bags("hall", bag_dir), robot_bags("kitchen", other)])
