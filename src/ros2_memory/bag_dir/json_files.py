@@ -142,8 +142,8 @@ class JsonLog(Generic[_T]):
                 yield line.number, line.row
             elif not isinstance(line.error, json.JSONDecodeError):
                 raise ValueError(f"line {line.number}: {line.error}")
-            # A whole line ends with its check.
-            elif not line.text.startswith(b"{") or line.text.endswith(b'"}'):
+            # A whole line ends with its check, or before there was one with a list.
+            elif not line.text.startswith(b"{") or line.text.endswith((b"]}", b'"}')):
                 raise ValueError(f"line {line.number}: it is damaged: {line.error}")
 
     def text(self, rows: Iterable[_T]) -> str:
