@@ -136,6 +136,21 @@ def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    ("words", "more"), [(["server.page=false"], {}), ([], {"MEMORY_DEPLOYMENT": "spec"})]
+)
+def test_a_page_that_is_not_served_is_not_announced(
+    bag_dir: Path, tmp_path: Path, words: list[str], more: dict[str, str]
+) -> None:
+    program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir), *words]
+    with serving(bag_dir, tmp_path / "log", program=program, **more) as served:
+        assert served.get("/")[0] == 404
+        served.process.terminate()
+        served.process.wait(PATIENCE_S)
+        assert served.process.stdout is not None
+        assert served.process.stdout.read() == b""
+
+
+@pytest.mark.parametrize(
     ("how", "display", "is_terminal", "opened"),
     [
         ("open", ":0", True, 1),
