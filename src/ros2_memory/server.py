@@ -149,8 +149,8 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
                 page=parts.page,
                 limited=limited,
             )
-            shows = page is not None and parts.page is not None
-            serve_http(server, app, address, partial(_show_page, page) if shows else None)
+            shown = None if parts.page is None else page
+            serve_http(server, app, address, partial(_show_page, shown) if shown else None)
     except SystemExit:
         log.info("stopped")
     finally:

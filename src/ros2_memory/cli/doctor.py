@@ -117,7 +117,8 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         return
     yield Finding(Level.OK, "config", f"files in use: {', '.join(files_in_use(settings))}")
     if unused := unused_config():
-        yield Finding(Level.WARNING, "config", unused, "set that, or rename the file if it is of another program")
+        do = "set that, or rename the file if it is another program's"
+        yield Finding(Level.WARNING, "config", unused, do)
     if memory is None:
         for name in robots:
             yield from _of_robot(name, robot_settings(settings, name), verbose=bags.verbose)

@@ -115,9 +115,9 @@ def prove(
     else:
         same = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
         typer.echo(same, err=True)
-    if undefined:
-        typer.echo(f"note: {describe_undefined(undefined)}", err=True)
-    if differing or undefined:
+    if lacking := describe_undefined(undefined):
+        typer.echo(f"note: {lacking}", err=True)
+    if differing or lacking:
         raise typer.Exit(EXIT_NEGATIVE)
 
 

@@ -342,9 +342,7 @@ class TestMcap:
     def test_types_without_any_definition_are_named_and_the_exit_code_is_1(
         self, tmp_path: Path, exits: Program
     ) -> None:
-        odd = [
-            Msg(f"/odd_{n}", f"nobody_msgs/msg/Knows{n}", T0, b"\0\1\0\0\0") for n in range(5)
-        ]
+        odd = [Msg(f"/odd_{n}", f"nobody_msgs/msg/Knows{n}", T0, b"\0\1\0\0\0") for n in range(5)]
         write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [*odd, *odd], definitions=False)
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--bag-dir"]
         err = exits(1, *words, tmp_path / "bags", "deployment=replay").err

@@ -2,9 +2,10 @@
 
 The new recorder is started beside the old one, and waits until it has subscribed to all topics of
 the old one, but not for ever, since a publisher may be gone. Then both run for `BOTH_S`, since who
-has subscribed receives nothing before the publishers discovered that. The cut lies in the middle of those: messages published around it are in both recordings, so that a
-message in transit, or a clock that is off by less than a second, loses and doubles nothing. A
-recorder that stalled meanwhile lost what was published: `union` finds that in the other one.
+has subscribed receives nothing before the publishers discovered that. The cut lies in the middle of
+those: messages published around it are in both recordings, so that a message in transit, or a clock
+that is off by less than a second, loses and doubles nothing. A recorder that stalled meanwhile lost
+what was published: `union` finds that in the other one.
 """
 
 from __future__ import annotations
