@@ -707,6 +707,33 @@ def config_dir(env: Mapping[str, str]) -> Path:
     return folder
 
 
+def files_in_use(settings: Settings) -> list[str]:
+    """Returns the paths of the configuration's files, with those that its keys name."""
+    recording, data = settings.recording, settings.data
+    named = (
+        config_dir(os.environ) / "config.yaml",
+        recording.topics_file,
+        recording.keep_when,
+        recording.exclude_when,
+        data.labels_file,
+        data.places_file,
+        settings.reader.schemas_file,
+    )
+    return [str(path.absolute()) for path in named if path is not None]
+
+
+def unused_config() -> str | None:
+    """Returns that a `config/config.yaml` of the working directory is not used, if it is there.
+
+    It may be another program's, and what it names is run (`recorder.setup_files`): one has to
+    choose it.
+    """
+    used, beside = config_dir(os.environ) / "config.yaml", Path("config/config.yaml").absolute()
+    if os.environ.get("MEMORY_CONFIG_DIR") or not beside.is_file() or beside.samefile(used):
+        return None
+    return f"{beside} is not used, but {used}; MEMORY_CONFIG_DIR={beside.parent} chooses its folder"
+
+
 def load_message_schemas(settings: Settings) -> Mapping[str, Mapping[str, str]]:
     """Returns the schema map of `reader.schemas_file`: message type to {field name: dot-path}.
 

@@ -81,7 +81,12 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
     """
     from ros2_memory.bootstrap import build_memory, build_telemetry
     from ros2_memory.bootstrap_fleet import build_fleet
-    from ros2_memory.config import exit_on_config_error, load_settings
+    from ros2_memory.config import (
+        exit_on_config_error,
+        files_in_use,
+        load_settings,
+        unused_config,
+    )
 
     with exit_on_config_error(PROGRAM):
         settings = load_settings(overrides)
@@ -106,7 +111,15 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
     bag_dir = str(settings.recording.bag_dir.absolute())
     if fleet is not None:
         bag_dir = f"those of {counted(len(fleet.robots), 'robot')}"
-    log.info("starting", version=package_version(), bag_dir=bag_dir, transport=at.transport)
+    log.info(
+        "starting",
+        version=package_version(),
+        bag_dir=bag_dir,
+        transport=at.transport,
+        files=files_in_use(settings),
+    )
+    if unused := unused_config():
+        log.warning("config_unused", reason=unused)
     if fleet is None:
         from ros2_memory.serving.health import refresh_logged
 
@@ -136,7 +149,8 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
                 page=parts.page,
                 limited=limited,
             )
-            serve_http(server, app, address, partial(_show_page, page) if page else None)
+            shown = None if parts.page is None else page
+            serve_http(server, app, address, partial(_show_page, shown) if shown else None)
     except SystemExit:
         log.info("stopped")
     finally:

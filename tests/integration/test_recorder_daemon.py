@@ -207,6 +207,8 @@ def test_a_signal_ends_it_and_every_file_is_complete(site: Site, number: int) ->
     child = daemon.child
     assert daemon.stop(number) == 0
     assert not Path(f"/proc/{child}").exists()
+    (starting,) = daemon.events("starting")
+    assert str(site.topics) in starting["files"]
     (recording,) = daemon.recordings()
     assert (recording / "metadata.yaml").exists()
     states = {McapReader().closing(path) for path in recording.glob("*.mcap")}

@@ -107,11 +107,17 @@ def serving(
 
 
 def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> None:
+    beside = tmp_path / "config"
+    beside.mkdir()
+    (beside / "places.yaml").write_text("places: {}\n")
+    (beside / "config.yaml").write_text("server: {page: false}\n")
     env = environment(tmp_path / "elsewhere", MCP_PORT="0", DISPLAY=":99", BROWSER="false")
     del env["MEMORY_BAG_DIR"]
     program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir)]
     with (tmp_path / "log").open("wb") as log:
-        process = subprocess.Popen(program, env=env, stdout=subprocess.PIPE, stderr=log, text=True)
+        process = subprocess.Popen(
+            program, env=env, stdout=subprocess.PIPE, stderr=log, text=True, cwd=tmp_path
+        )
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
@@ -121,9 +127,27 @@ def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> No
         assert (status, b"<html" in page) == (200, True)
         (starting,) = (each for each in served.events() if each["event"] == "starting")
         assert starting["bag_dir"] == str(bag_dir)
+        assert str(beside / "places.yaml") in starting["files"]
+        (unused,) = (each for each in served.events() if each["event"] == "config_unused")
+        assert str(beside / "config.yaml") in unused["reason"]
     finally:
         process.kill()
         process.communicate()
+
+
+@pytest.mark.parametrize(
+    ("words", "more"), [(["server.page=false"], {}), ([], {"MEMORY_DEPLOYMENT": "spec"})]
+)
+def test_a_page_that_is_not_served_is_not_announced(
+    bag_dir: Path, tmp_path: Path, words: list[str], more: dict[str, str]
+) -> None:
+    program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir), *words]
+    with serving(bag_dir, tmp_path / "log", program=program, **more) as served:
+        assert served.get("/")[0] == 404
+        served.process.terminate()
+        served.process.wait(PATIENCE_S)
+        assert served.process.stdout is not None
+        assert served.process.stdout.read() == b""
 
 
 @pytest.mark.parametrize(

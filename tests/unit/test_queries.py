@@ -228,7 +228,7 @@ def test_without_a_bag_directory_it_is_not_reported_that_nothing_was_recorded(
     tmp_path: Path,
 ) -> None:
     memory = memory_of(tmp_path / "away")
-    with pytest.raises(NoDataError, match="the bag directory does not exist"):
+    with pytest.raises(NoDataError, match=r"the bag directory does not exist.*check \.\.\./away"):
         queries.list_recorded_topics(memory, Call())
     assert queries.list_recorded_topics(memory_of(tmp_path), Call()) == ()
 

@@ -90,7 +90,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "copy a time window to MCAP or Parquet",
         {
             0: "the whole window was copied",
-            1: "part of it could not be read, or has no definition (stderr names it)",
+            1: "part of it could not be read or decoded, or has no definition (stderr names it)",
         },
     ),
     "prove": CommandEntry(
@@ -98,7 +98,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "write the messages that an answer rests on to MCAP",
         {
             0: "the same question over the file gives the same answer",
-            1: "its answer differs (stderr names the keys)",
+            1: "its answer differs, or a type in it has no definition (stderr names them)",
         },
     ),
     "forget": CommandEntry(

@@ -38,7 +38,7 @@ from ros2_memory.cli.options import (
     stdout_console,
 )
 from ros2_memory.cli.output import escape
-from ros2_memory.config import NullRecorderNode, Settings, config_dir
+from ros2_memory.config import NullRecorderNode, Settings, files_in_use, unused_config
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
@@ -115,7 +115,10 @@ def _examine(bags: Bags) -> Iterator[Finding]:
     except ConfigError as refused:
         yield Finding(Level.ERROR, "config", str(refused), "correct the key that it names")
         return
-    yield Finding(Level.OK, "config", f"composed from {config_dir(os.environ)}")
+    yield Finding(Level.OK, "config", f"files in use: {', '.join(files_in_use(settings))}")
+    if unused := unused_config():
+        do = "set that, or rename the file if it is another program's"
+        yield Finding(Level.WARNING, "config", unused, do)
     if memory is None:
         for name in robots:
             yield from _of_robot(name, robot_settings(settings, name), verbose=bags.verbose)

@@ -28,7 +28,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.core.text import counted, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
@@ -105,19 +105,17 @@ def export(
             )
         messages = _reported(chain(earlier, first, within), report)
         undefined: list[str] = []
+        lacking = ""
         if mcap is not None:
             messages = with_definitions(messages, memory.reader, undefined)
             path, files = mcap, None
             count = write_mcap(mcap, messages, profile_of(view, topics, window, earlier))
+            lacking = describe_undefined(undefined)
         elif parquet is not None:
             path = parquet
-            count, files = _write_parquet(parquet, messages, memory, robot)
-    if undefined:
-        view.notes.add(
-            f"{listed(undefined)} {'has' if len(undefined) == 1 else 'have'} no definition in "
-            "the bags, in reader.custom_msg_paths or among the standard types, and none in the "
-            "file: other programs cannot read such messages"
-        )
+            count, files, lacking = _write_parquet(parquet, messages, memory, robot)
+    if lacking:
+        view.notes.add(lacking)
     if as_json:
         done = {"path": str(path), "messages": count, "files": files or 1}
         print_line(json.dumps(done | {"notes": [*view.notes.sentences()]}))
@@ -126,7 +124,7 @@ def export(
         print_line(f"{counted(count, 'message')} {where}")
     for note in view.notes.sentences():
         typer.echo(f"note: {with_local_times(note)}", err=True)
-    if undefined or not view.notes.complete or lost_in(view.snapshot, window):
+    if lacking or not view.notes.complete or lost_in(view.snapshot, window):
         raise typer.Exit(EXIT_NEGATIVE)
 
 
@@ -216,6 +214,17 @@ def with_definitions(
         yield each._replace(record=each.record._replace(channel=defined(each.record.channel)))
 
 
+def describe_undefined(types: Sequence[str]) -> str:
+    """Returns the sentence on types that an MCAP file has no definition of; empty without any."""
+    if not types:
+        return ""
+    return (
+        f"{', '.join(types)} {'has' if len(types) == 1 else 'have'} no definition in the bags, in "
+        "reader.custom_msg_paths or among the standard types, and none in the file: other "
+        "programs cannot read such messages"
+    )
+
+
 def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> int:
     """Writes an MCAP file, which appears when it is complete; returns the number of messages.
 
@@ -251,8 +260,10 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS
 
 def _write_parquet(
     path: Path, messages: Iterator[StoredMessage], memory: Memory, robot: str | None
-) -> tuple[int, int]:
-    """Writes rows of Parquet; returns the numbers of rows and of files.
+) -> tuple[int, int, str]:
+    """Writes rows of Parquet.
+
+    Returns the numbers of rows and of files, and a sentence on types of which rows have no value.
 
     Raises:
         ConfigError: the optional dependency is missing.
@@ -266,7 +277,14 @@ def _write_parquet(
         ) from error
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
-    return dataset.rows, dataset.files
+    lacking = ""
+    if dataset.undecoded:
+        types = ", ".join(sorted(dataset.undecoded))
+        lacking = (
+            f"messages of {types} cannot be decoded: their rows have no value, and `undecodable` "
+            "says why"
+        )
+    return dataset.rows, dataset.files, lacking
 
 
 def _reported(

@@ -97,6 +97,11 @@ class Dataset:
         reader: decodes messages.
         extractor: extracts their values and poses.
         robot: the name of a further partition, so that many robots share a dataset.
+
+    Attributes:
+        rows: how many were written.
+        files: how many.
+        undecoded: the types of messages of which rows have no value.
     """
 
     def __init__(
@@ -111,6 +116,7 @@ class Dataset:
         self._cleanup = ExitStack()
         self.rows = 0
         self.files = 0
+        self.undecoded: set[str] = set()
 
     def write(self, messages: Iterable[StoredMessage]) -> None:
         """Writes all messages; the files appear at the end, or none where it fails.
@@ -172,6 +178,7 @@ class Dataset:
         try:
             message = self._reader.decode(record)
         except UndecodableError as error:
+            self.undecoded.add(channel.type)
             return (*row, None, error.reason, None, *_NO_POSE)
         shown = self._extractor.shown(message, channel.type)
         # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.

@@ -15,7 +15,7 @@ import typer
 
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_tools, question_for
-from ros2_memory.cli.export import profile_of, with_definitions, write_mcap
+from ros2_memory.cli.export import describe_undefined, profile_of, with_definitions, write_mcap
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     LOOKING,
@@ -89,11 +89,12 @@ def prove(
     parts = _parts(view)
     if not parts:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing is recorded: see ros2-memory info")
+    undefined: list[str] = []
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
         for nth, spans in enumerate(_more_and_more(view, reads.spans(), parts)):
             path = Path(folder) / str(nth) / output.name
             path.parent.mkdir()
-            count = _write(path, view, spans, parts)
+            count = _write(path, view, spans, parts, undefined)
             settings = load_to_look(None, [str(path), *LOOKING, _LONG, *others])
             found = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
             beside, differing = _differing(expected, found)
@@ -111,8 +112,13 @@ def prove(
         apart = len(parts) > 1 and output.suffix == ".mcap"
         hint = f"; -o {output.with_suffix('')} keeps recordings apart" if apart else ""
         typer.echo(f"over {output} the answer differs in {listed(differing)}{hint}", err=True)
+    else:
+        same = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
+        typer.echo(same, err=True)
+    if lacking := describe_undefined(undefined):
+        typer.echo(f"note: {lacking}", err=True)
+    if differing or lacking:
         raise typer.Exit(EXIT_NEGATIVE)
-    typer.echo(f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}", err=True)
 
 
 class _Reads:
@@ -217,16 +223,20 @@ def _more_and_more(
 
 
 def _write(
-    path: Path, view: View, spans: Mapping[str, Spans], parts: Sequence[tuple[Path, TimeWindow]]
+    path: Path,
+    view: View,
+    spans: Mapping[str, Spans],
+    parts: Sequence[tuple[Path, TimeWindow]],
+    undefined: list[str],
 ) -> int:
     """Writes the messages of these times by topic: a file, or one for each part in a folder.
 
-    Returns how many.
+    Returns how many; collects types without a definition.
     """
     profile = profile_of(view, [*spans], TimeWindow.everything(), ())
 
     def written(path: Path, messages: Iterator[StoredMessage]) -> int:
-        return write_mcap(path, with_definitions(messages, view.memory.reader, []), profile)
+        return write_mcap(path, with_definitions(messages, view.memory.reader, undefined), profile)
 
     if path.suffix == ".mcap":
         return written(path, _messages(view, spans, TimeWindow.everything()))

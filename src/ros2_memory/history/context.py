@@ -141,12 +141,14 @@ class Memory:
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.
 
-        None for bags of another day, too (`recorder=none`, `data.now=latest`): a heartbeat that was
-        copied with them is not about today.
+        None for bags of another day, too (`recorder=none`, `data.now=latest`), unless it beats
+        today: one that was copied with them is not about their recorder.
         """
-        if self.limits.kept is None and self.limits.now == "latest":
+        heartbeat = self.index.heartbeat()
+        replays = self.limits.kept is None and self.limits.now == "latest"
+        if replays and heartbeat is not None and not heartbeat.is_live(self.clock.now()):
             return None
-        return self.index.heartbeat()
+        return heartbeat
 
     def now(self, wall: Ns, latest: Ns | None, call: Call | None = None) -> Ns:
         """Returns what ages count from: the wall clock, or the newest recorded time.

@@ -232,9 +232,11 @@ class Tree:
         return None if self._device in {None, device} else _OTHER_DISK
 
     def _problem(self, error: OSError) -> str:
-        """Returns a sentence on a bag directory that cannot be listed."""
+        """Returns a sentence on a bag directory that cannot be listed; an absolute path is cut."""
+        root = Path(self._root)
+        named = f".../{root.name}" if root.is_absolute() else self._root
         if isinstance(error, FileNotFoundError):
-            return f"the bag directory does not exist (yet): check {self._setting}"
+            return f"the bag directory does not exist (yet): check {named}, from {self._setting}"
         if isinstance(error, NotADirectoryError):
             return f"the bag directory is a file, not a directory: correct {self._setting}"
         return f"the bag directory cannot be read: {error.strerror or error}"

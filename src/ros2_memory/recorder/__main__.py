@@ -26,7 +26,13 @@ from ros2_memory.bootstrap import (
     claim,
     exclusions_of,
 )
-from ros2_memory.config import NullRecorderNode, exit_on_config_error, load_explained
+from ros2_memory.config import (
+    NullRecorderNode,
+    exit_on_config_error,
+    files_in_use,
+    load_explained,
+    unused_config,
+)
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.sd_notify import (
@@ -146,7 +152,9 @@ def _record(settings: Settings) -> None:
         if clear:
             _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
         _put_in_order(bag_dir, reader, housekeeper)
-        _log.info("starting", bag_dir=str(bag_dir))
+        _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
+        if unused := unused_config():
+            _log.warning("config_unused", reason=unused)
         _record_until_signal(recorder, bag_dir, reader, lock)
         _log.info("stopped")
     finally:

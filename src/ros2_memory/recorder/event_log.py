@@ -32,6 +32,9 @@ _ADVICE = {
     LineKind.MESSAGES_LOST: "messages were lost: the disk is too slow for what is recorded",
 }
 
+_LASTING = frozenset({LineKind.UNKNOWN_TYPE, LineKind.SEVERAL_TYPES, LineKind.QOS_REFUSED})
+_MOST_TOPICS = 1000
+
 
 class EventLog:
     """Log events of the recorder.
@@ -52,6 +55,7 @@ class EventLog:
         self.recovered = False
         self._lasting: tuple[str, str] | None = None
         self._unresolved: set[tuple[str, str]] = set()
+        self._of_topics: set[tuple[str, str]] = set()
 
     def info(self, event: str, **values: object) -> None:
         """Logs an event of normal operation."""
@@ -121,7 +125,13 @@ class EventLog:
             elif line.kind in _ADVICE:
                 about = f"{line.topic}: " if line.topic else ""
                 sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
-                self.warn(line.kind.value, sentence, recording=recording)
+                lasts = line.topic is not None and line.kind in _LASTING
+                # Each new recorder says it again, which is no newer fault than why it was started.
+                known = lasts and (line.kind, line.topic) in self._of_topics
+                report = self.remark if known else self.warn
+                report(line.kind.value, sentence, recording=recording)
+                if lasts and len(self._of_topics) < _MOST_TOPICS:
+                    self._of_topics.add((line.kind, line.topic or ""))
             elif line.kind in {LineKind.ERROR, LineKind.FOLDER_EXISTS}:
                 self.fail("recorder_error", line.text, recording=recording)
             else:

@@ -228,7 +228,9 @@ class IndexManager:
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
         changed = before is None or _figures(before) != _figures(after)
         if after.problem is not None and (before is None or before.problem != after.problem):
-            self._log.warning("bag_directory_not_read", reason=after.problem)
+            self._log.warning(
+                "bag_directory_not_read", reason=after.problem, bag_dir=str(self.bag_dir.absolute())
+            )
         (self._log.info if changed and not grew else self._log.debug)(
             "index_scanned",
             bag_dir=str(self.bag_dir),

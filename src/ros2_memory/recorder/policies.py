@@ -185,7 +185,8 @@ def describe_death(status: int, last_output: str) -> str:
     else:
         known = {each.value: each.name for each in signal.Signals}
         ended = f"was killed ({known.get(-status, f'signal {-status}')})"
-    return f"ros2 bag record {ended}: {last_output}" if last_output else f"ros2 bag record {ended}"
+    said = f"; last it said: {last_output}" if last_output else ""
+    return f"ros2 bag record {ended}{said}"
 
 
 def describe_silent_topics(

@@ -200,7 +200,10 @@ class RecordingSession:
 
     @property
     def last_output(self) -> str:
-        """The last warnings and errors of the child, at most 600 characters; not its INFO lines."""
+        """The last warnings and errors of the child, at most 600 characters.
+
+        Not its INFO lines, nor what it said of a single topic, which is no reason to end.
+        """
         return " | ".join(self._last_lines)[-600:]
 
     def age_s(self, now: ClockReading) -> float:
@@ -222,7 +225,7 @@ class RecordingSession:
         lines: list[Line] = []
         for raw in self.child.take_lines():
             line = parse_line(raw)
-            if line.text and "[INFO]" not in raw:
+            if line.text and line.topic is None and "[INFO]" not in raw:
                 self._last_lines.append(line.text)
             if line.kind is LineKind.READY:
                 if not self.has_recorded:

@@ -403,20 +403,21 @@ class Supervisor:
 
         `ros2 bag record` names the first topic of each unknown type, and no other.
         """
-        current = self._sessions.current
-        if current is None or not current.of_unknown_type or current.age_s(now) < TYPES_S:
+        current, selection = self._sessions.current, self._topics.selection
+        if current is None or current.age_s(now) < TYPES_S:
             return
-        unknown = frozenset(
-            {*self._topics.selection.exact, *current.of_unknown_type} - current.subscribed
-        )
-        if unknown != self._unknown:
+        # The list may have changed since the child was started.
+        unknown = frozenset(filter(selection.matches, current.of_unknown_type))
+        if not unknown <= self._unknown:
             self._unknown = unknown
+            others = sorted({*selection.exact} - unknown - current.subscribed)
+            listed_too = f", nor these, if anybody offers them: {', '.join(others)}"
             self._events.warn(
                 "topics_not_recorded",
                 f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
-                "type of all or some of these: name the workspace that defines it in "
-                "recorder.setup_files. It names one topic of each type: of those that a glob "
-                "selects, others of the same type are not recorded either",
+                "type: name the workspace that defines it in recorder.setup_files. It names one "
+                "topic of each type: of those that a glob selects, others of the same type are "
+                f"not recorded either{listed_too if others else ''}",
                 recording=current.name,
             )
 

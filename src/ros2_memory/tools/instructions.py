@@ -74,8 +74,6 @@ def _newest(settings: QuerySettings) -> str:
         newest = "the newest 3 s or so answer"
     elif settings.kept is not None:
         newest = f"the newest {settings.closed_after_s:g} s or so answer"
-    elif settings.now == "latest":
-        return "They are complete: nothing is being written."
     else:
         newest = "bags that are being written answer"
     return f"For what it sees right now, ask elsewhere: {newest} not_closed_yet."

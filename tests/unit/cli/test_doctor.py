@@ -125,6 +125,23 @@ def test_people_read_a_line_for_each_concern(robot: Path, exits: Program) -> Non
     assert output == [["ok", each] for each in [*about, "server"]]
 
 
+def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
+    robot: Path, exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    beside = tmp_path / "beside" / "config"
+    beside.mkdir(parents=True)
+    (beside / "places.yaml").write_text("places: {}\n")
+    monkeypatch.chdir(beside.parent)
+    [line, *_] = exits(0, "doctor").out.splitlines()
+    assert f"{beside}/places.yaml" in line
+    for name in ("config", "topics", "message_schemas", "labels", "triggers", "exclusions"):
+        assert f"/{name}.yaml" in line
+    (beside / "config.yaml").write_text("server: {}\n")
+    output = exits(1, "doctor").out
+    assert f"{beside}/config.yaml is not used" in output
+    assert f"MEMORY_CONFIG_DIR={beside}" in output
+
+
 def test_what_an_rmw_needs_is_said_where_it_is_used(
     robot: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -342,11 +342,12 @@ class TestMcap:
     def test_types_without_any_definition_are_named_and_the_exit_code_is_1(
         self, tmp_path: Path, exits: Program
     ) -> None:
-        odd = Msg("/odd", "nobody_msgs/msg/Knows", T0, b"\0\1\0\0\0")
-        write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [odd, odd], definitions=False)
+        odd = [Msg(f"/odd_{n}", f"nobody_msgs/msg/Knows{n}", T0, b"\0\1\0\0\0") for n in range(5)]
+        write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [*odd, *odd], definitions=False)
         words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--bag-dir"]
         err = exits(1, *words, tmp_path / "bags", "deployment=replay").err
-        assert err.count("nobody_msgs/msg/Knows has no definition") == 1
+        named = ", ".join(each.type for each in odd)
+        assert err.count(f"{named} have no definition") == 1
         assert "reader.custom_msg_paths" in err
 
     def test_a_file_is_never_overwritten(
@@ -454,7 +455,8 @@ class TestParquet:
         layout = McapLayout(definitions=False)
         write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [odd], layout)
         words = ["export", "--parquet", str(tmp_path / "rows"), "--bag-dir", str(tmp_path / "bags")]
-        exits(0, *words, "deployment=replay")
+        err = exits(1, *words, "deployment=replay").err
+        assert "nobody_msgs/msg/Knows cannot be decoded: their rows have no value" in err
         ((reason, value),) = queried(tmp_path / "rows", "SELECT undecodable, value FROM memory")
         assert reason
         assert value is None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from mcap.reader import make_reader
 
-from tests.support.bags import odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
 if TYPE_CHECKING:
@@ -89,6 +89,17 @@ def test_it_has_what_was_read_and_what_says_when_now_is(
     assert ("/odom", max(poses)) in within
     assert {min(at for _, at, _ in every), last} <= {at for _, at in within}
     assert len(found) < 10
+
+
+def test_types_without_a_definition_are_named_and_the_exit_code_is_1(
+    tmp_path: Path, exits: Program
+) -> None:
+    odd = [Msg("/odd", "nobody_msgs/msg/Knows", BEGIN, b"\0\1\0\0\0"), text(BEGIN, "x")]
+    write_mcap(tmp_path / "bags" / "rec_0.mcap", odd, McapLayout(definitions=False))
+    question = "get_topic_seconds_ago topic=/chatter seconds_ago=0"
+    err = exits(1, "prove", question, "-o", tmp_path / "proof.mcap", tmp_path / "bags").err
+    assert "the same answer" in err
+    assert "nobody_msgs/msg/Knows has no definition" in err
 
 
 def test_what_lay_between_recordings_needs_a_folder(

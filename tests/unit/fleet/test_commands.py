@@ -30,7 +30,7 @@ def test_doctor_checks_each_robot(robots: str, capsys: pytest.CaptureFixture[str
     assert [each["level"] for each in found] == ["ok", "warning"]
     assert found[0]["seen"].startswith("r1: 2 bag files are readable")
     assert "away" in found[1]["seen"]
-    assert "check fleet.robots" in found[1]["seen"]
+    assert "from fleet.robots" in found[1]["seen"]
 
 
 def test_info_is_about_each_robot(robots: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -377,12 +377,11 @@ class TestTrouble:
         ]
         found = reply(Fleet(robots, FixedClock(NOW)), "find_last_match", LAST | {"value": "x"})
         assert found["never"] == ["r1"]
-        assert found["notes"] == [
-            "no answer of away: the bag directory does not exist (yet): check fleet.robots"
-        ]
+        missing = "the bag directory does not exist (yet): check .../away, from fleet.robots"
+        assert found["notes"] == [f"no answer of away: {missing}"]
         assert str(tmp_path) not in json.dumps(found)
         status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
-        assert "check fleet.robots" in status["doubts"]
+        assert "from fleet.robots" in status["doubts"]
 
     def test_one_that_hangs_blocks_one_thread_however_often_it_is_asked(self, folder: Path) -> None:
         released = threading.Event()

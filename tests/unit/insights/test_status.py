@@ -5,6 +5,7 @@ import os
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Literal
 
+import anyio
 import pytest
 from mcap.writer import Writer
 
@@ -17,12 +18,13 @@ from ros2_memory.bag_dir.state_files import (
     ScreenState,
     append_losses,
 )
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import topic_range
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.serving.health import Health
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
@@ -219,6 +221,19 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     reply = shown(memory, tmp_path)
     assert (reply["recorder"], reply["recorder_alive"]) == told
     assert ("the recorder died" in reply["doubts"]) == (now == "wall")
+
+
+def test_a_recorder_that_is_started_beside_a_server_of_bags_to_replay_is_shown(
+    tmp_path: Path,
+) -> None:
+    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=60)
+    memory = replace(memory, limits=QuerySettings(now="latest"))
+    assert shown(memory, tmp_path)["recorder"] is None
+    beating(tmp_path, RecorderState.RECORDING, 59)
+    reply = shown(memory, tmp_path)
+    assert (reply["recorder"], reply["recorder_alive"]) == ("recording", True)
+    health = anyio.run(Health(memory, "1"))
+    assert health["recorder"]["live"] is True  # type: ignore[index,call-overload]
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:

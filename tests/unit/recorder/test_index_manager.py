@@ -297,6 +297,7 @@ def test_a_missing_bag_directory_is_warned_of_once(tmp_path: Path) -> None:
     warned = [each for each in logged if each["log_level"] == "warning"]
     assert [each["event"] for each in warned] == ["bag_directory_not_read"]
     assert "does not exist" in warned[0]["reason"]
+    assert warned[0]["bag_dir"] == str(tmp_path / "bags")
 
 
 def test_a_bag_directory_that_is_missing_is_a_problem_until_it_appears(tmp_path: Path) -> None:

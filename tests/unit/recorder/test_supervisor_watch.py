@@ -243,8 +243,37 @@ def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> 
     with capture_logs() as logs:
         world.run(30)
     (reported,) = events(logs, "topics_not_recorded")
-    assert "not recorded: /arm, /grip;" in reported["reason"]
+    assert "not recorded: /arm;" in reported["reason"]
     assert "of those that a glob selects, others of the same type" in reported["reason"]
+    assert reported["reason"].endswith("nor these, if anybody offers them: /grip")
+
+
+def test_a_topic_of_an_unknown_type_that_is_dropped_is_no_fault(tmp_path: Path) -> None:
+    world = World(tmp_path / "bags", expected=("/bumper", "/door", "/arm", "/never")).started(2)
+    world.recorders[0].lines.append(
+        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
+    )
+    world.run(20)
+    world.topics_path.write_text("topics: [/bumper, /door]\n")
+    with capture_logs() as logs:
+        world.run(15)
+    assert events(logs, "topics_changed")
+    assert not events(logs, "topics_not_recorded")
+
+
+def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> None:
+    world = World(tmp_path, expected=("/bumper", "/door", "/arm"))
+    world.defaults["lines"] = [
+        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
+    ]
+    world.supervisor.start()
+    world.run(20)
+    assert "/arm" in str(world.heartbeat()["last_error"])
+    world.recorders[0].die(-9)
+    world.run(20)
+    assert len(world.recorders) == 2
+    assert world.heartbeat()["last_error"] == "ros2 bag record was killed (SIGKILL)"
+    assert world.heartbeat()["unknown_types"] == ["/arm"]
 
 
 class TestShortfall:
