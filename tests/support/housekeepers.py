@@ -129,9 +129,9 @@ def recorder_at_work(bag_dir: Path, clock: Clock) -> Iterator[None]:
 
 
 def files_in(bag_dir: Path) -> list[str]:
-    """Every file and directory, relative to the bag directory, but the list of what is gone."""
+    """Every file and directory, relative to the bag directory, but what lists them."""
     found = {path.relative_to(bag_dir).as_posix() for path in bag_dir.rglob("*")}
-    found.discard(DELETED_FILE)
+    found -= {DELETED_FILE, LIST_FILE}
     if not any(each.startswith(f"{OWN_FOLDER}/") for each in found):
         found.discard(OWN_FOLDER)
     return sorted(found)

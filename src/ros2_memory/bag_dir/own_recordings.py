@@ -7,6 +7,7 @@ Only those are ever deleted. The file has one JSON object a line:
     {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
     {"recording": "rec_A", "inode": 7, ..., "splits": 60, "ended": true}
     {"recording": "old/run1", "inode": 8, "adopted": true, "bags": ["x.db3"]}   `ros2-memory adopt`
+    {"recording": "moments/m/rec_A", ..., "adopted": true, "splits": 0, "bags": ["rec_A_7.mcap"]}
 
 The last line of a recording counts. A directory is the recorder's own while it lies under its name
 and is the very directory that was listed (see `directories.Identity`). A bag in it is the
@@ -43,17 +44,14 @@ from ros2_memory.bag_dir.durable_write import (
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
-    CARRY_FILE,
-    CARRY_FOLDER,
     COMPRESSED,
     LIST_FILE,
-    MOMENTS_FOLDER,
     bag_kind,
     has_own_name,
+    is_kept_apart,
     split_name,
     split_number,
 )
-from ros2_memory.bag_dir.moment_file import read_saved_moment
 from ros2_memory.core.directories import Identity, identity_of, known_identity
 from ros2_memory.core.errors import RecorderError
 
@@ -100,7 +98,8 @@ class ListRow:
 
     `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
     and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
-    directory, sorted; None: all that lie there.
+    directory, sorted; None: all that lie there. Directories of saved moments and of carried
+    messages are listed like adopted ones.
     """
 
     bag_dir_id: Annotated[str, Field(pattern=r"^[0-9a-f]{8,64}$")] = ""
@@ -123,6 +122,11 @@ class ListRow:
             return True
         number = split_number(self.recording, name)
         return number is not None and (self.splits is None or number < self.splits)
+
+    def with_bags(self, files: Iterable[str]) -> ListRow:
+        """Returns the line of the directory with these bags adopted."""
+        others = {each.removesuffix(COMPRESSED) for each in files if not self.holds(each)}
+        return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
 
     def counted(self, files: Container[str]) -> int:
         """Returns how many splits the recording has, where these files were seen."""
@@ -179,7 +183,7 @@ class OwnRecordings:
             return self._read()
 
     def names(self) -> Collection[str]:
-        """Returns the listed recordings, whatever lies under their names.
+        """Returns the listed recordings, whatever lies under their names; no saved moments.
 
         Those that were known remain known if the list is deleted.
 
@@ -188,7 +192,7 @@ class OwnRecordings:
         """
         with self._lock:
             self._read()
-            return self._list.entries.keys()
+            return [name for name in self._list.entries if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
         """Returns the listed recordings in the order in which they began; no adopted ones.
@@ -217,20 +221,13 @@ class OwnRecordings:
     def judge(self, folder: str, identity: Identity | None) -> Callable[[str], bool]:
         """Returns what decides, by its name, whether a bag file in a directory is the recorder's.
 
-        Those are bags of recordings of the list, as last read, the carried messages, and what lies
-        in saved moments.
+        Those are the bags that the list, as last read, has by name or number. A folder of moments
+        or carried messages that was restored is in no list.
 
         Args:
             folder: the directory's name in the list.
             identity: shows whether it is the one that was listed.
         """
-        first, _, rest = folder.partition("/")
-        if folder == CARRY_FOLDER:
-            return lambda name: name == CARRY_FILE
-        if first == MOMENTS_FOLDER and rest:
-            moment = self._bag_dir / first / rest.partition("/")[0]
-            is_saved = read_saved_moment(moment) is not None
-            return lambda _: is_saved
         row = self._list.entries.get(folder)
         if row is None or not self.lists(folder, identity):
             return lambda _: False
@@ -373,14 +370,40 @@ class OwnRecordings:
 
     def _adopted(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory that is adopted, one of the list or another."""
-        row = self._list.entries.get(name)
-        if row is None or not self.lists(name, identity):
-            row = ListRow("", name, identity.inode, identity.generation)
+        row = self._row(name, identity)
         with suppress(OSError):
-            names = {path.name for path in _bags_in(self._bag_dir / name)}
-            others = {each.removesuffix(COMPRESSED) for each in names if not row.holds(each)}
-            return replace(row, adopted=True, bags=(*sorted({*others, *(row.bags or ())}),))
+            return row.with_bags(path.name for path in _bags_in(self._bag_dir / name))
         return row
+
+    def _row(self, name: str, identity: Identity) -> ListRow:
+        """Returns the line of a directory, one of the list or another."""
+        row = self._list.entries.get(name)
+        if row is not None and self.lists(name, identity):
+            return row
+        row = ListRow("", name, identity.inode, identity.generation)
+        return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
+
+    def hold(self, directory: Path, bags: Iterable[str]) -> None:
+        """Lists bags that the recorder puts into a directory of a moment or of carried messages.
+
+        What cannot be written is known all the same, and is written with the next recording.
+
+        Raises:
+            OSError: the list or the directory cannot be read.
+        """
+        with self._lock:
+            self._read()
+            name, identity = self.name_of(directory), identity_of(directory)
+            if identity is None:
+                raise FileNotFoundError(f"{directory} is not there any more")
+            held = self._row(name, identity).with_bags(bags)
+            if held == self._list.entries.get(name):
+                return
+            try:
+                self._add([held])
+            except RecorderError as error:
+                self._know([held])
+                _log.error("recordings_not_listed", reason=str(error))
 
     def _know(self, rows: Iterable[ListRow]) -> None:
         """Counts rows as listed that cannot be written; the next one that is written takes them."""

@@ -60,9 +60,8 @@ RETRY_SOON_NS: Final[Ns] = 5 * NS_PER_S
 _ACTIVE = "still being written"
 HELD_BACK: Final = "not served yet: recording.exclude_when has still to be applied"
 _ANSWERS = "still being written: its complete chunks are read"
-_NO_MESSAGE = (
-    "it ends before its first message: its recorder was killed before any reached the disk"
-)
+_NO_MESSAGE = "a crash left it open, and no message in it counts"
+_RECOVER = "; ros2-memory recover closes it"
 
 
 class FileState(IntEnum):
@@ -342,7 +341,8 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
             return Classification(FileState.EMPTY, silent=summary.silent)
         if is_closed:
             return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
-        return _set_aside(FileState.DAMAGED, notes, _NO_MESSAGE)
+        closes = _RECOVER if notes.kind == ".mcap" else ""
+        return _set_aside(FileState.DAMAGED, notes, _NO_MESSAGE + closes)
     bag = _bag(notes, BagState.CLOSED if is_closed else BagState.INCOMPLETE, summary)
     return Classification(FileState.CLOSED if is_closed else FileState.INCOMPLETE, bag=bag)
 

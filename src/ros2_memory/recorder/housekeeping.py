@@ -112,7 +112,7 @@ class Housekeeping(Housekeeper):
         collector = GarbageCollector(
             bag_dir,
             limits,
-            Carrier(bag_dir, reader, writer, static_topics),
+            Carrier(bag_dir, reader, writer, static_topics, self._own),
             self._own,
             recorded=self._recorded,
             is_synchronised=is_synchronised,
@@ -130,7 +130,7 @@ class Housekeeping(Housekeeper):
             split_duration_s=split_duration_s,
             collector=collector,
         )
-        self._moments = MomentKeeper(bag_dir, moments_bytes, clock, rule_bytes)
+        self._moments = MomentKeeper(bag_dir, moments_bytes, clock, self._own, rule_bytes)
         self._triggers = None if watch is None else watch(self._moments)
         self._screening = screening
         self._repairer = Repairer(reader, writer, bag_dir)

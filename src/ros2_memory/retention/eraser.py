@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, BagWriter
 
 NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
+_FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
 
 
@@ -159,7 +160,7 @@ class Eraser:
             elif found is not None:
                 holders.append(found)
                 foreign = [self._name(each) for each in paths if each not in found.paths]
-                kept.extend(f"{each}: this recorder did not make it" for each in foreign)
+                kept.extend(f"{each}: {_FOREIGN}" for each in foreign)
         return Survey(tuple(holders), tuple(kept))
 
     def _look_into(
@@ -252,7 +253,7 @@ class Eraser:
     ) -> str | None:
         path, reason = paths[0], None
         if not any(map(self._may_change, paths)):
-            reason = "this recorder did not make it; `ros2-memory adopt` takes its folder"
+            reason = _FOREIGN
         elif path.name.endswith(COMPRESSED):
             reason = "it is compressed as a whole; decompress it (zstd -d --rm), and forget again"
         elif self._reader.closing(path) is Closing.OPEN or not summary.complete:

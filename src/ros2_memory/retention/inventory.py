@@ -206,8 +206,7 @@ class Inventory:
     def _is_new(self, bag: StoredBag, named: Collection[str]) -> bool:
         """Whether a bag that is not listed as own counts: it is listed moments after it appears."""
         name = bag.path[len(bag.recording) + 1 :]
-        is_split = split_number(bag.recording, name) is not None
-        return is_carried(bag.path) or (is_split and bag.recording in named)
+        return split_number(bag.recording, name) is not None and bag.recording in named
 
     def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""

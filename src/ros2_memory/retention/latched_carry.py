@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader, BagWriter, Record
@@ -124,15 +125,22 @@ class Carrier:
         reader: reads them.
         writer: writes the one of carried messages.
         static_topics: carried though no publisher is known to have offered them as transient local.
+        own: lists the bag.
     """
 
     def __init__(
-        self, bag_dir: Path, reader: BagReader, writer: BagWriter, static_topics: Collection[str]
+        self,
+        bag_dir: Path,
+        reader: BagReader,
+        writer: BagWriter,
+        static_topics: Collection[str],
+        own: OwnRecordings,
     ) -> None:
         self.path = bag_dir / CARRY_FOLDER / CARRY_FILE
         self._reader = reader
         self._writer = writer
         self._static_topics = frozenset(static_topics)
+        self._own = own
         self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
@@ -325,6 +333,7 @@ class Carrier:
             raise
         flush(folder)
         flush(folder.parent)
+        self._own.hold(folder, [CARRY_FILE])
 
 
 def _is_tf(type_name: str) -> bool:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.bag_dir.moment_file import SaveRequest
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
@@ -164,6 +166,7 @@ class MomentKeeper:
         bag_dir: the bag directory.
         share_bytes: how much of the budget moments may take.
         clock: the wall clock.
+        own: lists what is linked.
         rule_bytes: how much of that is set aside for each rule.
     """
 
@@ -172,12 +175,14 @@ class MomentKeeper:
         bag_dir: Path,
         share_bytes: int,
         clock: Clock,
+        own: OwnRecordings,
         rule_bytes: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
         self._bag_dir = bag_dir
         self._share = share_bytes
         self._rule_bytes = rule_bytes
         self._clock = clock
+        self._own = own
         self._queue = RequestQueue(bag_dir)
         self._links = HardLinks(bag_dir)
         # Until the first call of `keep` shows that nothing is pending.
@@ -296,7 +301,7 @@ class MomentKeeper:
             )
         if not need.bags and not need.waits:
             return "nothing was recorded then: ask for a time at which something was"
-        files = filter(None, map(_file_of, need.bags))
+        files = filter(None, (_file_of(bag.path) for bag in need.bags))
         expected = self._open_bytes(moment.request, snapshot) if need.waits else 0
         share, key = self._share_of(moment)
         return no_room(files, _all_files(group), share, expected, key)
@@ -387,9 +392,9 @@ class MomentKeeper:
         """
         missing: dict[str, None] = {}
         linked: dict[int, int] = {}
-        files = [_file_of(bag) for bag in bags]
+        files = [_file_of(bag.path) for bag in bags]
         allowed = None if limit is None else fitting(filter(None, files), limit[0], limit[1])
-        touched: set[Path] = set()
+        linking: defaultdict[Path, list[tuple[Path, tuple[int, int]]]] = defaultdict(list)
         for bag, file in zip(bags, files, strict=True):
             name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
             target = folder / name
@@ -400,15 +405,21 @@ class MomentKeeper:
             elif limit is not None and allowed is not None and file[0] not in allowed:
                 missing[_used_up(limit[2])] = None
             else:
-                directories.make(self._bag_dir, target.parent)
-                if not _link_bag(bag.path, target, file[0]):
-                    missing[_gone(name)] = None
-                    continue
-                linked.update((file,))
-                if target.parent not in touched:
-                    touched.add(target.parent)
-                    _link_sidecar(bag.path.parent, target.parent)
-        for parent in touched:
+                linking[target.parent].append((bag.path, file))
+        for parent, here in linking.items():
+            directories.make(self._bag_dir, parent)
+            # Listed first, so that `forget`, in another process, knows whose the new links are.
+            free = (
+                each.name for each, file in here if _file_of(parent / each.name) in {None, file}
+            )
+            self._own.hold(parent, free)
+            for recorded, file in here:
+                target = parent / recorded.name
+                if _link_bag(recorded, target, file[0]):
+                    linked.update((file,))
+                    _link_sidecar(recorded.parent, parent)
+                else:
+                    missing[_gone(str(target.relative_to(folder)))] = None
             flush(parent)
         return tuple(missing), linked
 
@@ -427,10 +438,10 @@ def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
     return recorded is None or (recorded.start < window.stop and window.start < recorded.stop)
 
 
-def _file_of(bag: BagFile) -> tuple[int, int] | None:
-    """Returns inode and size (bytes) of a bag's file; None where it has gone."""
+def _file_of(path: Path) -> tuple[int, int] | None:
+    """Returns inode and size (bytes) of a file; None where it has gone."""
     try:
-        status = bag.path.lstat()
+        status = path.lstat()
     except FileNotFoundError:
         return None
     return status.st_ino, status.st_size

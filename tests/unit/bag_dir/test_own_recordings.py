@@ -523,14 +523,28 @@ class TestBags:
         LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
         assert OwnRecordings(tmp_path).owns_bag(path)
 
-    def test_carried_messages_and_moments(self, tmp_path: Path) -> None:
+    def test_carried_messages_and_moments_are_those_that_were_listed(self, tmp_path: Path) -> None:
         own = claimed(tmp_path)
-        made_moment(tmp_path / "moments" / "x")
-        assert own.owns_bag(tmp_path / "latched" / "carried.mcap")
-        assert own.owns_bag(tmp_path / "moments" / "x" / A / f"{A}_0.mcap")
-        assert not own.owns_bag(tmp_path / "latched" / "latched_0.mcap")
-        assert not own.owns_bag(tmp_path / "moments" / "y" / A / f"{A}_0.mcap")
-        assert not own.owns_bag(tmp_path / "loose.mcap")
+        saved, carried = made_moment(tmp_path / "moments" / "x") / A, tmp_path / "latched"
+        for folder in (saved, carried):
+            folder.mkdir()
+        assert not own.owns_bag(carried / "carried.mcap")
+        assert not own.owns_bag(saved / f"{A}_0.mcap")
+        own.hold(carried, ["carried.mcap"])
+        own.hold(saved, [f"{A}_0.mcap"])
+        own.hold(saved, [f"{A}_1.mcap.zstd"])
+        for known in (own, OwnRecordings(tmp_path), claimed(tmp_path)):
+            assert known.owns_bag(carried / "carried.mcap")
+            assert known.owns_bag(saved / f"{A}_0.mcap")
+            assert known.owns_bag(saved / f"{A}_1.mcap")
+            assert not known.owns_bag(saved / f"{A}_2.mcap")
+            assert not known.owns_bag(carried / "latched_0.mcap")
+            assert not known.owns_bag(tmp_path / "moments" / "x" / "x_0.mcap")
+            assert not known.owns_bag(tmp_path / "loose.mcap")
+            assert (known.names(), known.in_order()) == ([], [])
+        saved.rename(tmp_path / "moved")  # so that its inode number is not used again
+        saved.mkdir()
+        assert not own.owns_bag(saved / f"{A}_0.mcap")
 
     @pytest.mark.parametrize("named", [True, False])
     def test_where_children_embed_nothing_the_heartbeat_names_one_that_a_kill_left_unlisted(

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
+from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
@@ -172,6 +172,7 @@ def test_a_bag_with_another_name_is_reported(bag_dir: Path, forget: Forget) -> N
     kept = made_moment(bag_dir / "moments" / "20231114T221320Z-x") / "rec_0" / "rec_1.mcap"
     kept.parent.mkdir()
     kept.hardlink_to(bag_dir / "rec_0" / "rec_1.mcap")
+    own_all(bag_dir)
     shown = forget(1, 20, 35, "--yes").out
     assert kept.is_file()
     assert "moment" in shown
@@ -339,6 +340,22 @@ class TestForeignBags:
         forget(1, 40, 100, "--yes", "--topic", "/odom")
         assert McapReader().summarize(path).count == 1
 
+    @pytest.mark.parametrize("folder", ["latched", "moments/x", "moments/x/rec_1"])
+    def test_in_folders_of_the_recorder_too_they_go_once_they_are_adopted(
+        self, bag_dir: Path, folder: str, forget: Forget, exits: Program
+    ) -> None:
+        made_moment(bag_dir / "moments" / "x")
+        name = f"{folder}/y_0.mcap"
+        path = left(write_mcap(bag_dir / name, [odom(T0 + 65 * NS_PER_S, 1.0, 0.0)]))
+        before = path.read_bytes()
+        shown = forget(1, 64, 66, "--yes", "--topic", "/odom").out
+        assert f"stays: {name}: this recorder did not make it; `ros2-memory adopt`" in shown
+        assert f"`ros2-memory adopt {folder}` first" in forget(1, 65, 65, "--yes").out
+        assert path.read_bytes() == before
+        exits(0, "adopt", folder)
+        forget(0, 64, 66, "--yes", "--topic", "/odom")
+        assert McapReader().summarize(path).count == 0
+
     def test_a_copy_without_its_list_of_which_one_file_is_damaged_is_kept(
         self, bag_dir: Path, forget: Forget
     ) -> None:
@@ -369,6 +386,45 @@ class TestForeignBags:
         monkeypatch.setattr("typer.confirm", meanwhile)
         forget(0, 40, 100)
         assert len([*(bag_dir / "rec_1").glob("*.mcap")]) == 2
+
+
+class TestUnreadable:
+    def test_a_file_that_cannot_be_read_is_named_wherever_its_mtime_allows_messages(
+        self, bag_dir: Path, forget: Forget
+    ) -> None:
+        path = write_mcap(bag_dir / "session" / "session_0.mcap", [odom(T0, 1.0, 0.0)])
+        own_all(bag_dir)
+        data = bytearray(path.read_bytes())
+        data[0] ^= 1
+        path.write_bytes(data)
+        os.utime(path, (T0 / NS_PER_S + 2 * 86400,) * 2)
+        assert "stays: session/session_0.mcap: " in forget(1, -5, 0.5, "--yes").out
+
+    def test_the_other_form_of_a_bag_goes_with_it_and_is_not_said_to_stay(
+        self, bag_dir: Path, forget: Forget
+    ) -> None:
+        other = bag_dir / "rec_1" / "rec_2.mcap.zstd"
+        other.write_bytes(b"compressed")
+        left(other)
+        assert "stays" not in forget(0, 39, 55, "--yes", "storage=mcap").out
+        assert not other.exists()
+
+    def test_one_that_a_crash_left_open_is_closed_by_recover_also_where_none_counts(
+        self, bag_dir: Path, forget: Forget, exits: Program
+    ) -> None:
+        name = "rec_20231114T221330Z"
+        messages = [odom(T0 + 200 * NS_PER_S + n, 1.0, 0.0) for n in range(30)]
+        layout = McapLayout(finish=False, chunk_size=400)
+        path = left(write_mcap(bag_dir / name / f"{name}_0.mcap", messages, layout))
+        write_handover(bag_dir / name, Handover(state=Counting.VOID, previous="rec_1"))
+        own_all(bag_dir)
+        shown = forget(1, 199, 10**5, "--yes").out
+        assert f"stays: {name}/{path.name}: a crash left it open" in shown
+        assert "ros2-memory recover closes it" in shown
+        exits(0, "recover", path)
+        left(path)
+        forget(0, 199, 10**5, "--yes")
+        assert not path.exists()
 
 
 class TestCopies:

@@ -30,6 +30,7 @@ from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.cli.maintenance import forget as cli_forget
 from ros2_memory.columns.pack import decompressed
@@ -217,6 +218,7 @@ def test_hard_links_in_moments_follow(tmp_path: Path, bag_dir: Path) -> None:
     link = moment / "rec_a" / source.name
     link.parent.mkdir()
     os.link(source, link)
+    OwnRecordings(bag_dir).hold(link.parent, [link.name])
     assert forget(0, 100, "--topic", CAMERA) == 0
     assert traces(tmp_path, SAID) == []
     assert link.samefile(source)
@@ -234,6 +236,7 @@ def test_a_moment_that_is_kept_meanwhile_follows(
         if not link.exists():
             made_moment(link.parents[1])
             link.parent.mkdir()
+            OwnRecordings(bag_dir).hold(link.parent, [link.name])
             os.link(source, link)
         return taken
 

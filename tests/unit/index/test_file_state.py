@@ -196,7 +196,7 @@ def test_a_bag_left_open_before_its_first_message_is_damaged(
 ) -> None:
     path = plain(tmp_path / "rec_0.mcap", silent=["/scan"], closed=False)
     assert scan.run(path, age_s=3600) is FileState.DAMAGED
-    assert "before its first message" in scan.reason()
+    assert "no message in it counts; ros2-memory recover" in scan.reason()
 
 
 def test_a_file_of_a_kind_that_is_not_read_names_the_storage_that_reads_it(

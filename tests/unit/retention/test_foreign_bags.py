@@ -313,15 +313,42 @@ class TestClearing:
         clear_bags(bag_dir)
         assert not any(path.exists() for path in others)
 
-    def test_of_moments_those_go_that_were_saved(self, tmp_path: Path) -> None:
-        own = own_all(tmp_path)
-        made_moment(tmp_path / "moments" / "ours")
-        [saved] = foreign(tmp_path, f"moments/ours/{A}/{A}_0.mcap")
-        [other] = foreign(tmp_path, "moments/theirs/x_0.mcap")
+    def test_of_moments_those_bags_go_that_were_saved(self, tmp_path: Path) -> None:
+        own_all(tmp_path)
+        recording(tmp_path, A, 0)
+        house = house_of(tmp_path, keeps_foreign=True)
+        moments = [
+            tmp_path / "moments" / str(kept(house, tmp_path, 5, 25, label).moment)
+            for label in ("ours", "mixed")
+        ]
+        others = foreign(
+            moments[1], "theirs_0.mcap", f"{A}/theirs_0.mcap", f"{A}/{A}_5.mcap", "run/run_0.mcap"
+        )
+        others += foreign(tmp_path, "moments/theirs/x_0.mcap")
+        # What retention deleted long ago is in no list.
+        (tmp_path / A).rename(tmp_path.parent / "gone")
+        own = OwnRecordings(tmp_path)
+        claim(own)
         clear_bags(tmp_path, own)
-        assert not saved.exists()
-        assert not (tmp_path / "moments" / "ours").exists()
-        assert other.exists()
+        assert all(path.exists() for path in others)
+        assert len(in_moments(tmp_path)) == len(others)
+        assert not moments[0].exists()
+
+    def test_a_restored_folder_is_left_until_it_is_adopted(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        saved = f"moments/{made_moment(tmp_path / 'moments' / 'birthday').name}"
+        names = (f"{A}/{A}_0.mcap", f"{saved}/{A}/{A}_0.mcap", f"{saved}/holiday_0.mcap")
+        restored = foreign(tmp_path, *names, "latched/carried.mcap")
+        for _ in range(2):
+            own = OwnRecordings(tmp_path)
+            claim(own)
+            clear_bags(tmp_path, own)
+            assert all(path.exists() for path in restored)
+        monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))
+        assert cli.main(["adopt", A, saved, "latched"]) == 0
+        clear_bags(tmp_path, own)
+        assert files_in(tmp_path) == []
 
 
 class TestReports:
@@ -350,7 +377,7 @@ class TestReports:
         before = memory_status(memory, Call()).budget.foreign
         own_all(bag_dir)
         after = memory_status(memory, Call()).budget.foreign
-        never = [bag_dir / "loose.mcap", bag_dir / "latched" / "latched_0.mcap"]
+        never = [bag_dir / "loose.mcap"]
         left = sum(path.stat().st_size for path in never)
         assert (before, after) == (sum(path.stat().st_size for path in others), left)
         for path in never:
@@ -467,8 +494,8 @@ class TestAdopt:
 
 
 def test_a_bag_of_latched_messages_that_are_carried_is_not_foreign(tmp_path: Path) -> None:
-    own_all(tmp_path)
     write_mcap(tmp_path / "latched" / "carried.mcap", [boolean(T0, True)])
+    own_all(tmp_path)
     with structlog.testing.capture_logs() as logs:
         house_of(tmp_path, keeps_foreign=True).apply()
     [reported] = [each for each in logs if each["event"] == "retention_applied"]

@@ -7,6 +7,7 @@ import pytest
 from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import BagError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
@@ -59,7 +60,8 @@ def keep_only(bag_dir: Path, *kept: str) -> None:
     sidecars = {(bag_dir / name).with_name("handover.json") for name in kept}
     files = [*(bag_dir / name for name in kept), *(each for each in sidecars if each.exists())]
     size = sum(each.stat().st_size for each in files)
-    keeper_of(bag_dir, max_bytes=size + 1).apply()
+    of_list = 500
+    keeper_of(bag_dir, max_bytes=size + of_list).apply()
     left = [path for path in bag_dir.rglob("*.mcap") if not is_carried(path)]
     assert sorted(path.relative_to(bag_dir).as_posix() for path in left) == sorted(kept)
 
@@ -101,6 +103,7 @@ class TestTheBagOfCarriedMessages:
         memory = memory_of(tmp_path)
         assert places(memory, T0 + 15 * S, ["laser"]) == [(0.1, 0.0, 0.0)]
         assert files_in(tmp_path) == ["latched", "latched/carried.mcap", "rec", "rec/rec_1.mcap"]
+        assert OwnRecordings(tmp_path).owns_bag(tmp_path / "latched/carried.mcap")
 
     def test_the_newest_of_each_child_frame_is_carried_and_not_the_newest_message(
         self, tmp_path: Path

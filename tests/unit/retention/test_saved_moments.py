@@ -19,6 +19,7 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS
@@ -358,7 +359,7 @@ class TestOthers:
 
     def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0)
-        looking = MomentKeeper(tmp_path, PLENTY, SettableClock(NOW))
+        looking = MomentKeeper(tmp_path, PLENTY, SettableClock(NOW), OwnRecordings(tmp_path))
         assert looking.has_work()
         looking.keep(memory_of(tmp_path).index.snapshot())
         assert not looking.has_work()

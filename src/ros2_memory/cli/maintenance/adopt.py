@@ -59,7 +59,7 @@ def adopt(
         name: path
         for directory in given
         for path in folders_with_bags(directory)
-        if (name := own.name_of(path)) and not is_kept_apart(name)
+        if (name := own.name_of(path))
     }
     _require_list(root, own)
     new = {name: path for name, path in found.items() if not all(map(own.owns_bag, _bags_in(path)))}
@@ -80,7 +80,7 @@ def adopt(
     if already:
         folders = counted(already, "directory is", "directories are")
         print_line(f"{folders} the recorder's own already")
-    if new:
+    if not all(map(is_kept_apart, new)):
         print_line("retention deletes them from now on, by its limits, oldest first")
     if not found:
         print_line("there are no bag files")

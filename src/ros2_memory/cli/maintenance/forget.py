@@ -26,7 +26,6 @@ from ros2_memory.bag_dir.layout import (
     METADATA_FILE,
     MOMENTS_FOLDER,
     SHIPPED_FILE,
-    is_kept_apart,
     other_form,
 )
 from ros2_memory.bag_dir.lock import BagDirLock
@@ -130,7 +129,7 @@ def forget(
             raise typer.Exit(EXIT_NEGATIVE)
         return
     plan = plan_deletion(settings, memory.index.snapshot(), window, build_reader(settings))
-    carrier = Carrier(plan.bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics)
+    carrier = taking.carrier
     kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
     _print_kept(kept)
     if not plan.to_delete:
@@ -178,15 +177,15 @@ class _Taking:
         for bag in snapshot.bags:
             if bag.state is BagState.ACTIVE:
                 written[bag.path] = TimeWindow(bag.start, MAX_NS)
-        own = OwnRecordings(self._bag_dir) if settings.retention.foreign == "keep" else None
-        self._carrier = Carrier(
-            self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics
+        own = OwnRecordings(self._bag_dir)
+        self.carrier = Carrier(
+            self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics, own
         )
         self._eraser = Eraser(
             self._bag_dir,
             build_reader(settings),
             McapWriter(),
-            own,
+            own if settings.retention.foreign == "keep" else None,
             written=written,
             recorder=recorder,
         )
@@ -228,7 +227,7 @@ class _Taking:
             lines += [f"what is not known: {each}" for each in view.notes.sentences()]
         with spinner("looking which topics there are"):
             known = self._eraser.topics()
-        latched = known.intersection(self._carrier.topics(self._memory.index.snapshot()))
+        latched = known.intersection(self.carrier.topics(self._memory.index.snapshot()))
         if globs:
             topics = {each for glob in globs for each in match_topics(known, glob)}
             if not topics:
@@ -352,7 +351,10 @@ def plan_deletion(
             to_delete.append(bag)
         else:
             kept.append(f"{_name(bag.path, bag_dir)}: {reason}")
-    for aside, span in snapshot.unread_spans.items():
+    deleted_too = {other_form(bag.file) for bag in to_delete}
+    for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
+        if str(aside.path) in deleted_too:
+            continue
         name = _name(aside.path, bag_dir)
         if span is None:
             kept.append(f"{name}: when it was recorded is unknown ({aside.reason})")
@@ -391,7 +393,7 @@ def _reason_to_keep(
         return "it reaches beyond the window"
     if not _may_delete(bag, own):
         folder = own.name_of(bag.path.parent) if own is not None else ""
-        if folder and not is_kept_apart(folder):
+        if folder:
             adopt = f"`ros2-memory adopt {folder}` first"
         else:
             adopt = (

@@ -18,7 +18,7 @@ from rich.progress import Progress, TaskID
 
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE, is_kept_apart
+from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE
 from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
@@ -175,7 +175,7 @@ def _is_own(folder: Path) -> bool:
     for bag_dir in whole.parents:
         if (bag_dir / LIST_FILE).exists():
             own = OwnRecordings(bag_dir)
-            return is_kept_apart(own.name_of(whole)) or own.owns(whole)
+            return own.owns(whole)
     return False
 
 
