@@ -140,6 +140,11 @@ def _robots_found(value: object) -> object:
     return {each[len(before) : len(each) - len(after)]: each for each in folders}
 
 
+def _without_streamable(transport: object) -> object:
+    """Returns `http` for what the specification, and the SDK of MCP, call it."""
+    return "http" if transport in ("streamable_http", "streamable-http") else transport
+
+
 def _without_password(uri: str) -> str:
     if "@" in uri.partition("://")[2].partition("/")[0]:
         raise OpenSecretError("must name no user or password, which belong into lake.secrets_file")
@@ -330,7 +335,7 @@ class ServerSettings:
     """
 
     name: Text
-    transport: Literal["stdio", "sse", "http"]
+    transport: Annotated[Literal["stdio", "sse", "http"], BeforeValidator(_without_streamable)]
     host: Text
     port: Port
     call_timeout_s: Positive

@@ -121,14 +121,9 @@ def _whole(value: str) -> str:
         return quoted(value)
 
 
-def _transport(value: str) -> str:
-    """Returns a transport; the specification calls HTTP `streamable_http`."""
-    return quoted("http" if value == "streamable_http" else value)
-
-
 _VARIABLES: Final[dict[str, tuple[str, Callable[[str], str]]]] = {
     "MEMORY_BAG_DIR": ("recording.bag_dir", quoted),
-    "MCP_TRANSPORT": ("server.transport", _transport),
+    "MCP_TRANSPORT": ("server.transport", quoted),
     "MCP_HOST": ("server.host", quoted),
     "MCP_PORT": ("server.port", _whole),
 }

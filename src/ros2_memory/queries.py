@@ -131,7 +131,7 @@ def topic_value(
     A latched topic has no tolerance unless one is given: its newest message holds.
     """
     view, at, now = open_moment(memory, call, moment)
-    found = _found_at(view, resolve_topic(view, topic), at, tolerance_s)
+    found = _found_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
     value = _value(view, found, fields, now)
     return _held(view, value, found, at)
 
@@ -187,9 +187,9 @@ def position(
     name = resolve_path_topic(view, topic, degrees=True)
     body = robot_body(view) if name in memory.limits.tf_topics else None
     if body is not None:
-        return _position_of_body(view, body, (at, tolerance_s), now, frame_id)
+        return _position_of_body(view, body, (at, tolerance_s, moment.rest_s), now, frame_id)
     _require_kind(view, name, "position", "geodetic")
-    found = _found_at(view, name, at, tolerance_s)
+    found = _found_at(view, name, at, tolerance_s, moment.rest_s)
     return _position_in(view, found, at, now, frame_id)
 
 
@@ -224,7 +224,11 @@ def _position_in(
 
 
 def _position_of_body(
-    view: View, body: Body, asked: tuple[Ns, float | None], now: Ns | None, frame_id: str | None
+    view: View,
+    body: Body,
+    asked: tuple[Ns, float | None, float],
+    now: Ns | None,
+    frame_id: str | None,
 ) -> results.Position:
     """Returns where transforms have the robot's body, and the latitude and longitude beside it.
 
@@ -276,7 +280,7 @@ def velocity(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
-    found = _found_at(view, name, at, tolerance_s)
+    found = _found_at(view, name, at, tolerance_s, moment.rest_s)
     _note_held(view, found, at)
     twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
     if twist is None:
@@ -621,14 +625,16 @@ def _before(before_s: float | None) -> Ns:
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
-def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> StoredMessage:
+def _found_at(
+    view: View, topic: str, at: Ns, tolerance_s: float | None, rest_s: float
+) -> StoredMessage:
     """Returns the newest message of a topic at or before a moment: of any age where it is latched.
 
     Raises:
         NoDataError: there is none within the tolerance.
     """
     limits = view.memory.limits
-    window, tolerance = _within(view, at, tolerance_s)
+    window, tolerance = _within(view, at, tolerance_s, rest_s)
     found = view.stream.newest(topic, window)
     if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
         found = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
@@ -643,14 +649,17 @@ def _found_at(view: View, topic: str, at: Ns, tolerance_s: float | None) -> Stor
     return found
 
 
-def _within(view: View, at: Ns, tolerance_s: float | None) -> tuple[TimeWindow, Ns | None]:
+def _within(
+    view: View, at: Ns, tolerance_s: float | None, rest_s: float
+) -> tuple[TimeWindow, Ns | None]:
     """Returns when a message is near enough before a moment, and the tolerance; None for any."""
     limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
     tolerance: Ns | None = ns_argument("tolerance_s", limit)
     start = at - (tolerance or 0) - START_SLACK_NS
     if start <= MIN_NS:
         start, tolerance = MIN_NS, None
-    return TimeWindow(start, min(at + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)), tolerance
+    stop = at + ns_from_unix(rest_s) + AT_OR_BEFORE_SLACK_NS + 1
+    return TimeWindow(start, min(stop, MAX_NS)), tolerance
 
 
 def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
@@ -685,7 +694,8 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     if view.memory.limits.latching.holds(view.snapshot, found):
         topic = found.record.channel.topic
         view.notes.add(
-            f"{topic} is latched: its value of {seconds(at - found.time)} before is still valid"
+            f"{topic} is latched: its value of {seconds(max(at - found.time, 0))} before is still "
+            "valid"
         )
 
 

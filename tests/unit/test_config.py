@@ -162,6 +162,7 @@ class TestEnvironment:
             ("MCP_TRANSPORT", "sse", "server", "transport", "sse"),
             ("MCP_TRANSPORT", "http", "server", "transport", "http"),
             ("MCP_TRANSPORT", "streamable_http", "server", "transport", "http"),
+            ("MCP_TRANSPORT", "streamable-http", "server", "transport", "http"),
             ("MCP_HOST", "0.0.0.0", "server", "host", "0.0.0.0"),  # noqa: S104
             ("MCP_PORT", "9300", "server", "port", 9300),
         ],
@@ -172,6 +173,10 @@ class TestEnvironment:
         settings = load_settings((), {name: value})
         wanted = Path(value) if expected is None else expected
         assert getattr(getattr(settings, section), key) == wanted
+
+    @pytest.mark.parametrize("name", ["http", "streamable_http", "streamable-http"])
+    def test_streamable_http_may_be_written_out_as_a_setting(self, name: str) -> None:
+        assert load_settings([f"server.transport={name}"], {}).server.transport == "http"
 
     @settings(max_examples=examples(30))  # each composes the whole configuration
     @given(st.text(PATH_CHARACTERS, min_size=1))

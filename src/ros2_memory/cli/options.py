@@ -42,7 +42,7 @@ from ros2_memory.core.timebase import (
     Ns,
     WallClock,
     ns_from_unix,
-    rest_of_text_s,
+    rest_of_end_s,
     unix_from_ns,
     unix_from_text,
 )
@@ -475,7 +475,7 @@ class Times:
             first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
             until = unix_from_ns(MAX_NS)
             if self.end is not None:
-                until = parse_time(self.end, now) + rest_of_text_s(self.end)
+                until = parse_time(self.end, now) + rest_of_end_s(self.end)
             return TimeWindow.from_unix(first, until)
         if self.start is not None or self.end is not None:
             raise InvalidArgumentsError("give --last, or --start and --end, not both")

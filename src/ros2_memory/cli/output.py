@@ -6,7 +6,6 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 from __future__ import annotations
 
 import re
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from rich.box import SIMPLE_HEAD
@@ -14,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
@@ -294,10 +294,10 @@ def _is_time(value: JsonValue) -> bool:
 def format_time(unix_s: float) -> str:
     """Formats a time in this machine's zone, to the microsecond.
 
-    Every option that takes a time reads it, and it is one word for a shell.
+    Every option that takes a time reads it, and it is one word for a shell. Where clocks were set
+    back, and the time occurs twice, it has its offset.
     """
-    local = datetime.fromtimestamp(unix_s, tz=UTC).astimezone()
-    return f"{local:%Y-%m-%dT%H:%M:%S.%f}"
+    return local_time(round(unix_s * 1e6) * NS_PER_US).isoformat(timespec="microseconds")
 
 
 def format_duration(seconds: float) -> str:

@@ -106,7 +106,7 @@ class LocalTimes:
         begins, ends = (None if at is None else local_text(at) for at in (start, end))
         if begins is None or ends is None or begins == ends:
             return begins or (f"- {ends}" if ends else None)
-        day = begins[: -len("00:00:00")]
+        day = begins[: len("Tue 2026-11-17 ")]
         return f"{begins} - {ends.removeprefix(day)}"
 
 

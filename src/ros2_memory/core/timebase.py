@@ -84,17 +84,28 @@ def iso_local(ns: Ns) -> str | None:
         return None
 
 
-def local_text(ns: Ns) -> str | None:
-    """Returns local time as `Tue 2026-11-17 14:05:03`, which `unix_from_text` reads; else as above.
+def local_time(ns: Ns) -> datetime:
+    """Returns local time, rounded up to microseconds, which `unix_from_text` reads as ISO 8601.
 
-    Seconds are whole, rounded down. A local time that occurs twice, since clocks were set back, is
-    written the same way both times.
+    It has its offset only where clocks were set back, and it occurs twice.
+
+    Raises:
+        ValueError, OverflowError, OSError: the calendar does not have its year.
     """
+    whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
+    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
+    local = (whole + fraction).astimezone()
+    naive = local.replace(tzinfo=None)
+    return naive if naive.timestamp() == naive.replace(fold=1).timestamp() else local
+
+
+def local_text(ns: Ns) -> str | None:
+    """Returns `local_time` as `Tue 2026-11-17 14:05:03`, rounded down to seconds; else as above."""
     try:
-        local = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC).astimezone()
+        local = local_time(ns // NS_PER_S * NS_PER_S)
     except (OverflowError, ValueError, OSError):
         return None
-    return f"{_WEEKDAYS[local.weekday()]} {local.replace(tzinfo=None).isoformat(sep=' ')}"
+    return f"{_WEEKDAYS[local.weekday()]} {local.isoformat(sep=' ')}"
 
 
 def unix_from_text(text: str) -> float:
@@ -126,14 +137,20 @@ def unix_from_text(text: str) -> float:
 def rest_of_text_s(text: str) -> float:
     """Returns how long a time as text lasts after its first moment (s, whole microseconds).
 
-    Its last decimal is all part of it: 14:05:03.74 lasts 9.999 ms longer, to 14:05:03.749999. A
-    time with a weekday is rounded down to seconds (`local_text`). Any other is exact.
+    Its last decimal is all part of it: 14:05:03.74 lasts 9.999 ms longer, to 14:05:03.749999, and
+    14:05:03 all of its second. One without seconds is exact, as Unix seconds are.
+    """
+    found = _SECONDS.search(text)
+    return max(10.0 ** -len(found[1] or "") - 1e-6, 0.0) if found else 0.0
+
+
+def rest_of_end_s(text: str) -> float:
+    """Returns how long a window goes on after the time that ends it, as text (s).
+
+    It ends there, but a time with a weekday was rounded down by `local_text`: its message counts.
     """
     weekday, written = _without_weekday(text.strip())
-    found = _SECONDS.search(written)
-    if found is None or (found[1] is None and weekday is None):
-        return 0.0
-    return max(10.0 ** -len(found[1] or "") - 1e-6, 0.0)
+    return rest_of_text_s(written) if weekday else 0.0
 
 
 def named_span_s(text: str) -> float:

@@ -318,7 +318,7 @@ def _robot_rows(
     reply = with_notes({"robots": [*whole]}, notes)
     if len(to_json_text(reply)) <= max_chars:
         return reply
-    keys = (ROBOT_NAME, *SHORT_KEYS[tool])
+    keys = dict.fromkeys((ROBOT_NAME, "now", *SHORT_KEYS[tool]))
     short = [{key: row[key] for key in keys if key in row} for row in whole]
     return with_notes(
         {"robots": [*short]}, ["each robot shortly; pass robot for all of it", *notes]

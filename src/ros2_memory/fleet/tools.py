@@ -150,19 +150,20 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None]:
-            return robot.asked(
+        def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
+            answer, lake = robot.asked(
                 lambda memory: _single(_answer(asked.question, memory, own)),
                 lake=self._is_of_lake,
                 begin_of=partial(_begin_of, asked.given),
             )
+            return answer, lake, own.now
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
             raise found
-        answer, lake = found
+        answer, lake, now = found
         notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
-        return OfRobot(robot.name, robot.bag_dir, answer, notes)
+        return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
 
     @property
     def _is_of_lake(self) -> bool:
@@ -232,6 +233,8 @@ class _FleetQuestions:
             page.add(each.last for each in answer.sightings)
             page.add(each.until for each in answer.episodes)
         value = as_json(answer, memory.index.bag_dir)
+        if call.now is not None and isinstance(value, dict):
+            value = {"now": unix_rounded_up(call.now), **value}
         return RobotReply(robot.name, value, latest, is_ahead), answer
 
     def _limit(self, given: object) -> int | None:

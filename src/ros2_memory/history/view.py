@@ -221,12 +221,20 @@ def _stated(topic: str, bags: Sequence[BagSpan]) -> int:
 class AtTime:
     """A moment: at Unix seconds, or so many seconds before now; or several. Exactly one is set.
 
-    `each_s` are moments in Unix seconds; `insights.at_each` asks a query about one after the other.
+    `each` are several; `insights.at_each` asks a query about one after the other. `rest_s`: a
+    message counts as of the moment, too, if it is at most so much later; what is interpolated does
+    not.
     """
 
     at_s: float | None = None
     ago_s: float | None = None
-    each_s: tuple[float, ...] = ()
+    each: tuple[AtTime, ...] = ()
+    rest_s: float = 0.0
+
+    @property
+    def end_s(self) -> float:
+        """The last time that counts, in Unix seconds, of one at Unix seconds."""
+        return (self.at_s or 0.0) + self.rest_s
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,7 +266,7 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
     """
     if moment.at_s is not None:
         at = ns_argument("timestamp", moment.at_s)
-        view, now = open_view(memory, call, at), None
+        view, now = open_view(memory, call, at + ns_from_unix(moment.rest_s)), None
     else:
         ago = ns_argument("seconds_ago", moment.ago_s or 0.0)
         if ago < 0:

@@ -26,7 +26,7 @@ A = TypeVar("A", bound=MomentAnswer)
 def at_each(
     query: Callable[Concatenate[Memory, Call, P], A],
 ) -> Callable[Concatenate[Memory, Call, P], A | AtEach]:
-    """Returns a query that answers `moment.each_s` one by one, all from one snapshot of the index.
+    """Returns a query that answers `moment.each` one by one, all from one snapshot of the index.
 
     Where there is nothing at one of the moments, `NothingAt` takes its place. Where there is
     nothing at any, for one and the same reason, that is raised as for a single moment.
@@ -35,19 +35,19 @@ def at_each(
     @wraps(query)
     def answer(memory: Memory, call: Call, /, *args: P.args, **given: P.kwargs) -> A | AtEach:
         moment = given["moment"]
-        if not isinstance(moment, AtTime) or not moment.each_s:
+        if not isinstance(moment, AtTime) or not moment.each:
             return query(memory, call, *args, **given)
-        reach = max(ns_argument("timestamps", at_s) for at_s in moment.each_s)
+        reach = max(ns_argument("timestamps", one.end_s) for one in moment.each)
         index = OneSnapshot(memory.index, memory.index.snapshot(reach))
         fixed = replace(memory, index=index)
         answers: list[MomentAnswer | NothingAt] = []
         failures: list[NoDataError] = []
-        for at_s in moment.each_s:
-            given["moment"] = AtTime(at_s)
+        for one in moment.each:
+            given["moment"] = one
             try:
                 answers.append(query(fixed, call, *args, **given))
             except NoDataError as error:
-                at = ns_argument("timestamps", at_s)
+                at = ns_argument("timestamps", one.at_s or 0.0)
                 answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
                 failures.append(error)
         if len(failures) == len(answers) and len({each.detail for each in failures}) == 1:

@@ -185,13 +185,15 @@ OneAnswer: TypeAlias = (
 class OfRobot:
     """What one robot of a fleet answers; its files are named relative to `bag_dir`.
 
-    `notes` are on where the answer was found.
+    `notes` are on where the answer was found. `now`: what its ages count from, where that is not
+    the wall clock.
     """
 
     name: str
     bag_dir: Path
     answer: OneAnswer
     notes: tuple[str, ...] = ()
+    now: Ns | None = None
 
 
 @result()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from ros2_memory.core.reply import (
@@ -36,7 +35,7 @@ from ros2_memory.core.reply import (
     unit,
 )
 from ros2_memory.core.text import named, quote
-from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import Ns, local_time, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.episodes import SAID
 
@@ -505,5 +504,4 @@ def _cell(value: float, kind: BinColumn) -> JsonValue:
             return rounded(value, 6)
         case "time":
             # As arguments take it.
-            local = datetime.fromtimestamp(int(value) // NS_PER_S, tz=UTC).astimezone()
-            return local.replace(tzinfo=None).isoformat(sep=" ")
+            return local_time(int(value)).isoformat(sep=" ", timespec="microseconds")

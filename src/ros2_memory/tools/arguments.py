@@ -30,7 +30,7 @@ from pydantic import (
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import named_span_s, rest_of_text_s, unix_from_text
+from ros2_memory.core.timebase import named_span_s, rest_of_end_s, rest_of_text_s, unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.places.scope import WhileCondition
 
@@ -102,7 +102,7 @@ def _read_time(value: object) -> object:
 
 
 def _read_until(value: object, info: ValidationInfo[object]) -> object:
-    """Returns a time as `_read_time` does; of a text the end of its last decimal.
+    """Returns the end of a window: a time as `_read_time` does, but see `rest_of_end_s`.
 
     Of a window whose start is the same the end of the minute or the day that the text names.
     """
@@ -110,7 +110,12 @@ def _read_until(value: object, info: ValidationInfo[object]) -> object:
     if not isinstance(value, str) or not isinstance(seconds, float):
         return seconds
     start = info.data.get((info.field_name or "").replace("end", "start"))
-    return seconds + (named_span_s(value) if start == seconds else 0.0) + rest_of_text_s(value)
+    return seconds + (named_span_s(value) if start == seconds else 0.0) + rest_of_end_s(value)
+
+
+def _read_moment(value: object) -> tuple[object, float]:
+    """Returns a time as `_read_time` does, and how long it lasts as text (s)."""
+    return _read_time(value), rest_of_text_s(value) if isinstance(value, str) else 0.0
 
 
 def _as_times(value: object) -> object:
@@ -239,25 +244,19 @@ _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=F
 _Tolerance: TypeAlias = Annotated[_AtLeast0, Field(description="Oldest age, s, e.g. 2 at 1 Hz.")]
 _MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score.")]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
-_Time: TypeAlias = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False),
-    AfterValidator(_check_unix),
-    BeforeValidator(_read_time),
-    WithJsonSchema({"type": [*TIME_KINDS]}),
+_UnixSeconds: TypeAlias = Annotated[
+    float, Field(strict=True, allow_inf_nan=False), AfterValidator(_check_unix)
 ]
-# Up to which messages count: a text that a reply printed, pasted back, finds its message.
-_Until: TypeAlias = Annotated[
-    float,
-    Field(strict=True, allow_inf_nan=False),
-    AfterValidator(_check_unix),
-    BeforeValidator(_read_until),
-    WithJsonSchema({"type": [*TIME_KINDS]}),
+_TIME_SCHEMA: Final = WithJsonSchema({"type": [*TIME_KINDS]})
+_Time: TypeAlias = Annotated[_UnixSeconds, BeforeValidator(_read_time), _TIME_SCHEMA]
+_Until: TypeAlias = Annotated[_UnixSeconds, BeforeValidator(_read_until), _TIME_SCHEMA]
+_Moment: TypeAlias = Annotated[
+    tuple[_UnixSeconds, float], BeforeValidator(_read_moment), _TIME_SCHEMA
 ]
 _Start: TypeAlias = Annotated[_Time | None, Field(alias="start", description=FORMS_OF_TIME)]
 _End: TypeAlias = Annotated[_Until | None, Field(alias="end", description=_INCLUSIVE)]
 _Before: TypeAlias = Annotated[_Until | None, Field(alias="before", description="Up to this time.")]
-_Times: TypeAlias = Annotated[tuple[_Until, ...], BeforeValidator(_as_times)]
+_Times: TypeAlias = Annotated[tuple[_Moment, ...], BeforeValidator(_as_times)]
 _Topic: TypeAlias = Annotated[_Name, Field(description="E.g. /odom.", examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
@@ -412,6 +411,10 @@ class TimeArgument(Arguments):
     extra_reply: ClassVar[str] = ""
     either: ClassVar[tuple[str, ...]] = ()
 
+    def chosen(self) -> object:
+        """Returns what the placeholder is made of."""
+        return dict(self)
+
 
 class At(TimeArgument):
     """A time, or several."""
@@ -419,12 +422,17 @@ class At(TimeArgument):
     replaces = "moment"
     text = "at a time"
     either = ("timestamp", "timestamps")
-    at_s: _Until | None = Field(
+    one: _Moment | None = Field(
         default=None, alias="timestamp", description=FORMS_OF_TIME, examples=[1784023200.5]
     )
-    each_s: Annotated[_Times, Field(description=f"Up to {MOST_TIMES} times.")] = Field(
+    several: Annotated[_Times, Field(description=f"Up to {MOST_TIMES} times.")] = Field(
         default=(), alias="timestamps"
     )
+
+    def chosen(self) -> AtTime:
+        """Returns the moment, or those."""
+        each = [AtTime(at_s, rest_s=rest_s) for at_s, rest_s in self.several]
+        return AtTime(self.one[0], rest_s=self.one[1]) if self.one else AtTime(each=tuple(each))
 
 
 class Ago(TimeArgument):

@@ -68,7 +68,7 @@ class Replies:
         name: str | None = None
         notes: tuple[str, ...] = ()
         if isinstance(answer, results.OfRobot):
-            name, bag_dir, notes = answer.name, answer.bag_dir, answer.notes
+            name, bag_dir, notes, now = answer.name, answer.bag_dir, answer.notes, answer.now
             answer = answer.answer
         else:
             bag_dir = self.bag_dir

@@ -38,7 +38,8 @@ class Signature:
     """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
 
     `plain_times`: the schema declares times as numbers only, and places as names only, since some
-    clients refuse an argument of two types. The other types are still accepted.
+    clients refuse an argument of two types. The other types are still accepted. Of arguments of
+    which one must be given there is the first alone, as the specification has it.
     """
 
     def __init__(
@@ -61,6 +62,9 @@ class Signature:
                 properties.update(_properties(self._when))
             else:
                 properties[name] = schema
+        if self._plain_times and self._when is not None:
+            for name in self._when.either[1:]:
+                del properties[name]
         return properties
 
     @cached_property
@@ -70,7 +74,8 @@ class Signature:
     @property
     def _either(self) -> tuple[str, ...]:
         """Returns the arguments of which exactly one must be given."""
-        return () if self._when is None else self._when.either
+        either = () if self._when is None else self._when.either
+        return either[:1] if self._plain_times else either
 
     @property
     def example(self) -> JsonObject:
@@ -91,8 +96,7 @@ class Signature:
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
             properties[name] = _with_plain_times(shown) if self._plain_times else shown
-        # The specification's tools take one time; those beyond it take one of several forms.
-        required = [*self._required, *(self._either[:1] if self._plain_times else ())]
+        required = [*self._required, *(self._either if self._plain_times else ())]
         whole: JsonObject = {"type": "object", "properties": properties}
         return {**whole, "required": [*required]} if required else whole
 
@@ -112,7 +116,7 @@ class Signature:
         values = dict(present)
         if self._when is not None:
             try:
-                values[self._when.replaces] = dict(self._when.model_validate(present))
+                values[self._when.replaces] = self._when.model_validate(present).chosen()
             except ValidationError as error:
                 problems += self._wrong(error, given)
         try:
@@ -146,8 +150,8 @@ class Signature:
         if len(named) > 1:
             yield f"{' and '.join(named)} were both given: give only one"
         elif either and not named:
-            others = " or ".join(either[1:])
-            yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}; or {others}"
+            others = f"; or {' or '.join(either[1:])}" if either[1:] else ""
+            yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}{others}"
 
     def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
         reported: set[str] = set()
@@ -186,9 +190,6 @@ def _with_plain_times(schema: JsonObject) -> JsonObject:
             plain["type"] = kinds[0]
     if plain.get("description") == FORMS_OF_TIME:
         del plain["description"]
-    items = plain.get("items")
-    if isinstance(items, dict):
-        plain["items"] = _with_plain_times(items)
     return plain
 
 

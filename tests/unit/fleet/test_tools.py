@@ -9,6 +9,7 @@ import json
 import threading
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -122,6 +123,44 @@ def test_a_robot_that_is_named_answers_as_alone_with_its_name(folder: Path, name
         assert found == expected
     else:
         assert found == {"robot_name": "r2", **expected}
+
+
+def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
+    folder: Path,
+) -> None:
+    limits = QuerySettings(now="latest")
+    robots = [
+        Robot(name, folder / name, partial(fleet_memory, folder / name, limits)) for name in NAMES
+    ]
+    fleet = Fleet(robots, FixedClock(NOW))
+    nows = {name: float(seeded(name).end_s) for name in NAMES}
+    assert len({*nows.values()}) > 1
+    visited: dict[str, object] = {"where": {"x": 1, "y": 2, "radius_m": 2}}
+    last: dict[str, object] = {"last_s": LENGTH_S}
+    ago: dict[str, object] = {"seconds_ago": 5}
+    for tool, given in (
+        ("get_position_seconds_ago", ago),
+        ("find_last_match", LAST),
+        ("find_matches", LAST),
+        ("find_things", {}),
+        ("visits", visited),
+        ("recap", last),
+        ("memory_status", {}),
+    ):
+        for name, now in nows.items():
+            found = reply(fleet, tool, {**given, "robot": name})
+            assert found["now"] == now, (tool, found)
+    for tool, given in (("find_matches", LAST), ("find_things", {})):
+        rest = reply(fleet, tool, given)["by_robot"]
+        assert {name: rest[name]["now"] for name in NAMES} == nows, tool
+    for row in reply(fleet, "find_last_match", LAST)["matches"]:
+        assert row["now"] - row["age_s"] == pytest.approx(row["timestamp"])
+    tools = fleet_tools(build_tools(limits), fleet, max_chars=300)
+    for tool, given in (("recap", last), ("memory_status", {})):
+        (short,) = (each for each in tools if each.name == tool)
+        answer: Any = short.question(given)(None, Call())  # type: ignore[arg-type]
+        for value in (answer.value, reply(fleet, tool, given)):
+            assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
 
 
 @pytest.mark.parametrize("tool", ["find_matches", "find_things", "visits"])

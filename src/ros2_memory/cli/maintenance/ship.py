@@ -30,7 +30,7 @@ from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
 from ros2_memory.core.text import abbreviate, counted, listed
-from ros2_memory.core.timebase import WallClock, ns_from_unix, rest_of_text_s
+from ros2_memory.core.timebase import WallClock, ns_from_unix, rest_of_end_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -129,7 +129,7 @@ def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWin
     if robot is None or start is None or end is None:
         raise InvalidArgumentsError("give all of --forget, --start and --end, or none of them")
     now = time.time()
-    return TimeWindow.from_unix(parse_time(start, now), parse_time(end, now) + rest_of_text_s(end))
+    return TimeWindow.from_unix(parse_time(start, now), parse_time(end, now) + rest_of_end_s(end))
 
 
 def _forget(
