@@ -28,7 +28,7 @@ from ros2_memory.lake.tombstones import (
     read_tombstones,
 )
 from ros2_memory.lake.upkeep import compact, expire
-from ros2_memory.lake.written_files import recorded_files
+from ros2_memory.lake.written_files import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
@@ -216,7 +216,7 @@ def test_a_list_of_what_was_forgotten_that_cannot_be_read_keeps_its_robot_from_b
     path = bag_dir / FORGOTTEN_FILE
     # A crash cut the first line short.
     whole = with_checks('{"start": 1, "stop": 2, "topics": ["/a"]}')
-    path.write_text('{"start": 1, "sto\n' + whole)
+    path.write_text(f'{{"start": 1, "sto\n{whole}')
     assert read_forgettings(bag_dir) == [Forgetting(1, 2, ("/a",))]
     path.write_text('{"start": 1, "stop": 2}\n')
     done = ship(tmp_path / "lake", [robot_bags("hall", bag_dir), robot_bags("kitchen", other)])
@@ -297,7 +297,7 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     ship(lake, [robot_bags("hall", bag_dir)])
     where = location(lake)
     files = {path for path in lake.rglob("*") if path.is_file()}
-    now = max(recorded_files(where.state_dir).values()) + NS_PER_S
+    now = max(each.at for each in WRITTEN.rows(where.state_dir)) + NS_PER_S
     with where.opened() as catalog:
         tables = where.tables(catalog, TABLES)
         assert expire(where, tables, now, DAY_NS) == 0
