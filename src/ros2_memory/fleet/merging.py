@@ -335,7 +335,13 @@ def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
 
 def _notes_of(replies: Sequence[RobotReply]) -> list[str]:
     """Returns the notes of the replies, each with the names of its robots."""
-    said = ((each.name, str(note)) for each in replies for note in _items(each.body, "notes"))
+    # `str(note)` would lose that it is quoted.
+    said = [
+        (each.name, note)
+        for each in replies
+        for note in _items(each.body, "notes")
+        if isinstance(note, str)
+    ]
     return [_of_robots(names, note) for note, names in by_reason(said).items()]
 
 

@@ -27,6 +27,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
+from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.shared_bags import REAL, needs_real
@@ -303,7 +304,7 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
     own.parent.mkdir()
     inode = (bag_dir / "rec").stat().st_ino
     mine = json.dumps({"recording": "rec", "inode": inode})
-    own.write_text('{"bag_dir_id": "5f0c"}\n' + mine + "\n")
+    own.write_text(with_checks('{"bag_dir_id": "5f0c"}\n' + mine))
     assert last(bag_dir, recalls, "/rosout", "contains", "never") is None
     (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
     assert last(bag_dir, recalls, "/rosout", "contains", "never")["notes"]
