@@ -5,6 +5,7 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 
 from __future__ import annotations
 
+import math
 import re
 from typing import TYPE_CHECKING, Final
 
@@ -113,8 +114,9 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
     every = value.get(_ALL)
     if isinstance(every, list):  # a row of its own, without its name
         rows = [*rows, [_ALL, *every]]
+    names_of_cells = [*map(str, fields)]
     named: list[JsonValue] = [
-        {name: cell for name, cell in zip(map(str, fields), row, strict=False) if _is_shown(name)}
+        _cells(dict(zip(names_of_cells, row, strict=False)))
         for row in rows
         if isinstance(row, list)
     ]
@@ -122,9 +124,13 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
     return {key: each for key, each in value.items() if key not in shown} | {"rows": named}
 
 
-def _is_shown(column: str) -> bool:
-    """Returns whether people get a column: the same time as text stands beside a Unix time."""
-    return not column.endswith("_unix")
+def _cells(row: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
+    """Returns the cells of a row; of a time that stands there twice the exact one, once."""
+    return {
+        name: row.get(f"{name}_unix", cell)
+        for name, cell in row.items()
+        if not name.endswith("_unix")
+    }
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
@@ -297,7 +303,9 @@ def format_time(unix_s: float) -> str:
     Every option that takes a time reads it, and it is one word for a shell. Where clocks were set
     back, and the time occurs twice, it has its offset.
     """
-    return local_time(round(unix_s * 1e6) * NS_PER_US).isoformat(timespec="microseconds")
+    fraction, whole = math.modf(unix_s)
+    microseconds = int(whole) * 1_000_000 + round(fraction * 1e6)
+    return local_time(microseconds * NS_PER_US).isoformat(timespec="microseconds")
 
 
 def format_duration(seconds: float) -> str:

@@ -35,7 +35,7 @@ from ros2_memory.core.reply import (
     unit,
 )
 from ros2_memory.core.text import named, quote
-from ros2_memory.core.timebase import Ns, local_time, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.episodes import SAID
 
@@ -503,5 +503,5 @@ def _cell(value: float, kind: BinColumn) -> JsonValue:
         case "number":
             return rounded(value, 6)
         case "time":
-            # As arguments take it.
-            return local_time(int(value)).isoformat(sep=" ", timespec="microseconds")
+            # As arguments take it: all of the second, of which the Unix time beside it is exact.
+            return local_time(int(value) // NS_PER_S * NS_PER_S).isoformat(sep=" ")
