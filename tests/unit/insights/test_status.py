@@ -28,6 +28,7 @@ from ros2_memory.serving.health import Health
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, boolean, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.log_lines import with_checks
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
@@ -488,10 +489,10 @@ class TestWhatIsMissingIsNamedAndCounted:
         own = tmp_path / ".episodic" / "recordings.jsonl"
         own.parent.mkdir()
         inode = (tmp_path / "rec").stat().st_ino
-        own.write_text('{"bag_dir_id": "5f0c"}\n')
+        own.write_text(with_checks('{"bag_dir_id": "5f0c"}'))
         assert "lists 4 missing files" in self.doubts(tmp_path)
         with own.open("a") as stream:
-            stream.write(json.dumps({"recording": "rec", "inode": inode}) + "\n")
+            stream.write(with_checks(json.dumps({"recording": "rec", "inode": inode})))
         assert "lists 1 missing file" in self.doubts(tmp_path)
 
     def test_nothing_behind_a_link_is_looked_at(self, tmp_path: Path) -> None:
