@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.core.arrays import merged_times
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
@@ -359,17 +360,13 @@ def joined_stated(parts: Sequence[Stated]) -> Stated:
     """Returns what the messages of all parts state, which may overlap in time."""
     if len(parts) == 1:
         return parts[0]
-    times = np.concatenate([part.times for part in parts])
-    order = np.argsort(times, kind="stable")
-    place = np.empty(order.size, np.int64)
-    place[order] = np.arange(order.size)
-    begins = np.cumsum([0, *(part.times.size for part in parts)]).tolist()
+    times, _, places = merged_times([part.times for part in parts])
     moved = [
-        part.facts._replace(rows=place[begin + part.facts.rows])
-        for begin, part in zip(begins, parts, strict=False)
+        part.facts._replace(rows=place[part.facts.rows])
+        for place, part in zip(places, parts, strict=True)
     ]
     return Stated(
-        times[order],
+        times,
         joined_facts(moved),
         np.sort(np.concatenate([part.undecodable for part in parts])),
         max(part.beyond for part in parts),

@@ -142,7 +142,7 @@ class JsonLog(Generic[_T]):
                 yield line.number, line.row
             elif not isinstance(line.error, json.JSONDecodeError):
                 raise ValueError(f"line {line.number}: {line.error}")
-            # A whole line ends with its check, or before there was one with a list.
+            # A whole line ends with its check; one whose check was cut off, with a list.
             elif not line.text.startswith(b"{") or line.text.endswith((b"]}", b'"}')):
                 raise ValueError(f"line {line.number}: it is damaged: {line.error}")
 

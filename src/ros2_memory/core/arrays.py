@@ -16,6 +16,19 @@ Ints: TypeAlias = NDArray[np.int64]
 _MOST_KEYS: Final = 2**62
 
 
+def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
+    """Returns the times (ns) of several parts in one order.
+
+    Besides their order among the parts behind each other, and for each part the places of its
+    times in that order. Of equal times those of an earlier part come first.
+    """
+    times = np.concatenate(parts)
+    order = np.argsort(times, kind="stable")
+    places = np.empty(order.size, np.int64)
+    places[order] = np.arange(order.size)
+    return times[order], order, np.split(places, np.cumsum([part.size for part in parts])[:-1])
+
+
 def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     """Returns the distinct rows of some columns in order, and the number of each row among them."""
     lows = [int(each.min(initial=0)) for each in columns]

@@ -326,7 +326,7 @@ def _robot_rows(
 
 
 def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
-    """Returns the names of robots by what is said of them, of pairs of a name and that."""
+    """Returns the names of robots by reason, from pairs of a name and a reason."""
     found: dict[str, list[str]] = {}
     for name, reason in said:
         found.setdefault(reason, []).append(name)

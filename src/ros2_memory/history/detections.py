@@ -9,6 +9,7 @@ import numpy as np
 from ros2_memory.analysis.frames import AGREEMENT_NS
 from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
 from ros2_memory.columns.steps import METRES
+from ros2_memory.core.arrays import merged_times
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.history.scan import messages_of
 from ros2_memory.messages.conversions import nanoseconds
@@ -47,17 +48,13 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
     """Returns messages of tables of one topic together; `parts` is not empty."""
     if len(parts) == 1:
         return parts[0]
-    log_times = np.concatenate([part.log_times for part in parts])
-    order = np.argsort(log_times, kind="stable")
-    position = np.empty(order.size, np.int64)
-    position[order] = np.arange(order.size)
-    begins = np.cumsum([0, *(part.log_times.size for part in parts)]).tolist()
+    log_times, order, places = merged_times([part.log_times for part in parts])
     found = [
-        part.found._replace(rows=position[part.found.rows + begin])
-        for part, begin in zip(parts, begins[:-1], strict=True)
+        part.found._replace(rows=place[part.found.rows])
+        for place, part in zip(places, parts, strict=True)
     ]
     times = np.concatenate([part.times for part in parts])[order]
-    return Detected(log_times[order], times, joined_detections(found))
+    return Detected(log_times, times, joined_detections(found))
 
 
 class DetectionRows:

@@ -56,7 +56,7 @@ _SCORE_UNIT: Final = 1000.0
 
 
 class ShippedBag(NamedTuple):
-    """What a row of `bags` says of the bag that it is of; the fields are its columns.
+    """The columns of `bags` that identify a bag.
 
     Attributes:
         robot: its name.

@@ -97,7 +97,7 @@ class Shipped:
 
 @dataclass(slots=True)
 class _Seen:
-    """A state of a bag: of its file, and of what says which of its messages count.
+    """A bag as it was: its file, and the sidecars that decide which of its messages count.
 
     `is_forgotten`: whether it has messages that were forgotten; None before it was read for that.
     """

@@ -124,7 +124,7 @@ class RecordedTime:
             self._synchronised = True
 
     def _judge_clock(self, lead: Ns) -> bool:
-        """Judges the dates of what is being written; returns whether that changed anything.
+        """Updates whose dates are right, of what is being written; returns whether any changed.
 
         `lead` is the wall clock minus the monotonic clock, which changes when the clock is set.
         """

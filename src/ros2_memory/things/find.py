@@ -350,14 +350,7 @@ class _Finder:
         if found is None:
             return None
         return tuple(
-            UsualPlace(
-                (one.x / _MM, one.y / _MM, 0.0),
-                places_at(self.places, frame, one.x / _MM, one.y / _MM),
-                one.share,
-                _hours_text(one.hours),
-                one.likely,
-            )
-            for one in found
+            replace(one, inside=places_at(self.places, frame, *one.place[:2])) for one in found
         )
 
     def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
@@ -422,13 +415,6 @@ class _Finder:
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
         return StillThere("not_looked_at_since", last)
-
-
-def _hours_text(hours: Sequence[int]) -> str:
-    """Returns hours of the day as stretches: "07-09" is until 09:00."""
-    begins = [hour for hour in hours if hour - 1 not in hours]
-    ends = [hour + 1 for hour in hours if hour + 1 not in hours]
-    return ", ".join(f"{begin:02}-{end:02}" for begin, end in zip(begins, ends, strict=True))
 
 
 def _place(stay: PlacedStay) -> tuple[float, float, float]:

@@ -2,9 +2,9 @@
 
 What is known is where it was last seen in each hour of each day. A place is the likelier, the more
 often the thing was there around the same hour of the day; the place where it was last seen counts
-by how often the thing was still there after as long a time. That is told only where it would have
-said before each of the hours that are known where the thing was, better than the last place did
-(by Brier's score, so that being sure and wrong costs most), and better than without hours.
+by how often the thing was still there after as long a time. Usual places are returned only where,
+before each known hour, they would have predicted the thing's place better than its last place did,
+and better than without hours. The measure is Brier's score: the squared error of the probabilities.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ import numpy as np
 
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.time_bins import local_offset
+from ros2_memory.results import UsualPlace
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike, NDArray
 
     from ros2_memory.analysis.sights import Ints
@@ -28,6 +31,7 @@ if TYPE_CHECKING:
 
 _HOUR_NS: Final = 3600 * NS_PER_S
 _DAY_H: Final = 24
+_MM: Final = 1000.0
 _ONE_PLACE_MM: Final = 1000.0
 _FEWEST_HOURS: Final = 24
 """Fewer known hours make no routine."""
@@ -41,23 +45,6 @@ _AGES_H: Final = (1.5, 3.0, 6.0, 12.0, 24.0)
 _SIGMAS: Final = 2.0
 _LEAST_SHARE: Final = 0.05
 _MOST_PLACES: Final = 4
-
-
-class UsualPlace(NamedTuple):
-    """A place where a thing usually is.
-
-    Attributes:
-        x, y: mean of where it was seen there (mm).
-        share: of the hours in which it was seen anywhere.
-        hours: of the local day (0 to 23) at which this is its likeliest place.
-        likely: how likely it is there now, 0 to 1.
-    """
-
-    x: float
-    y: float
-    share: float
-    hours: tuple[int, ...]
-    likely: float
 
 
 class _Known(NamedTuple):
@@ -134,14 +121,21 @@ def usual_places(
     order = [place for place in np.argsort(-likely).tolist() if shares[place] >= _LEAST_SHARE]
     return tuple(
         UsualPlace(
-            x=float(centres[place, 0]),
-            y=float(centres[place, 1]),
-            share=float(shares[place]),
-            hours=tuple(np.flatnonzero(best == place).tolist()),
-            likely=float(likely[place]),
+            (*(centres[place] / _MM).tolist(), 0.0),
+            (),
+            float(shares[place]),
+            _hours_text(np.flatnonzero(best == place).tolist()),
+            float(likely[place]),
         )
         for place in order[:_MOST_PLACES]
     )
+
+
+def _hours_text(hours: Sequence[int]) -> str:
+    """Returns hours of the day as stretches: "07-09" is until 09:00."""
+    begins = [hour for hour in hours if hour - 1 not in hours]
+    ends = [hour + 1 for hour in hours if hour + 1 not in hours]
+    return ", ".join(f"{begin:02}-{end:02}" for begin, end in zip(begins, ends, strict=True))
 
 
 def _local_hour(at: Ns, offset: Offset) -> float:
