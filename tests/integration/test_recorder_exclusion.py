@@ -129,13 +129,14 @@ def test_nothing_of_it_is_ever_served(
     wait_for(has_excluded_a_split, "another split that is excluded", alive=recorder.process)
     last = turned(robot, truth, signal.SIGUSR2)
     private = range(first, last)
-    served(recorder, lambda found: max(found, default=0) > last + 100, "what came after it")
+    served(recorder, lambda found: max(found, default=0) > last + 150, "what came after it")
     recorder.stop()
     found = Server(recorder.bag_dir).finds()
-    # The margin of a second is 50 messages; all else is there but for what a kill lost.
-    assert not found & {*range(first - 30, last + 30)}
-    assert {*range(first - 100, first - 60)} <= found
-    assert {*range(last + 60, last + 100)} <= found
+    # The margin of a second is 50 messages or fewer, which a busy machine receives up to half a
+    # second late; all else is there but for what a kill lost.
+    assert not found & {*range(first - 20, last + 20)}
+    assert {*range(first - 150, first - 75)} <= found
+    assert {*range(last + 75, last + 150)} <= found
     everywhere = set().union(*map(numbers, recorder.bag_dir.rglob("rec_*.mcap")))
     assert everywhere == found
     gate = read_gate(recorder.bag_dir)

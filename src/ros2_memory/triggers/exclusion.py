@@ -114,7 +114,7 @@ def excluded_intervals(
             if following is None and stop >= each.stop < MAX_NS:
                 stop = each.stop
                 if run.holds:
-                    held += _carried(each, recordings[at + 1 :], rule.stale)
+                    held += _carried(run.first, each, recordings[at + 1 :], rule.stale)
                 elif _is_taken_over(each, recordings[at + 1 :]):
                     stop = (each.stop if run.lasts else run.last) + rule.stale
             if run.holds is True:
@@ -172,17 +172,24 @@ def _is_taken_over(ended: RecordingConditions, others: Iterable[RecordingConditi
     return any(ended.start <= each.start < ended.stop < each.stop for each in others)
 
 
-def _carried(ended: RecordingConditions, others: Iterable[RecordingConditions], stale: Ns) -> Spans:
-    """Returns where a condition that held at the end of a recording goes on after it."""
+def _carried(
+    since: Ns, ended: RecordingConditions, others: Iterable[RecordingConditions], stale: Ns
+) -> Spans:
+    """Returns where a condition that held from `since` to the end of a recording goes on after it.
+
+    A recording that took over may have begun, and received the topic, before the condition held.
+    """
     spans: Spans = []
     until: Ns | None = None
     for each in others:
+        start = max(since, each.start)
         if each.start < ended.start:  # the clock was set back
-            until = each.start + stale
+            start, until = each.start, each.start + stale
         elif until is None:
             until = max(each.start, ended.stop) + stale
         heard = each.heard[0].first if each.heard else MAX_NS
-        spans.append((each.start, min(until, heard)))
+        if start < min(until, heard):
+            spans.append((start, min(until, heard)))
         if each.heard:
             break
     return spans

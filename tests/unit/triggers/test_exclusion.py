@@ -70,8 +70,12 @@ def is_held(pasts: Sequence[Past], time: int, *, latched: bool) -> bool:
             continue
         later = pasts[at + 1 :]
         until = max(later[0].start, past.end + 1) + STALE if later else 0
+        since = past.end
+        while knows(past, since - 1, latched=latched):
+            since -= 1
         for each in later:
-            if each.start <= time < until and not any(when <= time for when, _ in each.said):
+            start = max(since, each.start)
+            if start <= time < until and not any(when <= time for when, _ in each.said):
                 return True
             if each.said:
                 break
@@ -130,6 +134,15 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
         if any(past.start <= time <= past.end for past in pasts):
             found = any(each.start <= time < each.stop for each in stretches)
             assert found == (time in goes), time
+
+
+def test_a_condition_that_holds_later_says_nothing_of_when_the_next_recording_began() -> None:
+    """Two recordings overlap, the condition begins to hold in both, and the first one ends."""
+    one, other = Past(0, 30, ((0, False), (20, True))), Past(10, 40, ((12, False), (20, True)))
+    found = excluded_intervals(
+        rule(margin=2), [heard_by(each, latched=True) for each in (one, other)]
+    )
+    assert found == [Excluded(18, 43, held=True)]
 
 
 def test_a_value_out_of_order_only_adds() -> None:
