@@ -176,11 +176,10 @@ class Filling:
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         bags, whole = batch
-        hashed = any(self._is_shared(bag, timeline) for bag in bags)
         decoded_bags: list[DecodedBag] = []
         done = held = 0
         for bag in sorted(bags, key=in_time):
-            found = self._decoded(bag, hashed=hashed)
+            found = self._decoded(bag, hashed=self._is_shared(bag, timeline))
             self._large.release()
             if isinstance(found, bool):
                 done += found
@@ -188,9 +187,9 @@ class Filling:
             decoded_bags.append(found)
             held += sum(table.memory_bytes for table in found.tables)
             if held > _MOST_HELD:
-                done += self._put(decoded_bags, hashed=hashed, whole=whole)
+                done += self._put(decoded_bags, whole=whole)
                 decoded_bags, held = [], 0
-        return done + self._put(decoded_bags, hashed=hashed, whole=whole)
+        return done + self._put(decoded_bags, whole=whole)
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -271,7 +270,8 @@ class Filling:
             second = next(groups, None)
             if second is None and bag.end - bag.start <= LONG_NS:
                 tables = self._whole(bag, first)
-                return DecodedBag(self._key(bag), bag, tables, partial(self._is_settled, bag))
+                current = partial(self._is_settled, bag)
+                return DecodedBag(self._key(bag), bag, tables, hashed, current)
             begin = [first] if second is None else [first, second]
             del first, second
             return self._put_long(bag, self._released_groups(bag, begin, groups), hashed=hashed)
@@ -282,15 +282,15 @@ class Filling:
             self._refuse(bag, type(error).__name__)
         return False
 
-    def _put(self, bags: Sequence[DecodedBag], *, hashed: bool, whole: bool) -> int:
+    def _put(self, bags: Sequence[DecodedBag], *, whole: bool) -> int:
         """Stores bags in parts together; each alone where the database refuses that."""
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
-        written = self.store.put(bags, hashed=hashed, whole=whole)
+        written = self.store.put(bags, whole=whole)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                return sum(self._put([bag], hashed=hashed, whole=whole) for bag in bags)
+                return sum(self._put([bag], whole=whole) for bag in bags)
             self._refuse(bags[0].bag, self.store.refused_for or "")
         if written.parts and whole:
             begin = self._slot(bags[0].bag)[1]

@@ -1,9 +1,10 @@
 """Parts: the rows of one topic in some bags of a recording, stored column by column.
 
 Beside the columns of the topic's layout a part has `#log_time`, `#bag` (the number of each row's
-bag) and, where copies of a message may lie in other recordings, `#publish_time`, `#payload_hash`
-and the zone of `#delay`: how much later messages were received than published. The owners of the
-elements of a sequence lie under its path and `#`.
+bag) and, where copies of a message of some bag may lie in other recordings, `#payload_hash`,
+`#delay` (how much later a message was received than published) and the zone of `#publish_time`. In
+rows of its other bags the hash is `UNHASHED` and the delay 0. The owners of the elements of a
+sequence lie under its path and `#`.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ ZONE_ALONE: Final = "zone"
 """The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: its topic is beyond its share."""
-ALWAYS: Final = frozenset({LOG_TIME, PUBLISH_TIME, PAYLOAD_HASH, BAG})
+ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
+UNHASHED: Final = -1
+"""In place of the hash of a payload that was not hashed."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +85,8 @@ def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPa
         replace(table, places=np.arange(stop - len(table), stop))
         for (_, table), stop in zip(tables, stops.tolist(), strict=True)
     ]
+    if any(table.payload_hashes is not None for table in numbered):
+        numbered = [_with_hashes(table) for table in numbered]
     whole = joined(numbered)
     bags = np.array([bag for bag, _ in tables], np.int64)
     return pack_rows(layout, whole, bags[np.searchsorted(stops, whole.places, side="right")])
@@ -95,11 +100,13 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     """
     columns = {LOG_TIME: pack(table.log_times), BAG: pack(bags)}
     if table.payload_hashes is not None:
-        columns[PUBLISH_TIME] = pack(table.publish_times)
+        is_hashed = table.payload_hashes != UNHASHED
         columns[PAYLOAD_HASH] = pack(table.payload_hashes)
-        delays = table.log_times - table.publish_times
-        zone = Zone(int(delays.min()), int(delays.max()))
-        columns[DELAY] = Packed(ZONE_ALONE, delays.size, 0.0, zone, b"")
+        columns[DELAY] = pack(np.where(is_hashed, table.log_times - table.publish_times, 0))
+        # Those of a table without columns may be log times.
+        if is_hashed.all() or "" not in table.left_out:
+            published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
+            columns[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
     steps = [slot.kind.step for slot in layout.slots.values()]
     packs = pack_columns([*zip(layout.columns_of(table), steps, strict=True)])
     columns.update(zip(layout.slots, packs, strict=True))
@@ -113,6 +120,12 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
             for path, packed in columns.items()
         },
     )
+
+
+def _with_hashes(table: Table) -> Table:
+    if table.payload_hashes is not None:
+        return table
+    return replace(table, payload_hashes=np.full(len(table), UNHASHED))
 
 
 def part_table(

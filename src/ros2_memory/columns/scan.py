@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
-from ros2_memory.columns.parts import DELAY, PUBLISH_TIME
+from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.columns.units import BagUnit, Rows, Unit
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
@@ -372,34 +372,35 @@ class Scan:
         parts: list[Identities] = []
         for unit, some in zip(units, rows, strict=True):
             recording = numbers[unit.recording]
-            # Below 0, and another for each recording: what has no hash is no copy.
-            published, hashes = unit.identities() or self._hashed_again(unit, -1 - recording)
+            published, hashes = self._identities(unit, some)
+            # Another for each recording: what has no hash is no copy.
+            hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
             parts.append(
-                Identities(
-                    unit.times()[some],
-                    published[some],
-                    hashes[some],
-                    np.full(some.size, recording),
-                )
+                Identities(unit.times()[some], published, hashes, np.full(some.size, recording))
             )
         return joined_identities(parts)
 
-    def _hashed_again(self, unit: Unit, unknown: int) -> tuple[IntArray, IntArray]:
-        """Reads the bags of a unit that was stored before another recording came beside it.
+    def _identities(self, unit: Unit, some: IntArray) -> tuple[IntArray, IntArray]:
+        """Returns publish times and hashes of some rows of a unit.
 
-        Rows of a bag that has changed meanwhile have their log times, and the hash `unknown`.
+        Bags that were stored before another recording came beside them are read. Rows of one that
+        has changed meanwhile have their log times, and are `UNHASHED`.
         """
-        published = unit.times().copy()
-        hashes = np.full(published.size, unknown)
-        numbers = unit.bag_numbers()
-        for number, bag in unit.bags().items():
+        times = unit.times()
+        published, hashes = unit.identities() or (times, np.full(times.size, UNHASHED))
+        unknown = some[hashes[some] == UNHASHED]
+        if not unknown.size:
+            return published[some], hashes[some]
+        published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
+        bags = unit.bags()
+        for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._asked.decode(bag, self._asked.topic, True):
+            for table in self._asked.decode(bags[number], self._asked.topic, True):
                 same = table.channel.type == unit.table.channel.type
                 if same and len(table) == rows.size and table.payload_hashes is not None:
                     published[rows] = table.publish_times
                     hashes[rows] = table.payload_hashes
-        return published, hashes
+        return published[some], hashes[some]
 
 
 def _bounded(tables: Iterable[Table]) -> list[Table]:

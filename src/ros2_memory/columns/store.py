@@ -502,14 +502,13 @@ class ColumnStore(Database):
 
         return self.write(write)
 
-    def put(self, bags: Sequence[DecodedBag], *, hashed: bool, whole: bool) -> Written:
+    def put(self, bags: Sequence[DecodedBag], *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
         One that is in whole parts stays as it is: another program has stored it.
 
         Args:
             bags: all messages of each. One that changed meanwhile is left out.
-            hashed: whether all tables have the hashes of their payloads.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
         written = Written(0, ())
@@ -517,18 +516,18 @@ class ColumnStore(Database):
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
             rows = connection.execute(
-                "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE hashed >= ?"
-                " AND definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
+                "SELECT path, size, mtime_ns, sidecar_ns, hashed FROM bag"
+                " WHERE definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
                 f" AND id NOT IN ({UNMERGED})",
-                (hashed, self._definitions, json.dumps([bag.key.path for bag in bags])),
+                (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
-            done = {BagKey(*row) for row in rows}
-            new = [bag for bag in bags if bag.key not in done and bag.is_current()]
+            stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
+            missing = [bag for bag in bags if stored.get(bag.key, -1) < bag.hashed]
+            new = [bag for bag in missing if bag.is_current()]
             delete_bags(connection, [bag.key.path for bag in new])
-            parts = insert_bags(
-                connection, new, self._definitions, self._layouts, hashed=hashed, whole=whole
-            )
-            written = Written(len(done) + len(new), tuple(self.offset + part for part in parts))
+            parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
+            done = len(bags) - len(missing)
+            written = Written(done + len(new), tuple(self.offset + part for part in parts))
 
         return written if self.write(write) else Written(0, ())
 

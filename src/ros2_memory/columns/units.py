@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.columns.parts import BAG, LOG_TIME, PAYLOAD_HASH, PUBLISH_TIME
+from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.errors import BusyError
 
 if TYPE_CHECKING:
@@ -134,8 +134,8 @@ class PartUnit(Unit):
 
     def identities(self) -> tuple[IntArray, IntArray] | None:
         """Returns publish times and hashes of payloads; None where they are not stored."""
-        published, hashes = self._load(PUBLISH_TIME), self._load(PAYLOAD_HASH)
-        return None if published is None or hashes is None else (published, hashes)
+        delays, hashes = self._load(DELAY), self._load(PAYLOAD_HASH)
+        return None if delays is None or hashes is None else (self.times() - delays, hashes)
 
     def bags(self) -> Mapping[int, BagFile]:
         """Returns the bags of which rows count, by their numbers in the store."""

@@ -38,12 +38,14 @@ class DecodedBag(NamedTuple):
         key: of the bag.
         bag: the bag, for its times.
         tables: all of its messages.
+        hashed: whether these have the hashes of all payloads.
         is_current: whether the bag may be stored, asked once nobody else can write.
     """
 
     key: BagKey
     bag: BagFile
     tables: Sequence[Table]
+    hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
 
 
@@ -206,7 +208,6 @@ def insert_bags(
     definitions: str,
     layouts: Layouts,
     *,
-    hashed: bool,
     whole: bool,
 ) -> list[int]:
     """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
@@ -214,7 +215,7 @@ def insert_bags(
     layout_of: dict[int, Layout] = {}
     for bag in bags:
         needed = definitions if lacks_definitions(bag.tables) else ""
-        number = insert_bag(connection, bag.key, bag.bag, needed, hashed=hashed)
+        number = insert_bag(connection, bag.key, bag.bag, needed, hashed=bag.hashed)
         for table in bag.tables:
             topic, layout_of[topic] = topic_of(connection, table, layouts)
             if len(table):

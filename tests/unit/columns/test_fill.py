@@ -133,6 +133,40 @@ def test_a_bag_that_comes_beside_another_recording_is_stored_again(tmp_path: Pat
     check_all(world)
 
 
+def test_of_a_part_only_the_bags_beside_another_recording_are_hashed(tmp_path: Path) -> None:
+    """The first of three bags has copies in another recording, and later so has the second."""
+    for number in range(3):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path)
+
+    def copy(number: int) -> None:
+        copied = write_bag(tmp_path / "copy", number)
+        path = tmp_path / f"rec_{number + 4}" / f"rec_{number + 4}_0.mcap"
+        path.parent.mkdir()
+        copied.rename(path)
+
+    def hashed() -> list[str]:
+        with closing(sqlite3.connect(store_file(tmp_path))) as base:
+            return [
+                path for (path,) in base.execute("SELECT path FROM bag WHERE hashed ORDER BY 1")
+            ]
+
+    copy(0)
+    assert world.fill() == 4
+    assert hashed() == ["rec/rec_0.mcap", "rec_4/rec_4_0.mcap"]
+    assert check_all(world) == 3 * 21
+    copy(1)
+    assert check_all(world) == 3 * 21  # what was stored unhashed is read
+    assert world.fill() == 2
+    assert hashed() == [
+        "rec/rec_0.mcap",
+        "rec/rec_1.mcap",
+        "rec_4/rec_4_0.mcap",
+        "rec_5/rec_5_0.mcap",
+    ]
+    assert check_all(world) == 3 * 21
+
+
 def test_columns_beyond_the_share_are_dropped_and_times_and_zones_stay(tmp_path: Path) -> None:
     for number in range(3):
         write_bag(tmp_path, number, rows=2000, hz=100)
