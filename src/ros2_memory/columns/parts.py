@@ -81,12 +81,15 @@ def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPa
     """
     stops = np.cumsum([len(table) for _, table in tables])
     # The place of a row becomes its number among all rows: so its bag is known once sorted.
+    is_hashed = any(table.payload_hashes is not None for _, table in tables)
     numbered = [
-        replace(table, places=np.arange(stop - len(table), stop))
+        replace(
+            table,
+            places=np.arange(stop - len(table), stop),
+            payload_hashes=_hashes(table) if is_hashed else None,
+        )
         for (_, table), stop in zip(tables, stops.tolist(), strict=True)
     ]
-    if any(table.payload_hashes is not None for table in numbered):
-        numbered = [_with_hashes(table) for table in numbered]
     whole = joined(numbered)
     bags = np.array([bag for bag, _ in tables], np.int64)
     return pack_rows(layout, whole, bags[np.searchsorted(stops, whole.places, side="right")])
@@ -122,10 +125,9 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     )
 
 
-def _with_hashes(table: Table) -> Table:
-    if table.payload_hashes is not None:
-        return table
-    return replace(table, payload_hashes=np.full(len(table), UNHASHED))
+def _hashes(table: Table) -> IntArray:
+    hashes = table.payload_hashes
+    return np.full(len(table), UNHASHED) if hashes is None else hashes
 
 
 def part_table(
