@@ -179,13 +179,16 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
         ends = [End(step, 0.0, plain=True, creep=None) for step in plain.tolist() or [0.0]]
         return Measured(total, total, ends[0], ends[-1], False, speed_mps, plain)
     noise = _noise(points)
+    places = _moving_mean(points, _MEAN_SPAN)
     lengths, as_plain, stationary = _steps(points, plain, noise)
     if np.median(apart) > _DENSE_S:
-        stationary &= _scatters(points, noise)
+        stationary &= _scatters(points, places, noise)
         lengths, as_plain = plain, ~stationary
     x, y, z = positions[0].tolist()
+    averaged = min(2 * _MEAN_SPAN + 1, len(points))
+    reach = _LEFT * math.sqrt(2 / averaged) * noise.max(axis=1)
     creeps = [
-        (begin, end, _creep(points, noise, begin, end, (x, y, z)))
+        (begin, end, _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z)))
         for begin, end in _rows(stationary)
         if end - begin >= _STATIONARY_STEPS or end - begin == len(plain)
     ]
@@ -249,9 +252,8 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
     return lengths, as_plain, unsettled & (energy < _STATIONARY * share)
 
 
-def _scatters(points: Rows, noise: Rows) -> Marks:
+def _scatters(points: Rows, places: Rows, noise: Rows) -> Marks:
     """Returns at which steps the positions spread around one place as far as their noise does."""
-    places = _moving_mean(points, _MEAN_SPAN)
     spread = _moving_mean(points**2, _MEAN_SPAN) - places**2
     ratio = spread.sum(axis=1) / np.maximum((noise**2).sum(axis=1), 1e-300)
     low, high = _SPREAD
@@ -287,11 +289,8 @@ def _rows(marks: Marks) -> Iterator[tuple[int, int]]:
     return iter([(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)])
 
 
-def _creep(points: Rows, noise: Rows, begin: int, end: int, origin: Vector3) -> Creep:
-    """Returns the places that a robot left from one position to another (inclusive)."""
-    places = _moving_mean(points, _MEAN_SPAN)[begin : end + 1]
-    width = min(2 * _MEAN_SPAN + 1, len(points))
-    reach = _LEFT * math.sqrt(2 / width) * noise[begin : end + 1].max(axis=1)
+def _creep(places: Rows, reach: Numbers, origin: Vector3) -> Creep:
+    """Returns which of the places a robot left: was farther from than its noise explains."""
     found = [0]
     while True:
         at = found[-1]
