@@ -230,7 +230,7 @@ def _kill(
     else:
         killed = recorder.kill(with_children=kind == "both")
     # A float of seconds does not tell messages apart that were logged within a microsecond.
-    asked_for = [each for each in closed if is_alone(each, closed)]
+    asked_for = alone(closed)
     chosen = chance.choice(asked_for) if asked_for else None
     questions: list[tuple[str, dict[str, Any]]] = [("list_recorded_topics", {})]
     if chosen is not None:
@@ -282,9 +282,16 @@ def _bytes_of(files: Sequence[Path]) -> int:
     return total
 
 
-def is_alone(tick: Tick, among: Sequence[Tick]) -> bool:
-    """Whether no other message was logged within a millisecond of this one."""
-    return sum(abs(each.log_time - tick.log_time) < NS_PER_S // 1000 for each in among) == 1
+def alone(among: Sequence[Tick]) -> list[Tick]:
+    """The messages within a millisecond of which no other was logged."""
+    ordered = sorted(among, key=lambda tick: tick.log_time)
+    near = {
+        tick
+        for before, after in pairwise(ordered)
+        if after.log_time - before.log_time < NS_PER_S // 1000
+        for tick in (before, after)
+    }
+    return [tick for tick in among if tick not in near]
 
 
 def place_is_right(fault: Fault) -> bool:
