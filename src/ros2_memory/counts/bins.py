@@ -16,6 +16,7 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
+    reached,
     recorded_reach,
     recording_gaps,
     unix_text,
@@ -84,9 +85,7 @@ class BinnedWindow:
             start, end = max(start, reach[0]), min(end, reach[1])
         if end < start:
             raise no_data_between(view, self._topics, asked)
-        self.counted = asked
-        if reach is not None:
-            self.counted = asked.intersect(TimeWindow(reach[0], reach[1] + 1))
+        self.counted = reached(view.snapshot, asked)
         # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
         self.bins: TimeBins = (

@@ -55,7 +55,13 @@ _COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
 
 
 def count_labels(
-    view: View, topic: str, condition: Condition, value: JsonValue, scope: Scope
+    view: View,
+    topic: str,
+    condition: Condition,
+    value: JsonValue,
+    scope: Scope,
+    *,
+    asked: TimeWindow,
 ) -> Bins:
     """Returns a row for each label that meets a condition, those seen most often first.
 
@@ -65,6 +71,7 @@ def count_labels(
         condition: on the labels; its least score holds for each detection.
         value: of the condition; `ANY_LABEL` takes every label.
         scope: when detections count.
+        asked: the window that was asked for, of which notes say what the memory does not have.
 
     Raises:
         InvalidArgumentsError: the condition is not on texts, or names a field.
@@ -83,8 +90,8 @@ def count_labels(
     table, elapsed = united(seen.visible), elapsed_in(view, window)
     rows = _rows(table, seen.most, elapsed)
     note_robots_on(view, topics, window)
-    note_unread(view, window, nothing=not rows, search=True)
-    note_edges(view, window)
+    note_unread(view, asked, nothing=not rows, search=True)
+    note_edges(view, asked)
     if unknown := elapsed.among(scope.unknown):
         view.notes.add(
             f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
@@ -92,8 +99,8 @@ def count_labels(
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
-    start, end = window.asked()
-    first, last = recorded_reach(view.snapshot, window) or (start, end)
+    start, end = asked.asked() if seen.since is None else window.asked()
+    first, last = recorded_reach(view.snapshot, asked) or (start, end)
     return Bins(
         by=BY_LABEL,
         about=tuple(topics),

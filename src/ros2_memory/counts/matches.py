@@ -28,6 +28,7 @@ from ros2_memory.counts.labels import ANY_LABEL, BY_LABEL, count_labels
 from ros2_memory.counts.time_bins import TrueIntervals
 from ros2_memory.counts.values import count_values
 from ros2_memory.history.context import READING_S
+from ros2_memory.history.coverage import reached
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
@@ -91,8 +92,10 @@ def count_matches(
     condition = condition_of(view, topic, condition_type, sought, field=field, min_score=min_score)
     asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest, call)))
     if by == BY_LABEL:
-        require_recorded(view, asked)
-        return count_labels(view, topic, condition, value, Scope(view, asked, where, during))
+        window = reached(view.snapshot, asked)
+        require_recorded(view, asked if window.empty else window)
+        scope = Scope(view, window, where, during)
+        return count_labels(view, topic, condition, value, scope, asked=asked)
     topics = matching_topics(view, topic)
     if by == "value":
         return _by_value(view, topics, asked, condition, is_bounded=bool(where or during))

@@ -14,7 +14,7 @@ from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, places_in, track_in
+from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times, places_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
@@ -71,7 +71,9 @@ def count_visits(
     if place is not None:
         place = replace(place, frame_id=asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,), place)
-    track = track_in(view, placement.frame_id, binned.window)
+    joined = joined_in(view, placement.frame_id, binned.window)
+    track = joined.track
+    binned.count_since(joined.since)
     known = placed_times(track, mixed)
     binned.add_lengths("placed_s", "duration", known)
     binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))

@@ -62,6 +62,7 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     header stamps of two topics go on in their cadence.
     """
     window = TimeWindow.everything() if window is None else window
+    _note_pauses(view, window)
     return tuple(each for each in _steps_around(view, window) if window.contains(each.at))
 
 
@@ -88,6 +89,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     except QueryTimeoutError:
         _note_timeout(view)
         return Elapsed()
+    _note_pauses(view, window)
     for at, by in steps:
         view.notes.add(
             f"the clock was set {seconds(by)} ahead at {unix_text(at)}: durations are without that"
@@ -152,9 +154,22 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         for fault in view.snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
-    suspects = [pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])]
-    found = (_step_in(view, pause) for pause in suspects[-_MOST_SUSPECTS:])
+    found = (_step_in(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:])
     return sorted([*steps, *filter(None, found)])
+
+
+def _suspects(view: View, window: TimeWindow) -> list[Pause]:
+    return [pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])]
+
+
+def _note_pauses(view: View, window: TimeWindow) -> None:
+    """Notes how many pauses were not looked at, if there are such."""
+    pauses = len(_suspects(view, window))
+    if pauses > _MOST_SUSPECTS:
+        view.notes.add(
+            f"only the newest {_MOST_SUSPECTS} of {pauses} pauses of all topics were looked at for "
+            "whether the clock was set there"
+        )
 
 
 def _step_in(view: View, pause: Pause) -> ClockStep | None:

@@ -513,6 +513,12 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
     return min(bag.start for bag in faulty), max(bag.end for bag in faulty)
 
 
+def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
+    """Returns the part of a window that the memory can show, by `recorded_reach`."""
+    reach = recorded_reach(snapshot, window)
+    return window if reach is None else window.intersect(TimeWindow(reach[0], reach[1] + 1))
+
+
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
     """Yields where nothing was recorded, by `View.gaps`; of a window, the parts in it.
 

@@ -97,7 +97,8 @@ class HeldValues:
         self._topic = topic
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
-        self._gaps = [gap[0] for gap in view.gaps(TimeWindow.everything())]
+        gaps = {gap[0] for gap in view.gaps(TimeWindow.everything())}
+        self._gaps = sorted(gaps.union(_ends_of_clocks(view)))
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
@@ -251,6 +252,19 @@ class HeldValues:
         if after is None:
             return max(run.last, self._view.snapshot.latest or run.last), False
         return following, True
+
+
+def _ends_of_clocks(view: View) -> Iterator[Ns]:
+    """Yields where bags of a wrong clock end before the others, and where these end before more."""
+    earliest, latest = view.snapshot.earliest, view.snapshot.latest
+    bags = [fault.bag for fault in view.snapshot.misdated]
+    if earliest is None or latest is None:
+        return
+    before = [bag.end for bag in bags if bag.end < earliest]
+    if before:
+        yield max(before)
+    if any(bag.start > latest for bag in bags):
+        yield latest
 
 
 def is_text(view: View, topic: str) -> bool:

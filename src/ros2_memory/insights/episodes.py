@@ -22,7 +22,7 @@ from ros2_memory.history.held_values import HeldValues, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import open_span
+from ros2_memory.history.view import View, open_span
 from ros2_memory.places.pose_frames import robot_at
 from ros2_memory.results import Changes, Episode, Spell
 
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.held_values import Held
-    from ros2_memory.history.view import TimeRange, View
+    from ros2_memory.history.view import TimeRange
     from ros2_memory.places.scope import Scope
 
 _LOOKED_AT: Final = 50
@@ -67,7 +67,9 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     """
     if len(topics) != 1 or not is_text(view, topics[0]):
         return False
-    newest = takewhile(_may_be_state, HeldValues(view, topics[0]).back(MAX_NS))
+    # With notes of its own: what cannot be read there may lie outside of the window.
+    values = HeldValues(View(view.memory, view.call), topics[0])
+    newest = takewhile(_may_be_state, values.back(MAX_NS))
     try:
         return any(held.is_blank for held in islice(newest, _LOOKED_AT))
     except QueryTimeoutError:

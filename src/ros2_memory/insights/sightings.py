@@ -154,8 +154,10 @@ def find_matches(
         view.notes.add(sentence)
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
-    start = min(max(start, first), end)
-    end = max(min(end, last), start)
+    # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
+    shown_at = [*(each.first for each in sightings), *(each.first for each in episodes)]
+    start = min(max(start, min([first, *shown_at])), end)
+    end = max(min(end, max([last, *shown_at])), start)
     return Sightings(
         sightings,
         more=rows.total is None or rows.total > shown_rows,

@@ -72,10 +72,11 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    return _joined_in(view, frame_id, window).track
+    return joined_in(view, frame_id, window).track
 
 
-def _joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
+def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
+    """Returns what `track_in` does, and since when it is known."""
     joined = RobotTracks(view, frame_id).over(window)
     if joined.since is not None:
         view.notes.complete = False
@@ -108,7 +109,7 @@ def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    joined = _joined_in(view, frame_id, window)
+    joined = joined_in(view, frame_id, window)
     tracks = RobotTracks(view, frame_id)
     every = [
         (one, track)

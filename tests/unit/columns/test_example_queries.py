@@ -68,7 +68,8 @@ def test_bags_that_are_stored(file: Path) -> None:
 
 
 def test_messages_of_a_day(file: Path) -> None:
-    assert answer(file, "How many messages has each topic on each day (UTC)?") == [
+    begun = "begin on each day (UTC), copies and deleted bags included?"
+    assert answer(file, f"How many messages has each topic in the parts that {begun}") == [
         ("2023-11-14", "/battery_state", 10),
         ("2023-11-14", "/odom", 4000),
         ("2023-11-15", "/battery_state", 5),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.history.context import QuerySettings
-from tests.support.bags import boolean, odom, write_mcap
+from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of
 
@@ -20,14 +20,17 @@ S = 10**9
 TRUE = 1_784_030_400
 UNSET = 86_400
 AHEAD = 2_082_758_400
+CUPS = "/vision/scene/scene_objects"
 
 
 @pytest.fixture
 def memory(tmp_path: Path) -> Memory:
-    """Six messages of today, two of 1970 and one of 2036."""
+    """Six messages of today, two of 1970 and one of 2036, of each topic."""
     for name, begin, count in (("unset", UNSET, 2), ("today", TRUE, 6), ("ahead", AHEAD, 1)):
         messages = [odom((begin + n) * S, n, 0.0) for n in range(count)]
         messages += [boolean((begin + n) * S + 1, data=n % 2 == 0) for n in range(count)]
+        messages += [detections((begin + n) * S + 2, ["cup"]) for n in range(count)]
+        messages += [text((begin + n) * S + 3, "idle" if n < 3 else "busy") for n in range(count)]
         write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
     return memory_of(tmp_path, clock=FixedClock((TRUE + 600) * S), limits=QuerySettings())
 
@@ -65,6 +68,41 @@ def test_a_condition_does_not_count_where_a_wrong_clock_dated_it(
 
 def test_metres_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
     assert all_of(asked(memory, tmp_path, "trajectory_summary", **whole()))["metres"] == 5.0
+
+
+def test_labels_of_a_wrong_clock_do_not_count(memory: Memory, tmp_path: Path) -> None:
+    seen = {"topic": CUPS, "condition_type": "contains", "value": "cup", "by": "label"}
+    for window in ({}, {"start": 0, "end": AHEAD + 10}):
+        reply = asked(memory, tmp_path, "find_matches", **seen, **window)
+        found = all_of(reply)
+        assert (found["count"], found["seconds"]) == (1, 5.0)
+        assert found["first_unix"] == pytest.approx(TRUE, abs=0.001)
+        assert found["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
+        assert not any("recorded only" in note for note in reply["notes"])
+    reply = asked(memory, tmp_path, "find_matches", **seen, start=UNSET - 5, end=UNSET + 60)
+    assert all_of(reply)["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
+    assert not any("recorded only" in note for note in reply["notes"])
+
+
+def test_no_value_holds_from_one_clock_to_the_next(memory: Memory, tmp_path: Path) -> None:
+    """The robot was idle at the end of 1970, and at the beginning of today."""
+    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **whole("value"))
+    rows = {row[0]: dict(zip(reply["columns"][1:], row[1:], strict=True)) for row in reply["rows"]}
+    assert {value: row["count"] for value, row in rows.items()} == {"idle": 1, "busy": 1}
+    assert rows["idle"]["first_unix"] == pytest.approx(TRUE, abs=0.001)
+    assert rows["busy"]["last_unix"] == pytest.approx(TRUE + 5, abs=0.001)
+    of_1970 = {"start": UNSET - 5, "end": UNSET + 60, "by": "value"}
+    reply = asked(memory, tmp_path, "get_topic_in_range", topic="/chatter", **of_1970)
+    assert all_of(reply)["last_unix"] == pytest.approx(UNSET + 1, abs=0.001)
+
+
+def test_what_was_searched_has_all_that_was_found(memory: Memory, tmp_path: Path) -> None:
+    seen = {"topic": CUPS, "condition_type": "contains", "value": "cup"}
+    reply = asked(memory, tmp_path, "find_matches", **seen, start=0, end=AHEAD + 10)
+    first = [sighting["first_seen"] for sighting in reply["sightings"]]
+    assert len(first) == 3
+    assert reply["searched_from"] <= min(first)
+    assert reply["searched_to"] >= max(first)
 
 
 @pytest.mark.parametrize(("begin", "count"), [(UNSET, 2), (AHEAD, 1)])
