@@ -20,6 +20,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
+from ros2_memory.counts.stays import count_visits
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.view import TimeRange
@@ -147,6 +148,24 @@ class Limited(Deadline):
 
     def expired(self) -> bool:
         return next(self.looks, True)  # type: ignore[attr-defined]
+
+
+def test_visits_that_run_out_of_time_have_no_rows_for_hours_without_poses_yet(
+    tmp_path: Path,
+) -> None:
+    poses = [odom(BEGIN + n * 10 * S, n % 36 * 0.1, 0.0) for n in range(1080)]
+    write(tmp_path, poses, split=60)
+    memory = memory_of(tmp_path, limits=LATEST)
+    rows = set()
+    for looks in range(1, 60):
+        with suppress(QueryTimeoutError):
+            call = Call(deadline=Limited(looks))
+            answer = count_visits(memory, call, 0.0, 0.0, by="hour", radius_m=1.0)
+            rows.add(len(answer.rows))
+            assert not any("only what is after" in note for note in answer.notes) or (
+                len(answer.rows) < 4 and all(cells(answer, "placed_s"))
+            )
+    assert len(rows) > 1
 
 
 def test_a_mean_lies_between_the_least_and_the_greatest_number(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory.history import clock_steps
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, battery, boolean, odom, write_mcap
 from tests.support.clocks import SettableClock
@@ -177,6 +178,25 @@ def test_a_clock_set_while_the_robot_stands_shows_in_stamps_of_another_clock(
         "at": pytest.approx(at, abs=1e-5),
         "step_s": pytest.approx(by, abs=0.01),
     }
+
+
+def test_pauses_that_are_not_looked_at_are_noted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The clock was set before two pauses in which messages were lost."""
+    monkeypatch.setattr(clock_steps, "_MOST_SUSPECTS", 2)
+    lost = [(100, 103), (150, 153)]
+
+    def is_lost(t: float) -> bool:
+        return any(begin < t < end for begin, end in lost)
+
+    memory = stamped(tmp_path, delay=lambda t: 2.0 * (t > 54.95), is_lost=is_lost)
+    for tool in ("data_time_range", "memory_status"):
+        reply = asked(memory, tmp_path, tool)
+        assert not reply.get("clock_steps")
+        assert any("only the newest 2 of 3 pauses" in note for note in reply["notes"]), tool
+    monkeypatch.setattr(clock_steps, "_MOST_SUSPECTS", 3)
+    assert len(steps(memory, tmp_path)) == 1
 
 
 def test_messages_that_waited_for_the_recorder_are_no_step(tmp_path: Path) -> None:

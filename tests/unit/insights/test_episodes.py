@@ -10,7 +10,8 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.history import held_values
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
-from tests.support.bags import boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
+from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -48,6 +49,22 @@ def written(folder: Path, *, stored: bool = False) -> Memory:
 @pytest.fixture(params=[False, True], ids=["bags", "store"])
 def memory(tmp_path: Path, request: pytest.FixtureRequest) -> Memory:
     return written(tmp_path, stored=request.param)
+
+
+def test_what_is_damaged_outside_of_the_window_is_no_note(tmp_path: Path) -> None:
+    """Whether a topic has episodes is seen in its newest messages, of which one is damaged."""
+    for nth in range(2):
+        begin = (BEGIN + 40 * nth) * S
+        said = [text(begin + n * S, f"step {n}") for n in range(10)]
+        path = write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", said, McapLayout(chunk_size=200))
+    spoil_chunk(path, 2)
+    memory = memory_of(tmp_path)
+    found = {"topic": "/chatter", "condition_type": "contains", "value": "step"}
+    early = ask(memory, "find_matches", **found, start=BEGIN + 2, end=BEGIN + 4)
+    assert len(early["sightings"]) == 1
+    assert "notes" not in early
+    late = ask(memory, "find_matches", **found, start=BEGIN + 40, end=BEGIN + 50)
+    assert any("could not be read whole" in note for note in late["notes"])
 
 
 def ask(memory: Memory, tool: str, **given: object) -> Any:
