@@ -396,10 +396,14 @@ class Scan:
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
             for table in self._asked.decode(bags[number], self._asked.topic, True):
-                same = table.channel.type == unit.table.channel.type
-                if same and len(table) == rows.size and table.payload_hashes is not None:
-                    published[rows] = table.publish_times
-                    hashes[rows] = table.payload_hashes
+                if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
+                    continue
+                # A part has ten minutes of a long bag.
+                begin = int(np.searchsorted(table.log_times, times[rows[0]]))
+                same = slice(begin, begin + rows.size)
+                if np.array_equal(table.log_times[same], times[rows]):
+                    published[rows] = table.publish_times[same]
+                    hashes[rows] = table.payload_hashes[same]
         return published[some], hashes[some]
 
 

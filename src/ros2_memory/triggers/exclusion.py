@@ -53,13 +53,16 @@ class ExclusionRule:
 class RecordingConditions(NamedTuple):
     """The values of a topic in one recording, in the order in which they were written.
 
-    `end` is None while it is being written.
+    `end` is None while it is being written. `previous` is the recording that it took over from
+    while both ran, if there is one: the clock of any other may have been set since.
     """
 
     start: Ns
     end: Ns | None
     heard: Sequence[ConditionInterval]
     unclear: Sequence[tuple[Ns, Ns]] = ()
+    name: str = ""
+    previous: str | None = None
 
     @property
     def stop(self) -> Ns:
@@ -177,12 +180,14 @@ def _carried(
 ) -> Spans:
     """Returns where a condition that held from `since` to the end of a recording goes on after it.
 
-    A recording that took over may have begun, and received the topic, before the condition held.
+    One that took over may have begun, and received the topic, before the condition held.
     """
     spans: Spans = []
     until: Ns | None = None
     for each in others:
-        start = max(since, each.start)
+        start = each.start
+        if each.previous == ended.name and not (ended.unclear or each.unclear):
+            start = max(since, start)
         if each.start < ended.start:  # the clock was set back
             start, until = each.start, each.start + stale
         elif until is None:

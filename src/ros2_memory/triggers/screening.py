@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
+from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
     METADATA_FILE,
     SCREENED_FILE,
@@ -406,6 +407,8 @@ class Screening:
                     None if name in live else each.end,
                     each.heard.get(rule.name, ()),
                     each.unclear,
+                    name,
+                    read_handover(self._bag_dir / name).handover.previous,
                 )
                 for name, each in state.recordings.items()
                 if each.start is not None

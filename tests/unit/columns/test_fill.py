@@ -167,6 +167,20 @@ def test_of_a_part_only_the_bags_beside_another_recording_are_hashed(tmp_path: P
     assert check_all(world) == 3 * 21
 
 
+def test_copies_of_a_long_bag_are_recognised_before_it_is_stored_again(tmp_path: Path) -> None:
+    """Its parts of ten minutes have some of its messages each."""
+    poses = [odom(T0 + n * 5 * S, n / 7, 0.0) for n in range(300)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    world = World.of(tmp_path)
+    world.fill()
+    assert count(world, "part") == 3
+    again = [
+        odom(T0 + n * 5 * S, n / 7, 0.0, log_time=T0 + n * 5 * S + 99) for n in range(150, 160)
+    ]
+    write_mcap(tmp_path / "rec_b" / "rec_b_0.mcap", again)
+    assert check_all(world) == 300
+
+
 def test_columns_beyond_the_share_are_dropped_and_times_and_zones_stay(tmp_path: Path) -> None:
     for number in range(3):
         write_bag(tmp_path, number, rows=2000, hz=100)

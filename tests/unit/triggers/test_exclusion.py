@@ -47,11 +47,13 @@ def rule(*, margin: int = 0, excludes_unknown: bool = True) -> ExclusionRule:
     )
 
 
-def heard_by(past: Past, *, latched: bool) -> RecordingConditions:
+def heard_by(past: Past, *, latched: bool, nth: int = 0) -> RecordingConditions:
+    """The `nth` recording, which took over from the one before it."""
     heard: list[ConditionInterval] = []
     for time, holds in past.said:
         add_message(heard, time, holds, latched=latched, stale=STALE)
-    return RecordingConditions(past.start, None if past.live else past.end, heard)
+    end = None if past.live else past.end
+    return RecordingConditions(past.start, end, heard, (), f"rec_{nth}", f"rec_{nth - 1}")
 
 
 def knows(past: Past, time: int, *, latched: bool) -> bool | None:
@@ -73,8 +75,8 @@ def is_held(pasts: Sequence[Past], time: int, *, latched: bool) -> bool:
         since = past.end
         while knows(past, since - 1, latched=latched):
             since -= 1
-        for each in later:
-            start = max(since, each.start)
+        for nth, each in enumerate(later):
+            start = each.start if nth else max(since, each.start)
             if start <= time < until and not any(when <= time for when, _ in each.said):
                 return True
             if each.said:
@@ -118,7 +120,7 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
 ) -> None:
     stretches = excluded_intervals(
         rule(margin=margin, excludes_unknown=unknown),
-        [heard_by(past, latched=latched) for past in pasts],
+        [heard_by(past, latched=latched, nth=nth) for nth, past in enumerate(pasts)],
     )
     wrong = {
         time
@@ -139,10 +141,19 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
 def test_a_condition_that_holds_later_says_nothing_of_when_the_next_recording_began() -> None:
     """Two recordings overlap, the condition begins to hold in both, and the first one ends."""
     one, other = Past(0, 30, ((0, False), (20, True))), Past(10, 40, ((12, False), (20, True)))
-    found = excluded_intervals(
-        rule(margin=2), [heard_by(each, latched=True) for each in (one, other)]
-    )
-    assert found == [Excluded(18, 43, held=True)]
+    both = [heard_by(past, latched=True, nth=nth) for nth, past in enumerate((one, other))]
+    assert excluded_intervals(rule(margin=2), both) == [Excluded(18, 43, held=True)]
+
+
+def test_a_condition_that_held_goes_on_after_a_restart_whose_clock_was_set_back() -> None:
+    """To a time inside of the recording before, in which it did not hold yet."""
+    before = Past(0, 600, ((0, False), (450, True)))
+    after = Past(400, 700, ((420, True), (430, False)))
+    one, other = (heard_by(past, latched=True, nth=nth) for nth, past in enumerate((before, after)))
+    found = excluded_intervals(rule(), [one, other._replace(previous=None)])
+    assert Excluded(400, 430, held=True) in found
+    stepped = one._replace(unclear=[(500, 520)])
+    assert Excluded(400, 430, held=True) in excluded_intervals(rule(), [stepped, other])
 
 
 def test_a_value_out_of_order_only_adds() -> None:
