@@ -226,8 +226,14 @@ def test_publishers_of_another_user_are_named(site: Machine, tmp_path: Path) -> 
             started(tmp_path, site.env) as up,
         ):
             assert robot.t0
-            assert up.code() == 2
-    said = up.err.read_text()
-    assert "2 topics are offered" in said
-    assert f"no message came to user {os.getuid()} in 5 s (nodes of user {NOBODY} run here)" in said
+            named = f"nodes of user {NOBODY} run, or ran, here"
+            until(lambda: named in up.out.read_text() + up.err.read_text())
+            # Where the robot made the port anew that the first look left, messages come by chance.
+            is_heard = named in up.out.read_text()
+            if not is_heard:
+                assert up.code() == 2
+    said = up.out.read_text() if is_heard else up.err.read_text()
     assert "run the recorder as the robot's user" in said
+    if not is_heard:
+        assert "2 topics are offered" in said
+        assert f"no message came to user {os.getuid()} in 5 s ({named})" in said

@@ -156,15 +156,20 @@ def _require_messages(robot: _Robot, found: Survey) -> None:
             "and give this command their ROS_DOMAIN_ID, RMW_IMPLEMENTATION and "
             f"ROS_AUTOMATIC_DISCOVERY_RANGE{f'; {advice}' if advice else ''}"
         )
+    segments = Path("/dev/shm").glob("fastrtps_*")  # noqa: S108 - Fast DDS has them there
+    owners = {each.stat().st_uid for each in segments} - {os.getuid()}
+    names = ", ".join(map(str, sorted(owners)))
+    others = f"nodes of user {names} run, or ran, here" if owners else ""
+    advice = advice_on_silence(robot.ros.env)
     if light and not any(each.messages for each in light):
-        segments = Path("/dev/shm").glob("fastrtps_*")  # noqa: S108 - Fast DDS has them there
-        owners = {each.stat().st_uid for each in segments} - {os.getuid()}
-        users = f" (nodes of user {', '.join(map(str, sorted(owners)))} run here)" if owners else ""
         raise RecorderError(
             f"{counted(len(light), 'topic is', 'topics are')} offered in {robot.where}, and no "
-            f"message came to user {os.getuid()} in {SECONDS:g} s{users}; "
-            f"{advice_on_silence(robot.ros.env)}"
+            f"message came to user {os.getuid()} in {SECONDS:g} s{others and f' ({others})'}; "
+            f"{advice}"
         )
+    if others:
+        # Through a port that a node made anew, after its recorder ended, its messages come.
+        print_line(f"{others}; what they send may come now and not later: {advice}")
 
 
 def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:
