@@ -51,6 +51,8 @@ PRUNE_INTERVAL_S: Final = 600.0
 
 LONGEST_TURN_S: Final = 600.0
 """How long one of several stores is filled before it is the next one's turn."""
+_WRITTEN_TOGETHER: Final = 8
+"""Slices of the clock of which what follows is written at once."""
 _AGAIN: Final = 4
 """Slices of the clock of which what follows is made again in a round."""
 _LATELY: Final = 4
@@ -167,7 +169,7 @@ class Backfill:
 
 def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
     """Makes what follows from the parts of some times; stores it, and what questions made of it."""
-    for window in windows:
+    for nth, window in enumerate(windows, 1):
         try:
             view = View(memory, Call())
             slice_drive(view, window)
@@ -176,7 +178,9 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
             make_events(view, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
-        memory.columns.write_fragments()
+        # Of a store that has changed, all bags are looked up again: so several at once.
+        if nth % _WRITTEN_TOGETHER == 0:
+            memory.columns.write_fragments()
         memory.large.release()
     memory.columns.write_fragments()
 

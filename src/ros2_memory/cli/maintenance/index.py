@@ -42,8 +42,10 @@ NICENESS: Final = 15
 """So low a priority that the process that answers goes first."""
 
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
-_BATCH: Final = 256
+_BATCH: Final = 4096
 """Bags stored before the program looks which others closed meanwhile, among all that wait."""
+_FOLLOWED: Final = 256
+"""Bags stored before what follows from them is made."""
 _CACHE_MB: Final = 8
 _BAR_WIDTH: Final = 40
 _RARELY: Final = (50_000, 20, 100)
@@ -146,13 +148,16 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
         goes_on = True
         while goes_on:
             progress = backfill.progress()
-            done = tried = 0
+            done = tried = followed = 0
             for batch in backfill.batches():
                 if tried >= _BATCH:
                     break
                 show(replace(progress, stored=min(progress.stored + done, progress.closed)))
                 tried += len(batch.bags)
                 done += backfill.store(batch)
+                if tried - followed >= _FOLLOWED:
+                    followed = tried
+                    backfill.follow()
             goes_on = backfill.follow() or done > 0
     backfill.prune()
     backfill.precompute()
