@@ -20,6 +20,8 @@ from ros2_memory.storage.base import SEQUENCE, Definition, Field
 
 MAX_COLUMNS: Final = 5_000
 """Of one type, with those of its sequences."""
+_MOST_ELEMENTS: Final = 2**32 - 1
+"""Of a sequence in CDR; no message holds a longer array either."""
 
 # As rosbags decodes them: a byte is signed, a char is not.
 _DTYPES: Final = {
@@ -154,7 +156,8 @@ def plan_of(definition: Definition) -> Plan:
     """Returns the plan of a type; the same for the same object.
 
     Raises:
-        UnplannedError: it has more columns than `MAX_COLUMNS`, or a type that has none.
+        UnplannedError: it has more columns than `MAX_COLUMNS`, a type that has none, or an array
+            that no message holds.
     """
     planner = _Planner(_Budget())
     planner.add_message(definition, "", "")
@@ -215,6 +218,8 @@ class _Planner:
     def add_field(self, entry: Field, path: str, attribute: str) -> None:
         """Adds one field at its path."""
         kind, length = entry.kind, entry.length
+        if length is not None and length > _MOST_ELEMENTS:
+            raise UnplannedError(f"{path} is an array of {length} elements, more than a bag holds")
         self.budget.take()
         if entry.name == _FILLER:
             self._pass(1, 1)

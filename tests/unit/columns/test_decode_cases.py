@@ -373,6 +373,19 @@ def test_json_and_unknown_types_have_times_alone_and_say_why(tmp_path: Path) -> 
     assert all(table.log_times.tolist() == [3] for table in tables)
 
 
+def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None:
+    text = f"uint8 known\nfloat64[{10**18}] endless\n".encode()
+
+    def fill(writer: Writer) -> None:
+        schema = writer.register_schema("pkg/msg/Endless", "ros2msg", text)
+        channel = writer.register_channel("/endless", "cdr", schema)
+        writer.add_message(channel, 3, b"\0\1\0\0\7", 3)
+
+    [[table]] = decoded(McapReader(), raw_mcap(tmp_path / "a.mcap", fill))
+    assert table.log_times.tolist() == [3]
+    assert f"endless is an array of {10**18} elements" in table.left_out[""]
+
+
 def test_what_a_damaged_chunk_loses_is_raised_and_the_rest_follows(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
     spoil_chunk(path, 1)
