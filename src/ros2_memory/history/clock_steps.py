@@ -34,7 +34,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.index.clock_faults import FaultyClock
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -196,11 +196,13 @@ def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep 
     is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
     if step is not None or not is_long or topic is None or _is_late(view, topic, hole):
         return step
-    return step_over(
-        hole,
-        _poses(view, topic, TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)),
-        _poses(view, topic, TimeWindow(hole[1], hole[1] + BESIDE_NS)),
-    )
+    before = TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)
+    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+    bags = [view.snapshot.timeline.overlapping(window) for window in (before, after)]
+    # A recording that ended before the hole tells nothing about one that began after it.
+    through = set.intersection(*({bag.recording for bag in each} for each in bags))
+    sides = [_poses(view, topic, window, through) for window in (before, after)]
+    return step_over(hole, *sides)
 
 
 def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
@@ -252,10 +254,12 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntA
     return found
 
 
-def _poses(view: View, topic: str, window: TimeWindow) -> list[TimedPosition]:
+def _poses(
+    view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
+) -> list[TimedPosition]:
     found: list[TimedPosition] = []
     try:
-        for block in pose_rows(view, topic, window, []):
+        for block in pose_rows(view, topic, window, [], among=recordings.__contains__):
             rows = zip(block.poses.times.tolist(), block.poses.positions.tolist(), strict=True)
             found += [TimedPosition(time, (x, y, z)) for time, (x, y, z) in rows]
     except InvalidArgumentsError:

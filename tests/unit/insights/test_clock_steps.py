@@ -94,6 +94,24 @@ def test_a_recorder_that_stalled_while_the_robot_drove_on_is_no_step(tmp_path: P
     assert steps(memory, tmp_path) == []
 
 
+def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_path: Path) -> None:
+    for name, begin in (("early", 0), ("late", 200)):
+        drive = [
+            odom((BEGIN + begin) * S + beat * S // HZ, SPEED * beat / HZ, 0.0, 0.0)
+            for beat in range(3 * HZ)
+        ]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", drive)
+    beside = [
+        boolean((BEGIN + begin) * S + beat * S // HZ, data=False)
+        for begin in (-100, 400)
+        for beat in range(3 * HZ)
+    ]
+    write_mcap(tmp_path / "beside" / "beside_0.mcap", beside)
+    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
+    assert (BEGIN + 200) * S in [pause.end for pause in memory.index.snapshot().suspects]
+    assert steps(memory, tmp_path) == []
+
+
 @pytest.mark.parametrize("queued", [3, 10, 100])
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
 def test_what_queued_up_while_the_recorder_stalled_is_no_step(
