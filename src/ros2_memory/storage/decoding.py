@@ -117,7 +117,7 @@ def _deserialized(found: MessageType, payload: bytes) -> object:
             " folder into reader.custom_msg_paths"
         )
     if holds_too_many(found.definitions, found.name, payload):
-        raise UnreadableError(f"it holds more than {MAX_OBJECTS} texts or messages")
+        raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
     return found.deserialize(payload)
 
 

@@ -36,8 +36,8 @@ class _StoppedError(Exception):
 def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
     """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
-    One byte of it can become an object of a hundred. A payload that does not fit its definition
-    is left to decoding, which names the fault.
+    One byte of it can become an object of a hundred. The length that a sequence states counts. A
+    payload that does not fit its definition otherwise is left to decoding, which names the fault.
     """
     if len(payload) < _COUNTED_FROM_BYTES:
         return False
@@ -79,6 +79,9 @@ class _Walk:
     def _elements(self, element: FieldDesc, count: int) -> None:
         size = _SIZES.get(element[1][0]) if element[0] == Nodetype.BASE else None
         if size is None:
+            if element[0] == Nodetype.NAME and self.objects + count > MAX_OBJECTS:
+                self.objects += count
+                raise _StoppedError
             for _ in range(count):
                 self._field(element)
         elif count:

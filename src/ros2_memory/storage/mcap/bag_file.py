@@ -629,14 +629,15 @@ class McapBags:
         A bag is chosen for a question by these times: a wrong one would hide its messages.
         """
         ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
-        outer = (*index.chunks[:1], *index.chunks[-1:])
+        ordered = index.chunks
+        looked_at = {each.offset for each in (*ordered[:1], *ordered[-1:], *_out_of_order(ordered))}
         left = _VERIFIED_BYTES
         try:
             for chunk in index.chunks:
                 self._has_any(file, chunk, index.channels)
                 nth = bisect_left(ends, chunk.start)
-                is_end = chunk in outer or (nth < len(ends) and ends[nth] <= chunk.end)
-                if chunk.index_places is None or not is_end:
+                is_end = nth < len(ends) and ends[nth] <= chunk.end
+                if chunk.index_places is None or not (is_end or chunk.offset in looked_at):
                     continue
                 left -= chunk.length
                 if left < 0:
@@ -771,6 +772,13 @@ def _describes(believed: Chunk | None, chunk: Chunk) -> bool:
         return False
     within = believed.start <= chunk.start and chunk.end <= believed.end
     return within and chunk.channels <= believed.channels
+
+
+def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
+    """Yields chunks that follow each other in the file, and whose times are the other way round."""
+    for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
+        if after.end < before.start:
+            yield from (before, after)
 
 
 def _lost_row(lost: LostError, *, newest_first: bool) -> Rows[Record | LostError]:

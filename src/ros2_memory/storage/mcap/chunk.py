@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
+from array import array
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -312,7 +313,7 @@ def walk_chunk(data: bytes) -> ChunkContent:
     Raises:
         UnreadableError: it has more messages or declarations than are indexed.
     """
-    found: dict[int, tuple[list[int], list[int]]] = {}
+    found: dict[int, tuple[array[int], array[int]]] = {}
     declarations: list[tuple[int, bytes]] = []
     position, end = 0, len(data)
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
@@ -328,7 +329,7 @@ def walk_chunk(data: bytes) -> ChunkContent:
             _, _, channel, _, log_time, _ = message(data, position)
             entry = found.get(channel)
             if entry is None:
-                entry = found[channel] = ([], [])
+                entry = found[channel] = (array("Q"), array("q"))
             entry[0].append(log_time)
             entry[1].append(position)
             messages += 1
