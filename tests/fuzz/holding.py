@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from typing import TYPE_CHECKING, Any, Final
@@ -85,6 +86,10 @@ def _wrong_summary(bag: BagFile, truth: list[Readable]) -> list[str]:
     return [] if stated == true else [f"oracle: summary {stated}, not {true}"[:600]]
 
 
+def _digest(payload: bytes) -> bytes:
+    return hashlib.blake2b(payload).digest()
+
+
 def _wrong_reading(
     memory: Memory, bag: BagFile, topic: str, held: list[Readable], rng: Random
 ) -> list[str]:
@@ -96,13 +101,14 @@ def _wrong_reading(
         )
         view = View(memory, Call())
         records = view.bags.read(bag, [topic], TimeWindow(start, stop), newest_first=newest_first)
-        found = [(each.record.log_time, each.record.payload) for each in records]
+        # Of a bomb, payloads would fill the memory that is measured.
+        found = [(each.record.log_time, _digest(each.record.payload)) for each in records]
         if _excused(view.notes.sentences()):
             continue
         times = [time for time, _ in found]
         wanted = [each for each in held if start <= each.time < stop]
         plain = not any(each.payload.startswith(_PACKED) for each in wanted)
-        same = Counter(found) == Counter((each.time, each.payload) for each in wanted)
+        same = Counter(found) == Counter((each.time, _digest(each.payload)) for each in wanted)
         if (plain and not same) or times != sorted(map(_time, wanted), reverse=newest_first):
             faults.append(
                 f"oracle: {topic} in [{start}, {stop}) newest_first={newest_first}: {len(found)}"

@@ -23,7 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
-_LATEST: Final = 1 << 63
+_LATEST: Final = (1 << 63) - 1
+"""This time and later ones are none: no half-open window of 64 bits has them."""
 _LARGEST: Final = 1 << 24
 _PLAIN: Final = (
     "SELECT count(*) FROM sqlite_master"
@@ -124,7 +125,7 @@ def _unpacked(chunk: bytes) -> bytes | None:
             data = bytes(lz4.frame.decompress(packed))
         elif name:
             return None
-    except (struct.error, zstandard.ZstdError, RuntimeError, ValueError):
+    except (struct.error, zstandard.ZstdError, RuntimeError, ValueError, MemoryError):
         return None
     # Without a checksum nothing vouches for the messages.
     return data if crc and zlib.crc32(data) == crc else None

@@ -16,6 +16,7 @@ from tests.fuzz.campaign import Child, campaign
 from tests.fuzz.classes import CLASSES, Job
 from tests.fuzz.good import goods, sqlites
 from tests.fuzz.holding import hold, truth_of
+from tests.fuzz.indexes import agreed
 from tests.fuzz.mutant import mutant_of
 from tests.fuzz.trial import World
 from tests.support.examples import LONG
@@ -82,6 +83,21 @@ def test_the_oracle_agrees_with_a_good_bag_and_misses_a_message(tmp_path: Path, 
         one = next(each for each in truth if each.topic == topic)
         assert faults([each for each in truth if each is not one])
         assert faults([*truth, one._replace(time=one.time + 30_000_000)])
+
+
+def test_a_chunk_that_lies_wholly_before_the_one_before_it_is_found_out(tmp_path: Path) -> None:
+    [good] = [each for each in goods() if each.kind == "small chunks"]
+    chunks = 55
+    for nth in (chunks - 2, chunks // 2):
+        plain = agreed(good.plain, nth, lambda time: time - 600_000_000)
+        mutant = mutant_of(good, plain)
+        folder = tmp_path / str(nth)
+        folder.mkdir()
+        world = World(folder, "mcap", stored=False)
+        path = mutant.place(world.bag_dir, 0)
+        memory, _ = world.serving()
+        [bag] = [each for each in memory.index.snapshot().bags if each.path == path]
+        assert any("contradict" in note or "without" in note for note in bag.summary.notes)
 
 
 def test_of_damaged_content_the_oracle_knows_no_right_answer() -> None:
