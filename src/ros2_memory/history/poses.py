@@ -276,15 +276,27 @@ class PoseReader:
         """
         try:
             found = self._columns.of(rows.table, rows.times, rows.index)
+            if found is None and isinstance(rows.table, StoredTable):
+                found = self._of_bags(rows)
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        if found is None and isinstance(rows.table, StoredTable):
-            # Of a topic beyond its share no columns are stored.
-            return joined_poses([self.poses(each) for each in decoded_rows(self._view, rows)])
         return poses_of(self._decoded(rows)) if found is None else found
+
+    def _of_bags(self, rows: Rows) -> Poses | None:
+        """Returns the poses of a topic of which no columns are stored, as it is beyond its share.
+
+        None where the columns of its messages are not enough for them.
+        """
+        found: list[Poses] = []
+        for each in decoded_rows(self._view, rows):
+            poses = self._columns.of(each.table, each.times, each.index)
+            if poses is None:
+                return None
+            found.append(poses)
+        return joined_poses(found)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
         reader, extractor = self._view.memory.reader, self._view.memory.extractor
