@@ -107,8 +107,13 @@ def decoded(
         ]
         kinds = _Kinds(reader, hashed, columns)
         kinds.look_at(channels, path, window)
+        alone = reader.times_alone(path)
         bare = {channel.topic for channel in channels}
-        bare -= {channel.topic for channel in channels if kinds.of(channel).needs_payloads}
+        for channel in channels:
+            kind = kinds.of(channel)
+            # Copies among those of which there are times alone are told by their publish times.
+            if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
+                bare.discard(channel.topic)
         batches = reader.batches(path, {each.topic for each in channels}, window, bare=bare)
         group = _Group(kinds, group_bytes)
         while True:
@@ -183,10 +188,6 @@ class _Kind:
     plan: Plan | None
     reason: str
     is_hashed: bool
-
-    @property
-    def needs_payloads(self) -> bool:
-        return self.plan is not None or self.is_hashed
 
 
 @dataclass(slots=True)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
-from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
+from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, united
@@ -332,7 +332,7 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     """Returns the recordings that hold messages of their own on a topic at the same time.
 
     None for latched topics, which each recording receives again, or where the time for the answer
-    is over before it is known.
+    is over before it is known, or a lake does not hold the messages.
     """
     if topic in view.snapshot.timeline.transient_local:
         return []
@@ -347,7 +347,7 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
             if not is_known and _differ(view, topic, pair, each.span.intersect(window)):
                 found.append(each)
                 apart.update(() if each.by_clock else pair)
-    except QueryTimeoutError:
+    except (QueryTimeoutError, NotInLakeError):
         return []
     finally:
         # The answer itself needed nothing of what was read here.

@@ -329,6 +329,10 @@ class BagReader(ABC):
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded; None if its type is known."""
 
+    def times_alone(self, path: Path) -> Collection[str]:  # noqa: ARG002 - of others it is asked
+        """Returns the topics of which there are the times of messages, and no messages."""
+        return frozenset()
+
     @abstractmethod
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file, with or without messages.

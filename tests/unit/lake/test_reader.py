@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -91,6 +92,36 @@ def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
         expected = reply(over_bags, tool, given)
         assert "error" not in expected
         assert reply(over_lake, tool, given) == expected
+
+
+def test_copies_among_images_are_told_by_their_publish_times(
+    engine: LakeEngine, tmp_path: Path
+) -> None:
+    for recording, beats in enumerate((range(20), range(10, 30))):
+        messages: list[Msg] = []
+        for n in beats:
+            sent = AT + n * NS_PER_S
+            said = replace(text(sent + recording, f"{n}"), publish_time=sent)
+            image = Msg("/camera", "sensor_msgs/msg/Image", sent + recording, b"%06d" % n, sent)
+            messages += [said, image]
+        write_mcap(tmp_path / "bags" / f"r{recording}" / f"r{recording}_0.mcap", messages)
+    bags = with_store(memory_of(tmp_path / "bags"), tmp_path / "bags")
+    catalog = lake_in(tmp_path)
+    fill(catalog, {"hall": bags})
+    robot = lake_robots(catalog, engine, ["hall"], stores=tmp_path / "cache")["hall"]
+    for is_stored in (False, True):
+        if is_stored:
+            assert len(store_columns(robot).store.paths()) == 2
+        for topic in ("/camera", "/chatter"):
+            given: dict[str, object] = {
+                "topic": topic,
+                "start": START_S - 1,
+                "end": START_S + 99,
+                "by": "day",
+            }
+            expected = reply(fleet_of({"hall": bags}), "get_topic_in_range", given)
+            assert expected["rows"][0][2] == 30
+            assert reply(fleet_of({"hall": robot.memory}), "get_topic_in_range", given) == expected
 
 
 def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(

@@ -159,6 +159,11 @@ class LakeReader(BagReader):
         times: Sequence[Ns] = np.sort(np.concatenate(found)).tolist() if found else ()
         return times
 
+    def times_alone(self, path: Path) -> Collection[str]:
+        """Returns the topics whose messages are large, and were not asked for."""
+        heads = self._heads_of(self._index.bag(path)[0])
+        return {each.channel.topic for each in heads if not each.has_payloads}
+
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels of which the bag has messages."""
         return [each.channel for each in self._heads_of(self._index.bag(path)[0])]
