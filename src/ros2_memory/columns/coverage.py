@@ -17,13 +17,13 @@ from ros2_memory.columns.store import relative
 from ros2_memory.core.model import BagState
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ros2_memory.columns.store import ColumnStore, State, StoredBag
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
@@ -70,6 +70,12 @@ class Coverage:
         self._numbers: IntArray = everything[self._order]
         hashed = [each.hashed for each in segments]
         self._hashed = (np.concatenate(hashed) if hashed else np.empty(0, np.bool_))[self._order]
+
+    def missing_in(self, window: TimeWindow) -> Iterator[BagFile]:
+        """Yields the bags that are not stored and have messages in a window or near it."""
+        for each in self.segments:
+            if each.missing and window.overlaps(each.segment.first[0], each.segment.latest):
+                yield from each.missing
 
     def positions(self, numbers: IntArray) -> IntArray:
         """Returns where these bags are among those that are stored; -1 of others."""

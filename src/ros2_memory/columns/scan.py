@@ -218,8 +218,8 @@ class Scan:
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        for bag in coverage.missing:
-            if bag.summary.of(topic):
+        for bag in coverage.missing_in(reach):
+            if topic in bag.summary.schema.positions:
                 first, last = bag.summary.span_of([topic])
                 if reach.overlaps(first, last):
                     yield _Source(first, last, None, bag)
