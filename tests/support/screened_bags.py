@@ -8,6 +8,7 @@ from mcap.reader import make_reader
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import utc_stamp
 from ros2_memory.bag_dir.state_files import read_gate
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -82,6 +83,9 @@ class ScreenedBags:
         while name in self._splits:
             name += "_2"
         self.screening.announce(name)
+        if self.live:
+            (self.bag_dir / name).mkdir()
+            write_handover(self.bag_dir / name, Handover(previous=max(self.live)))
         self._splits[name] = 0
         self.live.add(name)
         return name

@@ -138,20 +138,16 @@ def _unknown(
     recordings: Sequence[RecordingConditions], held: Spans, free: Sequence[Spans]
 ) -> Iterator[tuple[Ns, Ns]]:
     """Yields where recordings did not know, by themselves or by others, whether it holds."""
-    for at, each in enumerate(recordings):
-        # Not across a clock that was set back.
-        before = (
+    for each in recordings:
+        # Of those alone that ran beside it by one clock.
+        beside = (
             spans
-            for spans, one in zip(free[:at], recordings, strict=False)
-            if one.start <= each.start and not one.unclear
+            for spans, one in zip(free, recordings, strict=True)
+            if one is each
+            or (each.previous == one.name and not one.unclear)
+            or one.previous == each.name
         )
-        after = (
-            spans
-            for spans, one in zip(free[at:], recordings[at:], strict=True)
-            if one.start >= each.start
-        )
-        known = chain(held, *before, *after)
-        yield from without([(each.start, each.stop)], united(known))
+        yield from without([(each.start, each.stop)], united(chain(held, *beside)))
 
 
 def _valid_until(

@@ -145,6 +145,14 @@ def test_a_condition_that_holds_later_says_nothing_of_when_the_next_recording_be
     assert excluded_intervals(rule(margin=2), both) == [Excluded(18, 43, held=True)]
 
 
+def test_what_was_known_before_a_clock_was_set_back_is_not_known_after_it() -> None:
+    before, after = Past(0, 600, ((0, False),)), Past(400, 700, ((450, False),))
+    one, other = (heard_by(past, latched=True, nth=nth) for nth, past in enumerate((before, after)))
+    assert excluded_intervals(rule(), [one, other]) == []
+    found = excluded_intervals(rule(), [one, other._replace(previous=None)])
+    assert found == [Excluded(400, 450, held=False)]
+
+
 def test_a_condition_that_held_goes_on_after_a_restart_whose_clock_was_set_back() -> None:
     """To a time inside of the recording before, in which it did not hold yet."""
     before = Past(0, 600, ((0, False), (450, True)))
