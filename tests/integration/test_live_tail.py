@@ -49,7 +49,6 @@ NEWEST: Final = ("get_position_seconds_ago", {"seconds_ago": 0, "tolerance_s": 6
 A_MOMENT_AGO: Final = ("get_position_seconds_ago", {"seconds_ago": FRESH_S, "tolerance_s": 1})
 TRAVELLED: Final = 0.05  # m: how far from the closed form an answer may be
 ROUNDED_S: Final = 0.002  # ages are whole milliseconds
-APART_S: Final = 0.005  # two recordings log one message up to some milliseconds apart
 NAMES: Final = ("steady", "rotating")
 
 
@@ -64,6 +63,7 @@ class Drive:
     newest: dict[str, list[Answer]] = field(default_factory=dict)
     ago: dict[str, list[Answer]] = field(default_factory=dict)
     recorded: dict[str, list[Tick]] = field(default_factory=dict)
+    copies: dict[str, list[Tick]] = field(default_factory=dict)
     files: dict[str, int] = field(default_factory=dict)
 
 
@@ -117,6 +117,7 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
             files = bag_files(recorder.bag_dir)
             drive.files[name] = len(files)
             drive.recorded[name] = ticks(files, drive.t0, HZ)
+            drive.copies[name] = ticks(files, drive.t0, HZ, counting=False)
         return drive
 
 
@@ -157,12 +158,27 @@ def is_right(drive: Drive, name: str) -> None:
         assert asked - ROUNDED_S <= now <= answered + ROUNDED_S
         x, y = position(told["timestamp"] - drive.t0 / NS_PER_S)
         assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
-        found = told["timestamp"]
-        apart_s = [
-            abs(found - _newest_recorded(drive, name, now - FRESH_S + off) / NS_PER_S)
-            for off in (-APART_S, APART_S)
+        # In a rotation two recordings log one message at times of their own: either may answer.
+        found = [
+            each.number
+            for each in drive.copies[name]
+            if abs(told["timestamp"] - each.log_time / NS_PER_S) <= 2e-6  # whole microseconds
         ]
-        assert min(apart_s) <= APART_S
+        assert found
+        then = now - FRESH_S
+        oldest, newest = _newest_of_copies(drive, name, then - ROUNDED_S, then + ROUNDED_S)
+        assert oldest <= found[0] <= newest
+
+
+def _newest_of_copies(drive: Drive, name: str, since: float, until: float) -> tuple[int, int]:
+    """The newest message of which all copies were logged at a moment, or any at a later one."""
+    logged: dict[int, list[int]] = {}
+    for each in drive.copies[name]:
+        logged.setdefault(each.number, []).append(each.log_time)
+    return (
+        max(number for number, times in logged.items() if max(times) <= since * NS_PER_S),
+        max(number for number, times in logged.items() if min(times) <= until * NS_PER_S),
+    )
 
 
 def _newest_recorded(drive: Drive, name: str, at: float) -> int:
