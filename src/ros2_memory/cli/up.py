@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -25,7 +26,12 @@ from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chose
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.text import counted, listed
-from ros2_memory.recorder.process.environment import advice_on_rmw, advice_on_silence, rmw_of
+from ros2_memory.recorder.process.environment import (
+    advice_on_rmw,
+    advice_on_silence,
+    advice_on_users,
+    rmw_of,
+)
 from ros2_memory.recorder.process.installation import (
     Installation,
     find_installation,
@@ -156,20 +162,26 @@ def _require_messages(robot: _Robot, found: Survey) -> None:
             "and give this command their ROS_DOMAIN_ID, RMW_IMPLEMENTATION and "
             f"ROS_AUTOMATIC_DISCOVERY_RANGE{f'; {advice}' if advice else ''}"
         )
-    segments = Path("/dev/shm").glob("fastrtps_*")  # noqa: S108 - Fast DDS has them there
-    owners = {each.stat().st_uid for each in segments} - {os.getuid()}
-    names = ", ".join(map(str, sorted(owners)))
-    others = f"nodes of user {names} run, or ran, here" if owners else ""
-    advice = advice_on_silence(robot.ros.env)
+    owners = ", ".join(map(str, sorted(_owners_of_segments() - {os.getuid()})))
+    others = f"nodes of user {owners} run, or ran, here" if owners else ""
     if light and not any(each.messages for each in light):
         raise RecorderError(
             f"{counted(len(light), 'topic is', 'topics are')} offered in {robot.where}, and no "
             f"message came to user {os.getuid()} in {SECONDS:g} s{others and f' ({others})'}; "
-            f"{advice}"
+            f"{advice_on_silence(robot.ros.env)}"
         )
-    if others:
-        # Through a port that a node made anew, after its recorder ended, its messages come.
+    # Fast DDS lets their messages through where such a node made anew what a recorder had left.
+    if others and (advice := advice_on_users(robot.ros.env)):
         print_line(f"{others}; what they send may come now and not later: {advice}")
+
+
+def _owners_of_segments() -> set[int]:
+    """Returns the users whose nodes have shared memory of Fast DDS."""
+    owners: set[int] = set()
+    for segment in Path("/dev/shm").glob("fastrtps_*"):  # noqa: S108 - Fast DDS has them there
+        with suppress(FileNotFoundError):  # its node ended just now
+            owners.add(segment.stat().st_uid)
+    return owners
 
 
 def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:

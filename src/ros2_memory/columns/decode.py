@@ -111,7 +111,7 @@ def decoded(
         bare = {channel.topic for channel in channels}
         for channel in channels:
             kind = kinds.of(channel)
-            # Copies among those of which there are times alone are told by their publish times.
+            # Copies of messages without a payload are recognised by their publish times.
             if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
                 bare.discard(channel.topic)
         batches = reader.batches(path, {each.topic for each in channels}, window, bare=bare)

@@ -329,8 +329,8 @@ class BagReader(ABC):
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded; None if its type is known."""
 
-    def times_alone(self, path: Path) -> Collection[str]:  # noqa: ARG002 - of others it is asked
-        """Returns the topics of which there are the times of messages, and no messages."""
+    def times_alone(self, path: Path) -> Collection[str]:  # noqa: ARG002 - a lake needs it
+        """Returns the topics of which the bag has log and publish times (ns), and no payloads."""
         return frozenset()
 
     @abstractmethod

@@ -160,7 +160,7 @@ class LakeReader(BagReader):
         return times
 
     def times_alone(self, path: Path) -> Collection[str]:
-        """Returns the topics whose messages are large, and were not asked for."""
+        """Returns the topics whose payloads were not shipped: their messages are large."""
         heads = self._heads_of(self._index.bag(path)[0])
         return {each.channel.topic for each in heads if not each.has_payloads}
 

@@ -127,16 +127,14 @@ def advice_on_rmw(env: Mapping[str, str]) -> str | None:
     return None
 
 
-def advice_on_silence(env: Mapping[str, str]) -> str:
-    """Returns advice for subscriptions that receive nothing, by the environment.
+def advice_on_users(env: Mapping[str, str]) -> str | None:
+    """Returns what a recorder needs to hear nodes of another user; None where it needs nothing.
 
     rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
     FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
     """
-    if advice := advice_on_rmw(env):
-        return advice
     if "fastrtps" not in rmw_of(env):
-        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
+        return None
     local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
     if local or env.get("ROS_LOCALHOST_ONLY") == "1":
         return (
@@ -150,6 +148,15 @@ def advice_on_silence(env: Mapping[str, str]) -> str:
             "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
             "for the recorder: Fast DDS does not share memory between users"
         )
+    return None
+
+
+def advice_on_silence(env: Mapping[str, str]) -> str:
+    """Returns advice for subscriptions that receive nothing, by the environment."""
+    if advice := advice_on_rmw(env) or advice_on_users(env):
+        return advice
+    if "fastrtps" not in rmw_of(env):
+        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
     return "do the publishers publish, and does a firewall block DDS?"
 
 
