@@ -164,10 +164,10 @@ def is_right(drive: Drive, name: str) -> None:
             for each in drive.copies[name]
             if abs(told["timestamp"] - each.log_time / NS_PER_S) <= 2e-6  # whole microseconds
         ]
-        assert found
+        assert found, told
         then = now - FRESH_S
         oldest, newest = _newest_of_copies(drive, name, then - ROUNDED_S, then + ROUNDED_S)
-        assert oldest <= found[0] <= newest
+        assert oldest <= found[0] <= newest, (told, asked, answered, drive.t0)
 
 
 def _newest_of_copies(drive: Drive, name: str, since: float, until: float) -> tuple[int, int]:

@@ -143,7 +143,11 @@ def _beside_deleted(base: sqlite3.Connection) -> list[str]:
 
 
 def _delete_unused(base: sqlite3.Connection) -> None:
-    """Deletes what only deleted bags had: topics, definitions, and what their summaries say."""
+    """Deletes what only deleted bags had: topics, definitions, and what their summaries say.
+
+    What `metadata.yaml` lists is read again: some of the files may be gone.
+    """
+    base.execute("DELETE FROM listing")
     base.execute("DELETE FROM topic WHERE id NOT IN (SELECT topic FROM part)")
     base.execute("DELETE FROM definition WHERE id NOT IN (SELECT definition FROM topic)")
     base.execute("DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)")

@@ -71,6 +71,7 @@ class Asked:
             found out only where that is asked.
         within: half-open spans, in order and apart; tables that overlap none of them are left out.
             None: none is.
+        stored: whether bags that are not stored are left out.
         check: is called before each table with a log time that what is left does not lie behind
             (with `newest_first`: is not later than); raises where the call's time is over.
     """
@@ -84,6 +85,7 @@ class Asked:
     may_match: Callable[[PartZones], bool | Mask] | None = None
     may_be_empty: bool = False
     within: Sequence[tuple[Ns, Ns]] | None = None
+    stored: bool = False
     check: Callable[[Ns], None] = lambda _: None
 
 
@@ -218,6 +220,8 @@ class Scan:
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
+        if self._asked.stored:
+            return
         for bag in coverage.missing_in(reach):
             if topic in bag.summary.schema.positions:
                 first, last = bag.summary.span_of([topic])

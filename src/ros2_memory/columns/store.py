@@ -71,6 +71,7 @@ TABLES: Final = Tables(
         "zone",
         "fragment",
         "fragment_part",
+        "listing",
         "deletion",
     ),
     # Deleted rows are overwritten, and pages that become free go back to the disk.
@@ -103,6 +104,7 @@ CREATE TABLE fragment (id INTEGER PRIMARY KEY AUTOINCREMENT, kind TEXT NOT NULL,
   UNIQUE (kind, settings, start_ns, parts));
 CREATE TABLE fragment_part (part INTEGER NOT NULL, fragment INTEGER NOT NULL,
   PRIMARY KEY (part, fragment)) WITHOUT ROWID;
+CREATE TABLE listing (folder TEXT PRIMARY KEY, listed TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
 """,
 )
@@ -475,6 +477,14 @@ class ColumnStore(Database):
 
         return self.read(ask, [])
 
+    def listings(self) -> dict[str, str]:
+        """Returns what was stored of `metadata.yaml` in each folder, by its path as in a key."""
+
+        def ask(connection: sqlite3.Connection) -> dict[str, str]:
+            return dict(connection.execute("SELECT folder, listed FROM listing").fetchall())
+
+        return self.read(ask, {})
+
     def _numbers(self, parts: str) -> tuple[int, ...]:
         return tuple(self.offset + part for part in json.loads(parts))
 
@@ -501,6 +511,15 @@ class ColumnStore(Database):
                     )
 
         return self.write(write)
+
+    def put_listings(self, listings: dict[str, str]) -> bool:
+        """Stores what `metadata.yaml` lists, by folder, in place of what was stored of any."""
+
+        def write(connection: sqlite3.Connection) -> None:
+            connection.execute("DELETE FROM listing")
+            connection.executemany("INSERT INTO listing VALUES (?, ?)", listings.items())
+
+        return self.listings() == listings or self.write(write)
 
     def put(self, bags: Sequence[DecodedBag], *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.

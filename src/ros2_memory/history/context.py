@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
+from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns, unix_from_ns
-from ros2_memory.index.listed_splits import absent_splits
+from ros2_memory.index.listed_splits import absent_splits, listing_from_json, listing_to_json
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -136,7 +137,34 @@ class Memory:
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns what recordings' metadata.yaml lists and is not there."""
-        return absent_splits(snapshot, self.index.bag_dir, self.memo.of(_LISTINGS, dict))
+        return absent_splits(snapshot, self.index.bag_dir, self._listings())
+
+    def store_listings(self, snapshot: Snapshot) -> None:
+        """Stores what metadata.yaml of each recording lists, for the programs that start later."""
+        store = self.columns.store
+        if store is None:
+            return
+        self.absent_splits(snapshot)
+        known, folders = self._listings(), snapshot.metadata_folders
+        store.put_listings(
+            {
+                relative(folder, str(self.index.bag_dir)): listing_to_json(*known[folder])
+                for folder in folders
+                if folder in known
+            }
+        )
+
+    def _listings(self) -> Listings:
+        return self.memo.of(_LISTINGS, self._stored_listings)
+
+    def _stored_listings(self) -> Listings:
+        """Returns what was stored of each metadata.yaml; one that is damaged is read again."""
+        stored = {} if self.columns.store is None else self.columns.store.listings()
+        found: Listings = {}
+        for folder, text in stored.items():
+            with suppress(ValueError, TypeError):
+                found[str(self.index.bag_dir / folder)] = listing_from_json(text)
+        return found
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.

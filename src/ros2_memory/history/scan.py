@@ -53,8 +53,6 @@ def scan(
     """
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        if stored:
-            return ()
         return view.bags.tables(bag, topic, window, hashed=hashed, columns=columns, around=True)
 
     def check(at: Ns) -> None:
@@ -72,6 +70,7 @@ def scan(
         may_match=may_match,
         may_be_empty=may_be_empty,
         within=within,
+        stored=stored,
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )

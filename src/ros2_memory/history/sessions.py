@@ -55,6 +55,8 @@ class _Recorded(NamedTuple):
 
 _RECORDED: Final[Key[_Recorded]] = Key()
 """Of a timeline: sidecars are read for it."""
+_LINKED: Final[Key[set[tuple[tuple[str, str], Session | None]]]] = Key()
+"""Of a timeline: what one call found, the next need not look for."""
 
 
 class Sessions:
@@ -81,7 +83,7 @@ class Sessions:
         self._recorded = view.snapshot.timeline.memo.of(_RECORDED, self._find_recorded)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
-        self.linked: set[tuple[tuple[str, str], Session | None]] = set()
+        self.linked = view.snapshot.timeline.memo.of(_LINKED, set)
         self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}

@@ -6,6 +6,7 @@ since, or never copied, leave no other trace.
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
 from itertools import takewhile
@@ -71,6 +72,27 @@ class _Listed(NamedTuple):
 
 Listings: TypeAlias = "dict[str, tuple[_Stamp, _Listed]]"
 """By folder: how it was when its metadata.yaml was read, and what that listed."""
+
+
+def listing_to_json(stamp: _Stamp, listed_there: _Listed) -> str:
+    """Returns what was read of a folder as one line."""
+    return json.dumps([stamp, listed_there])
+
+
+def listing_from_json(text: str) -> tuple[_Stamp, _Listed]:
+    """Returns what was read of a folder.
+
+    Raises:
+        ValueError, TypeError: the text is nothing of that kind.
+    """
+    (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
+    return (mtime, size, folder), _Listed(
+        tuple((str(name), int(count)) for name, count in first),
+        tuple((str(name), int(count)) for name, count in later),
+        None if bags is None else int(bags),
+        None if messages is None else int(messages),
+        bool(is_total),
+    )
 
 
 def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Absent]:

@@ -106,10 +106,13 @@ _XYZW: Final = attrgetter("x", "y", "z", "w")
 
 def xyz(node: object) -> Vector3 | None:
     """Returns the numbers of a message or JSON object with x, y and z; None for any other."""
-    try:
-        x, y, z = _XYZ(node)
-    except AttributeError:
-        x, y, z = (field_of(node, name) for name in "xyz")
+    if isinstance(node, dict):
+        x, y, z = map(node.get, "xyz")
+    else:
+        try:
+            x, y, z = _XYZ(node)
+        except AttributeError:
+            x, y, z = (field_of(node, name) for name in "xyz")
     if type(x) is type(y) is type(z) is float:
         return (x, y, z)
     return triple((x, y, z))

@@ -157,7 +157,7 @@ class Backfill:
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
 
     def prune(self) -> None:
-        """Removes what is stored of deleted files.
+        """Removes what is stored of deleted files; stores what each metadata.yaml lists now.
 
         Does nothing where there are no bags: the disk of the bags is more likely missing than
         empty.
@@ -165,6 +165,7 @@ class Backfill:
         snapshot = self._memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None and snapshot.bags:
             self.filling.prune(snapshot.timeline)
+            self._memory.store_listings(snapshot)
 
 
 def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.metadata_yaml import Listing
 from ros2_memory.index import listed_splits
 from ros2_memory.index.listed_splits import Absent
 from tests.support.bags import text, write_mcap
-from tests.support.memories import memory_of
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,3 +69,26 @@ def test_a_folder_that_changed_just_now_is_read_again(
     assert [each.files for each in found(memory)] == [ABSENT]
     monkeypatch.setattr(listed_splits, "read_listing", lambda *_: Listing(("r_2.mcap",), {}, None))
     assert found(memory) == []
+
+
+def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = with_store(recording(tmp_path, messages=7), tmp_path)
+    [absent] = found(memory)
+    memory.store_listings(memory.index.snapshot())
+    monkeypatch.setattr(listed_splits, "read_listing", None)
+    later = with_store(memory_of(tmp_path), tmp_path)
+    assert found(later) == [absent]
+    (tmp_path / "r" / "metadata.yaml").unlink()
+    later.store_listings(later.index.refresh())
+    assert later.columns.store is not None
+    assert later.columns.store.listings() == {}
+
+
+@pytest.mark.parametrize("damaged", ["", "{}", "[1, 2]", "[[1, 2, 3], [[], [], 1, 2]]", "[[1], 2]"])
+def test_what_was_stored_and_is_damaged_is_read_again(tmp_path: Path, damaged: str) -> None:
+    memory = recording(tmp_path)
+    expected = found(memory)
+    store = with_store(memory, tmp_path).columns.store
+    assert store is not None
+    store.put_listings({"r": damaged})
+    assert found(with_store(memory_of(tmp_path), tmp_path)) == expected
