@@ -10,6 +10,7 @@ import math
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from itertools import chain, groupby
 from typing import TYPE_CHECKING, Final
 
 import pytest
@@ -63,7 +64,7 @@ class Drive:
     newest: dict[str, list[Answer]] = field(default_factory=dict)
     ago: dict[str, list[Answer]] = field(default_factory=dict)
     recorded: dict[str, list[Tick]] = field(default_factory=dict)
-    copies: dict[str, list[Tick]] = field(default_factory=dict)
+    copies: dict[str, list[list[Tick]]] = field(default_factory=dict)  # of each recording
     files: dict[str, int] = field(default_factory=dict)
 
 
@@ -117,7 +118,9 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
             files = bag_files(recorder.bag_dir)
             drive.files[name] = len(files)
             drive.recorded[name] = ticks(files, drive.t0, HZ)
-            drive.copies[name] = ticks(files, drive.t0, HZ, counting=False)
+            recordings = groupby(files, key=lambda file: file.parent)
+            found = [ticks([*of], drive.t0, HZ, counting=False) for _, of in recordings]
+            drive.copies[name] = [*filter(None, found)]
         return drive
 
 
@@ -161,24 +164,23 @@ def is_right(drive: Drive, name: str) -> None:
         # In a rotation two recordings log one message at times of their own: either may answer.
         found = [
             each.number
-            for each in drive.copies[name]
+            for each in chain.from_iterable(drive.copies[name])
             if abs(told["timestamp"] - each.log_time / NS_PER_S) <= 2e-6  # whole microseconds
         ]
         assert found, told
         then = now - FRESH_S
-        oldest, newest = _newest_of_copies(drive, name, then - ROUNDED_S, then + ROUNDED_S)
+        # What one of them lost or wrote late need not be known while both still run.
+        since, until = then - ROUNDED_S, then + ROUNDED_S
+        running = [each for each in drive.copies[name] if each[-1].log_time >= since * NS_PER_S]
+        oldest = min(_newest_of_each(running, since))
+        newest = max(_newest_of_each(drive.copies[name], until))
         assert oldest <= found[0] <= newest, (told, asked, answered, drive.t0)
 
 
-def _newest_of_copies(drive: Drive, name: str, since: float, until: float) -> tuple[int, int]:
-    """The newest message of which all copies were logged at a moment, or any at a later one."""
-    logged: dict[int, list[int]] = {}
-    for each in drive.copies[name]:
-        logged.setdefault(each.number, []).append(each.log_time)
-    return (
-        max(number for number, times in logged.items() if max(times) <= since * NS_PER_S),
-        max(number for number, times in logged.items() if min(times) <= until * NS_PER_S),
-    )
+def _newest_of_each(recordings: list[list[Tick]], at: float) -> list[int]:
+    """The newest message that each recording had received at a moment, if it had any."""
+    received = [[t.number for t in each if t.log_time <= at * NS_PER_S] for each in recordings]
+    return [max(numbers) for numbers in received if numbers]
 
 
 def _newest_recorded(drive: Drive, name: str, at: float) -> int:
