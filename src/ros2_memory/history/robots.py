@@ -60,6 +60,8 @@ _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
 _APART: Final[Key[dict[tuple[Path, Path], str | None]]] = Key()
 """Of a memory: for pairs of recordings, the topic on which they differ. The past stays."""
+_DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
+"""Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: the parent of each static frame of a recording that is closed."""
 _MAKERS: Final[Key[list[tuple[str, Sequence[BagFile]]]]] = Key()
@@ -416,12 +418,18 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
     """Whether two recordings hold messages in a window, and the other none of the one's."""
+    known, key = view.snapshot.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
+    if key in known:
+        return known[key]
     if sessions_of(view).are_joined(*pair):
         return False
-    wide = both.widened(COPY_HORIZON_NS)
+    wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)
     one, other = ([each for each in bags if each.bag.recording == path] for path in pair)
-    return _differ_in(view, topic, (one, other), both)
+    differ = _differ_in(view, topic, (one, other), both)
+    if view.notes.added == noted:  # else something could not be read, and may be next time
+        known[key] = differ
+    return differ
 
 
 def _differ_in(

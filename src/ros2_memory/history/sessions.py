@@ -13,6 +13,7 @@ are of one robot, so a reply that uses borrowed transforms has to note it.
 
 from __future__ import annotations
 
+from collections import ChainMap
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -87,7 +88,7 @@ class Sessions:
         self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
-        self._recordings: dict[tuple[Session, tuple[str, ...]], dict[Path, tuple[Ns, Ns]]] = {}
+        self._recordings: dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]] = {}
 
     def folder(self, recording: Path) -> str:
         """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
@@ -100,16 +101,21 @@ class Sessions:
 
         With the log times of the first and the last message of these.
         """
-        key = (session, topics)
-        if key not in self._recordings:
-            found: dict[Path, tuple[Ns, Ns]] = {}
-            for topic in topics:
-                for path, span in self._view.snapshot.timeline.recordings(topic).items():
-                    if self.folder(path) in session:
-                        first, last = found.get(path, span)
-                        found[path] = min(first, span[0]), max(last, span[1])
-            self._recordings[key] = found
-        return self._recordings[key]
+        if topics not in self._recordings:
+            self._recordings[topics] = self._recordings_with(topics)
+        by_folder = self._recordings[topics]
+        some = [by_folder[folder] for folder in sorted(session) if folder in by_folder]
+        return some[0] if len(some) == 1 else dict(ChainMap(*some))
+
+    def _recordings_with(self, topics: tuple[str, ...]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
+        """Returns the recordings that hold some topics, by where they were recorded."""
+        found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
+        for topic in topics:
+            for path, span in self._view.snapshot.timeline.recordings(topic).items():
+                there = found.setdefault(self.folder(path), {})
+                first, last = there.get(path, span)
+                there[path] = min(first, span[0]), max(last, span[1])
+        return found
 
     def has(self, session: Session, found: StoredMessage) -> bool:
         """Whether a message is of a session; a carried one that names no recording is of each."""
