@@ -12,6 +12,7 @@ import struct
 import sys
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self
 
 import numpy as np
@@ -235,8 +236,29 @@ class BagSummary:
     @property
     def numbers(self) -> bytes:
         """Count, first and last of each topic, in the order of the schema."""
-        stored = self._numbers
-        return stored if len(stored) == self.schema.numbers.size else self._unfolded(stored)
+        if not self._is_packed:
+            return self._numbers
+        every = map(self._numbers_at, range(len(self.schema.topics)))
+        return self.schema.numbers.pack(*chain.from_iterable(every))
+
+    @property
+    def _is_packed(self) -> bool:
+        return len(self._numbers) != self.schema.numbers.size
+
+    def _numbers_at(self, position: int) -> tuple[int, int, int]:
+        """Returns count, first and last of the topic at a position, without unpacking others."""
+        if not self._is_packed:
+            count, first, last = _NUMBERS.unpack_from(self._numbers, position * _NUMBERS.size)
+            return count, first, last
+        packed = self._numbers
+        at = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
+        begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
+        (base,) = _BASE.unpack_from(packed)
+        return (
+            int.from_bytes(packed[at:begin], "little"),
+            base + int.from_bytes(packed[begin:end], "little"),
+            base + int.from_bytes(packed[end : end + _TIME_BYTES], "little"),
+        )
 
     def pack(self) -> None:
         """Takes about half of the memory from now on, and some microseconds for each look."""
@@ -257,19 +279,6 @@ class BagSummary:
         except OverflowError:
             return self.numbers
         return b"".join(parts) if numbers else b""
-
-    def _unfolded(self, packed: bytes) -> bytes:
-        (base,) = _BASE.unpack_from(packed)
-        numbers: list[int] = []
-        at = _BASE.size
-        while at < len(packed):
-            first = at + _COUNT_BYTES
-            last, end = first + _TIME_BYTES, first + 2 * _TIME_BYTES
-            numbers.append(int.from_bytes(packed[at:first], "little"))
-            numbers.append(base + int.from_bytes(packed[first:last], "little"))
-            numbers.append(base + int.from_bytes(packed[last:end], "little"))
-            at = end
-        return self.schema.numbers.pack(*numbers)
 
     def replaced(
         self,
@@ -298,8 +307,7 @@ class BagSummary:
 
     def at(self, position: int) -> TopicSummary:
         """Returns the topic at a position of the schema."""
-        numbers = _NUMBERS.unpack_from(self.numbers, position * _NUMBERS.size)
-        return _topic_of(self.schema.topics[position], numbers)
+        return _topic_of(self.schema.topics[position], self._numbers_at(position))
 
     def of(self, topic: str) -> tuple[TopicSummary, ...]:
         """Returns one topic under each of its types."""
@@ -307,12 +315,9 @@ class BagSummary:
 
     def span_of(self, topics: Collection[str]) -> tuple[Ns, Ns]:
         """Returns the first and last log time of these topics; it must hold one of them."""
-        known, numbers = self.schema.positions, self._unpacked()
-        positions = [each for topic in topics for each in known.get(topic, ())]
-        return (
-            min(numbers[3 * each + 1] for each in positions),
-            max(numbers[3 * each + 2] for each in positions),
-        )
+        known = self.schema.positions
+        every = [self._numbers_at(each) for topic in topics for each in known.get(topic, ())]
+        return min(first for _, first, _ in every), max(last for _, _, last in every)
 
     @property
     def silent(self) -> tuple[str, ...]:

@@ -18,15 +18,13 @@ from tests.support.moving_map import BEGIN, S, write_moving_map
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
-
 
 @pytest.fixture(scope="module")
-def moving(tmp_path_factory: pytest.TempPathFactory) -> Memory:
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A map that moves, in fifty bags."""
     folder = tmp_path_factory.mktemp("moving")
     write_moving_map(folder, 1, seconds=100, split_s=2.0)
-    return memory_of(folder)
+    return folder
 
 
 class _Looks:
@@ -40,22 +38,23 @@ class _Looks:
         return self.count
 
 
-def test_the_map_is_known_from_the_newest_bags_alone(moving: Memory) -> None:
-    looks = _Looks()
-    view = View(moving, Call(Deadline.after(1e6, looks)))
+def test_the_map_is_known_from_the_newest_bags_alone(moving: Path) -> None:
+    looks, memory = _Looks(), memory_of(moving)
+    view = View(memory, Call(Deadline.after(1e6, looks)))
     assert map_placement(view, "odom", "/odom", "map").frame_id == "map"
     nothing = _Looks()
-    everything = View(moving, Call(Deadline.after(1e6, nothing)))
+    everything = View(memory, Call(Deadline.after(1e6, nothing)))
     assert map_placement(everything, "elsewhere", "/odom").frame_id == "elsewhere"
     assert looks.count < nothing.count / 4
 
 
 def test_a_map_of_which_it_is_not_known_whether_transforms_lead_there_is_not_denied(
-    moving: Memory,
+    moving: Path,
 ) -> None:
     outcomes = set()
     for ticks in range(1, 40):
-        view = View(moving, Call(Deadline.after(ticks, _Looks())))
+        # A memory of its own each time: what one call found out, the next knows.
+        view = View(memory_of(moving), Call(Deadline.after(ticks, _Looks())))
         try:
             outcomes.add(map_placement(view, "odom", "/odom", "map").frame_id)
         except QueryTimeoutError:
