@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.facts import has_events, joined_stated, state_of, stated_by
+from ros2_memory.analysis.facts import joined_stated, state_of, stated_by
 from ros2_memory.analysis.topic_events import TopicEvents, events_of, joined_events
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.events import EVENTS
@@ -76,20 +76,19 @@ def events_back(
         yield from _events(view, columns, together, may_match)
 
 
-def make_events(view: View, window: TimeWindow) -> None:
-    """Makes the events of the parts in a window, of each topic that can have some.
+def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> None:
+    """Makes the events of the parts of some topics in a window.
 
     Raises:
         QueryTimeoutError: the deadline has passed.
     """
-    columns, timeline = StatedColumns(view.memory.extractor), view.snapshot.timeline
-    for topic in timeline.topics():
-        if any(map(has_events, timeline.types_of(topic))):
-            # What a part has before or after is of it all the same.
-            around = window.widened(PART_NS)
-            for rows in scan(view, topic, around, newest_first=True, stored=True):
-                if rows.part is not None:
-                    deque(_events(view, columns, [rows], None), maxlen=0)
+    columns = StatedColumns(view.memory.extractor)
+    for topic in topics:
+        # What a part has before or after is of it all the same.
+        around = window.widened(PART_NS)
+        for rows in scan(view, topic, around, newest_first=True, stored=True):
+            if rows.part is not None:
+                deque(_events(view, columns, [rows], None), maxlen=0)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:

@@ -24,6 +24,7 @@ from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
+from ros2_memory.insights.changes_before import topics_with_changes
 from ros2_memory.insights.drive import slice_drive
 from ros2_memory.insights.topic_events import make_events
 from ros2_memory.places.region_visits import make_tracks
@@ -176,7 +177,7 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
             slice_drive(view, window)
             make_tracks(view, window)
             Watching(view).make(window)
-            make_events(view, window)
+            make_events(view, window, topics_with_changes(view))
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.

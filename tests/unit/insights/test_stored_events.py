@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.columns.stated import StatedColumns
-from tests.support.bags import boolean, detections, log_entry, write_mcap
+from tests.support.bags import boolean, command, detections, log_entry, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -21,10 +21,11 @@ SPAN = {"start": BEGIN, "end": BEGIN + 1199}
 
 
 def written(folder: Path) -> Memory:
-    """Twenty minutes: a bumper, a detector that sees a cup at times, and two errors."""
+    """Twenty minutes: a bumper, a detector that sees a cup at times, commands, and two errors."""
     rows = [boolean((BEGIN + at) * S, data=at % 100 == 40) for at in range(0, 1200, 10)]
     seen = [["cup"] if at % 200 < 50 else [] for at in range(0, 1200, 5)]
     rows += [detections((BEGIN + 5 * nth) * S, labels) for nth, labels in enumerate(seen)]
+    rows += [command((BEGIN + at) * S, float(at % 60 < 40)) for at in range(1200)]
     rows += [log_entry((BEGIN + at) * S, 40, "arm", "stuck") for at in (100, 900)]
     rows.sort(key=lambda row: row.log_time)
     for nth, since in enumerate(range(0, 1200, 60)):
