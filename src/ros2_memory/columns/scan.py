@@ -215,6 +215,8 @@ class Scan:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
+            if self._asked.stored:
+                return
             plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
             yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
             return

@@ -162,7 +162,7 @@ class Memory:
         stored = {} if self.columns.store is None else self.columns.store.listings()
         found: Listings = {}
         for folder, text in stored.items():
-            with suppress(ValueError, TypeError):
+            with suppress(ValueError, TypeError, OverflowError):
                 found[str(self.index.bag_dir / folder)] = listing_from_json(text)
         return found
 

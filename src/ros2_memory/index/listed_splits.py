@@ -83,7 +83,7 @@ def listing_from_json(text: str) -> tuple[_Stamp, _Listed]:
     """Returns what was read of a folder.
 
     Raises:
-        ValueError, TypeError: the text is nothing of that kind.
+        ValueError, TypeError, OverflowError: the text is nothing of that kind.
     """
     (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
     return (mtime, size, folder), _Listed(

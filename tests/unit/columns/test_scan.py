@@ -54,6 +54,18 @@ def test_tables_come_in_the_order_of_time(tmp_path: Path, newest_first: bool) ->
     assert check_rows(world, "/odom", newest_first=newest_first) == 40
 
 
+def test_bags_that_are_not_stored_are_left_out_where_that_is_asked(tmp_path: Path) -> None:
+    cut(tmp_path, [10, 30, 31, 60])
+    world = World.of(tmp_path)
+    bags = world.memory.index.snapshot().timeline.bags
+    world.fill_alone(bags[:2])
+    expected = sum(bag.summary.of("/odom")[0].count for bag in bags[:2])
+    found = scan(View(world.memory, Call()), "/odom", EVERYTHING, stored=True)
+    assert sum(map(len, found)) == expected
+    without = replace(world.memory, columns=Scanner(None, tmp_path))
+    assert [*scan(View(without, Call()), "/odom", EVERYTHING, stored=True)] == []
+
+
 def test_parts_that_another_process_makes_meanwhile_hide_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

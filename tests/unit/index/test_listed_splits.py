@@ -84,7 +84,17 @@ def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.M
     assert later.columns.store.listings() == {}
 
 
-@pytest.mark.parametrize("damaged", ["", "{}", "[1, 2]", "[[1, 2, 3], [[], [], 1, 2]]", "[[1], 2]"])
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        "",
+        "{}",
+        "[1, 2]",
+        "[[1, 2, 3], [[], [], 1, 2]]",
+        "[[1], 2]",
+        "[[1, 2, 3], [[], [], Infinity, 1, 0]]",
+    ],
+)
 def test_what_was_stored_and_is_damaged_is_read_again(tmp_path: Path, damaged: str) -> None:
     memory = recording(tmp_path)
     expected = found(memory)
