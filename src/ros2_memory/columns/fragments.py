@@ -125,7 +125,7 @@ class Fragments(Generic[T]):
         store: where they are stored; None where they are remembered alone.
         kind: see there.
         settings: what all of them depend on, as a text.
-        most_bytes: of those that are remembered; as they are stored they may take a quarter more.
+        most_bytes: of those that are remembered.
     """
 
     def __init__(
@@ -135,7 +135,7 @@ class Fragments(Generic[T]):
         self._kind = kind
         self._settings = settings
         self._made: ByteLru[T] = ByteLru(most_bytes)
-        self._stored: ByteLru[bytes] = ByteLru(most_bytes // 4)
+        self._stored: ByteLru[bytes] = ByteLru(most_bytes)
         self._read: dict[tuple[int, str, Ns], int] = {}
         self._waiting: deque[tuple[FragmentKey, T]] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.Lock()
@@ -159,18 +159,13 @@ class Fragments(Generic[T]):
                 self._waiting.append((key, made))
 
     def write(self) -> None:
-        """Stores what was made since; not what follows from parts that are deleted meanwhile.
-
-        What is stored is not remembered, too: who fills the store asks for little of it.
-        """
+        """Stores what was made since; not what follows from parts that are deleted meanwhile."""
         with self._lock:
             waiting = [*self._waiting]
             self._waiting.clear()
         if self._store is not None and waiting:
             made = [(key, self._kind.store(made).to_bytes()) for key, made in waiting]
-            if self._store.put_fragments(self._name(), made):
-                for key, _ in waiting:
-                    self._made.drop(key)
+            self._store.put_fragments(self._name(), made)
 
     def _name(self) -> str:
         return f"{self._kind.name} {self._settings}"

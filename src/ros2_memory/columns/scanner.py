@@ -45,8 +45,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-_FRAGMENT_BYTES: Final = 40 << 20
-"""How much the fragments of a kind may take in memory: tracks of a week of splits take 33 MB."""
+_FRAGMENT_BYTES: Final = 24 << 20
+"""How much the fragments of a kind may take in memory, and as much again as they are stored."""
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")

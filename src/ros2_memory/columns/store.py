@@ -478,7 +478,7 @@ class ColumnStore(Database):
         return self.read(ask, [])
 
     def listings(self) -> dict[str, str]:
-        """Returns what was stored of `metadata.yaml` in each folder, by its path as in a key."""
+        """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
 
         def ask(connection: sqlite3.Connection) -> dict[str, str]:
             return dict(connection.execute("SELECT folder, listed FROM listing").fetchall())
@@ -513,7 +513,7 @@ class ColumnStore(Database):
         return self.write(write)
 
     def put_listings(self, listings: dict[str, str]) -> bool:
-        """Stores what `metadata.yaml` lists, by folder, in place of what was stored of any."""
+        """Replaces all that `listings` returns."""
 
         def write(connection: sqlite3.Connection) -> None:
             connection.execute("DELETE FROM listing")

@@ -13,7 +13,6 @@ are of one robot, so a reply that uses borrowed transforms has to note it.
 
 from __future__ import annotations
 
-from collections import ChainMap
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -104,8 +103,8 @@ class Sessions:
         if topics not in self._recordings:
             self._recordings[topics] = self._recordings_with(topics)
         by_folder = self._recordings[topics]
-        some = [by_folder[folder] for folder in sorted(session) if folder in by_folder]
-        return some[0] if len(some) == 1 else dict(ChainMap(*some))
+        every = (by_folder.get(folder, {}) for folder in sorted(session))
+        return {path: span for found in every for path, span in found.items()}
 
     def _recordings_with(self, topics: tuple[str, ...]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
         """Returns the recordings that hold some topics, by where they were recorded."""

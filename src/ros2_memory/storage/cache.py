@@ -53,13 +53,6 @@ class ByteLru(Generic[T]):
                 _, (_, dropped) = self._values.popitem(last=False)
                 self._bytes -= dropped
 
-    def drop(self, key: Hashable) -> None:
-        """Drops the value of the key, if there is one."""
-        with self._lock:
-            dropped = self._values.pop(key, None)
-            if dropped is not None:
-                self._bytes -= dropped[1]
-
 
 def shared(channel: Channel) -> Channel:
     """Returns the first channel met that equals this one: bags of one robot declare the same.

@@ -99,18 +99,6 @@ def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world:
     assert found.words == "there"
 
 
-def test_a_fragment_that_was_stored_is_read_by_who_made_it(world: World) -> None:
-    made, key = Words("there"), FragmentKey(T0, "any", (part_of(world.store),))
-    known = Fragments(world.store, WORDS, "", 10**6)
-    known.put(key, made)
-    assert known.get(key) is made
-    known.write()
-    found = known.get(key)
-    assert found is not None
-    assert found is not made
-    assert found.words == "there"
-
-
 def test_a_fragment_of_other_parts_settings_or_days_is_another(world: World) -> None:
     part = part_of(world.store)
     known = Fragments(world.store, WORDS, "", 10**6)

@@ -27,16 +27,6 @@ def test_a_replaced_value_counts_once() -> None:
     assert [cache.get(key) for key in "abc"] == [None, "small", "large"]
 
 
-def test_what_is_dropped_makes_room() -> None:
-    cache: ByteLru[str] = ByteLru(10)
-    cache.put("a", "A", 8)
-    for key in ("a", "never there"):
-        cache.drop(key)
-    cache.put("b", "B", 8)
-    cache.put("c", "C", 2)
-    assert [cache.get(key) for key in "abc"] == [None, "B", "C"]
-
-
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 15))))
 def test_what_is_cached_never_passes_the_bound(puts: list[tuple[int, int]]) -> None:
     cache: ByteLru[int] = ByteLru(20)
