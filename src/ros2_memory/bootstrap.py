@@ -359,19 +359,21 @@ def claim(own: OwnRecordings) -> None:
 class SharedParts(NamedTuple):
     """What memories of the same settings can share, with its caches: the reader and the decoder.
 
-    `large` is the reader's turn to hold much of a bag.
+    `large` is the reader's turn to hold much of a bag. `cache_mb` is what each of the caches of
+    chunks and of columns may take; None: as much as makes answers fast.
     """
 
     reader: BagReader
     large: LargeReads
     schemas: Mapping[str, Mapping[str, str]]
     extractor: SchemaExtractor
+    cache_mb: int | None = None
 
 
 def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
     """Returns what reads and decodes the bags of one memory, or of several.
 
-    With `cache_mb` for the reader if that is given.
+    `cache_mb` is that of `SharedParts`.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
@@ -382,7 +384,7 @@ def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedPa
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
     large = LargeReads()
     return SharedParts(
-        build_reader(settings, cache_mb=cache_mb, large=large), large, schemas, extractor
+        build_reader(settings, cache_mb=cache_mb, large=large), large, schemas, extractor, cache_mb
     )
 
 
@@ -398,7 +400,7 @@ def build_memory(
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.columns.scanner import Scanner
+    from ros2_memory.columns.scanner import CACHE_MB, Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager
@@ -425,7 +427,8 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
         large=shared.large,
     )
-    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas), shared.large)
+    reading, cache_mb = reading_of(settings, schemas), shared.cache_mb or CACHE_MB
+    scanner = Scanner(columns, bag_dir, reading, shared.large, cache_mb)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 

@@ -319,11 +319,13 @@ def open_memory(
     verbose: bool = False,
     scans: bool = True,
     setting: str | None = None,
+    cache_mb: int | None = None,
 ) -> "Memory":
     """Returns the memory of the configured bags, with an index of the directory as it is now.
 
     Without an index where it `scans` not, because the robots of a fleet are asked.
-    `setting` is the one that names the bags, where it is another than `recording.bag_dir`.
+    `setting` is the one that names the bags, where it is another than `recording.bag_dir`,
+    `cache_mb` as in `SharedParts`.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 
@@ -339,12 +341,12 @@ def open_memory(
             f"the robots are {listed([*robots])} (fleet.robots); `ros2-memory ask` asks all of them"
         )
     # Imported here: `adopt`, `recover` and `config show` do without the libraries that answer.
-    from ros2_memory.bootstrap import build_memory  # noqa: PLC0415
+    from ros2_memory.bootstrap import build_memory, shared_parts  # noqa: PLC0415
 
     configure_logging(settings.logging.level if verbose else "warning", settings.logging.format)
     if not verbose:
         withhold_warnings()
-    memory = build_memory(settings, setting=setting)
+    memory = build_memory(settings, shared_parts(settings, cache_mb=cache_mb), setting=setting)
     if not scans:
         return memory
     with spinner(f"looking through {settings.recording.bag_dir}"):

@@ -205,11 +205,9 @@ class Filling:
         A robot that drives has more to store than one that stands: what other bags left of their
         share is theirs.
         """
-        parts, self._whole_parts = self._whole_parts, []
-        for some, bags in parts:
-            stored, taken = self.store.merged_bytes()
-            spare = round(self._limits.max_share * stored) - taken
-            self.store.thin(some, self._share(bags), spare)
+        groups, self._whole_parts = self._whole_parts, []
+        shares = [(parts, self._share(bags)) for parts, bags in groups]
+        self.store.thin(shares, self._limits.max_share)
 
     def prune(self, timeline: Timeline) -> None:
         """Deletes the bags whose files are gone; nothing where no bag is left.

@@ -45,8 +45,8 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-_FRAGMENT_BYTES: Final = 24 << 20
-"""How much the fragments of a kind may take in memory, and as much again as they are stored."""
+CACHE_MB: Final = 48
+"""How much unpacked columns may take in memory, in MiB."""
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
@@ -101,6 +101,8 @@ class Scanner:
         bag_dir: the bag directory.
         settings: what fragments depend on besides the bags, as a text.
         large: the turn to hold much of a bag, which large columns need, too.
+        cache_mb: how much unpacked columns may take in memory, in MiB; the fragments of a kind half
+            of it, and as much again as they are stored.
 
     Attributes:
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
@@ -117,12 +119,13 @@ class Scanner:
         bag_dir: Path,
         settings: str = "",
         large: LargeReads | None = None,
+        cache_mb: int = CACHE_MB,
     ) -> None:
         self.store = store
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
-        self._columns: ByteLru[Column] = ByteLru(48 << 20)
-        self._known: ByteLru[Packed] = ByteLru(16 << 20)
+        self._columns: ByteLru[Column] = ByteLru(cache_mb << 20)
+        self._known: ByteLru[Packed] = ByteLru((cache_mb << 20) // 3)
         self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.decoded: ByteLru[list[list[Table]]] = ByteLru(DECODED_BYTES)
@@ -132,12 +135,13 @@ class Scanner:
         self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
         self._settings = settings
+        self._fragment_bytes = (cache_mb << 20) // 2
         self._fragments: dict[str, object] = {}
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            made = Fragments(self.store, kind, self._settings, _FRAGMENT_BYTES)
+            made = Fragments(self.store, kind, self._settings, self._fragment_bytes)
             self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])

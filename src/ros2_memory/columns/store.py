@@ -34,6 +34,7 @@ from ros2_memory.columns.writing import (
     DecodedBag,
     Layouts,
     LongBag,
+    bytes_of_topics,
     delete_bags,
     insert_bags,
     thin_parts,
@@ -611,20 +612,25 @@ class ColumnStore(Database):
                 self.write(long.delete_half)
         return is_whole
 
-    def thin(self, parts: Sequence[int], at_least: int, spare: int) -> bool:
+    def thin(self, shares: Sequence[tuple[Sequence[int], int]], max_share: float) -> bool:
         """Drops the columns of the largest topics of some parts, beyond what these may take.
 
         Args:
-            parts: their numbers.
-            at_least: how many bytes they may take in any case.
-            spare: how many they may take more than now; of less than 0, by how many less.
+            shares: the numbers of parts, and how many bytes these may take in any case; more as
+                long as all parts take less than their share.
+            max_share: of the bytes of all bags.
         """
 
         def write(connection: sqlite3.Connection) -> None:
-            if all(map(self.is_current, parts)):
-                thin_parts(connection, [part - self.offset for part in parts], at_least, spare)
+            usual = bytes_of_topics(connection)
+            stored, taken = _merged_bytes(connection)
+            for parts, at_least in shares:
+                if all(map(self.is_current, parts)):
+                    numbers = [part - self.offset for part in parts]
+                    spare = round(max_share * stored) - taken
+                    taken -= thin_parts(connection, numbers, usual, at_least, spare)
 
-        return self.write(write)
+        return not shares or self.write(write)
 
     def delete(self, paths: Sequence[str]) -> bool:
         """Deletes bags, and the parts that have rows of none that is left."""
@@ -632,17 +638,7 @@ class ColumnStore(Database):
 
     def merged_bytes(self) -> tuple[int, int]:
         """Returns the bytes of the bags that are in whole parts, and those of their columns."""
-
-        def ask(connection: sqlite3.Connection) -> tuple[int, int]:
-            [bags] = connection.execute(
-                f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
-            ).fetchone()
-            [columns] = connection.execute(
-                "SELECT total(bytes) FROM part WHERE whole AND dropped = ''"
-            ).fetchone()
-            return int(bags), int(columns)
-
-        return self.read(ask, (0, 0))
+        return self.read(_merged_bytes, (0, 0))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""
@@ -655,3 +651,13 @@ class ColumnStore(Database):
             return (pages - free) * size
 
         return self.read(ask, 0)
+
+
+def _merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
+    [bags] = connection.execute(
+        f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
+    ).fetchone()
+    [columns] = connection.execute(
+        "SELECT total(bytes) FROM part WHERE whole AND dropped = ''"
+    ).fetchone()
+    return int(bags), int(columns)

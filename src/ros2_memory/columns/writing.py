@@ -101,7 +101,8 @@ class LongBag:
                 numbers = np.full(len(rows), self._number, np.int64)
                 packed[topic].append(pack_rows(layout, rows, numbers))
         parts = insert_parts(connection, packed, whole=True)
-        thin_parts(connection, parts, round(self._share * sum(len(table) for table in tables)))
+        share = round(self._share * sum(len(table) for table in tables))
+        thin_parts(connection, parts, bytes_of_topics(connection), share)
 
     def end(self, connection: sqlite3.Connection) -> None:
         """Gives the bag its key: now it is stored."""
@@ -124,14 +125,29 @@ class LongBag:
         return self.goes_on
 
 
+def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:
+    """Returns how many bytes the parts of each topic take, with those that were dropped."""
+    return dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
+
+
 def thin_parts(
-    connection: sqlite3.Connection, parts: Sequence[int], at_least: int, spare: int = -(2**62)
-) -> None:
-    """Drops the columns of the largest topics of some parts; see `ColumnStore.thin`.
+    connection: sqlite3.Connection,
+    parts: Sequence[int],
+    usual: Mapping[int, float],
+    at_least: int,
+    spare: int = -(2**62),
+) -> int:
+    """Drops the columns of the largest topics of some parts; returns how many bytes they took.
 
     Those that are the largest in all parts, so that not each topic has some parts without data.
+
+    Args:
+        connection: to the store.
+        parts: their numbers.
+        usual: as `bytes_of_topics`.
+        at_least: how many bytes they may take in any case.
+        spare: how many they may take more than now; of less than 0, by how many less.
     """
-    usual = dict(connection.execute("SELECT topic, total(bytes) FROM part GROUP BY topic"))
     sizes: dict[int, dict[int, int]] = defaultdict(dict)
     for part, topic, size in connection.execute(
         "SELECT id, topic, bytes FROM part WHERE id IN (SELECT value FROM json_each(?))"
@@ -140,22 +156,27 @@ def thin_parts(
     ):
         sizes[topic][part] = size
     left = max(sum(sum(some.values()) for some in sizes.values()) + spare, at_least)
+    dropped = 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
         left -= sum(sizes[topic].values())
         if left < 0:
-            for part in sizes[topic]:
-                _drop_columns(connection, topic, part)
+            dropped += sum(
+                size
+                for part, size in sizes[topic].items()
+                if _drop_columns(connection, topic, part)
+            )
+    return dropped
 
 
-def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> None:
-    """Leaves of a part the zones of its columns, and the times of its messages."""
+def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool:
+    """Leaves of a part the zones of its columns, and its times; returns whether it had more."""
     rows = connection.execute(
         "SELECT path FROM part_column WHERE part = ? AND (length(data) > 0 OR same NOT NULL)",
         (part,),
     )
     paths = [path for (path,) in rows if path not in ALWAYS]
     if not paths:
-        return
+        return False
     among = (topic, part, json.dumps(paths))
     connection.execute(
         f"UPDATE zone SET codec = '{DROPPED}' WHERE topic = ? AND part = ?"
@@ -169,6 +190,7 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> None
     connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (json.dumps(paths), part))
     # Who knows the part looks again.
     connection.execute("INSERT INTO deletion DEFAULT VALUES")
+    return True
 
 
 def _in_parts(table: Table) -> Iterator[Table]:

@@ -99,7 +99,8 @@ def _fill_fleet(settings: Settings, *, as_json: bool, verbose: bool) -> None:
 
 
 def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None = None) -> Progress:
-    memory = open_memory(settings, verbose=verbose, setting=setting)
+    cache_mb = _cache_mb(settings)
+    memory = open_memory(settings, verbose=verbose, setting=setting, cache_mb=cache_mb)
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
@@ -132,11 +133,13 @@ def _low_priority_backfill(settings: Settings) -> Backfill:
     """Returns what fills the store in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
-    # Each bag is read once: a larger cache of chunks would take most of the memory, and not help.
-    cache_mb = min(_CACHE_MB, settings.reader.chunk_cache_mb)
-    return build_backfill(
-        settings, build_memory(settings, shared_parts(settings, cache_mb=cache_mb))
-    )
+    shared = shared_parts(settings, cache_mb=_cache_mb(settings))
+    return build_backfill(settings, build_memory(settings, shared))
+
+
+def _cache_mb(settings: Settings) -> int:
+    """Returns what a cache may take, in MiB: little, since each bag is read and unpacked once."""
+    return min(_CACHE_MB, settings.reader.chunk_cache_mb)
 
 
 def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:
