@@ -386,6 +386,26 @@ def test_bags_may_take_what_others_left_of_their_share(tmp_path: Path) -> None:
     assert count(moving("beside", share, quiet=True), "part", "dropped <> ''") == 0
 
 
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6, 0.9])
+def test_what_one_part_drops_is_room_for_the_next(tmp_path: Path, share: float) -> None:
+    def dropped(name: str, *, together: bool) -> int:
+        for slot in range(3):
+            write_bag(tmp_path / name, slot * 10, rows=2000, hz=100)
+        world = World.of(tmp_path / name, limits=StoreLimits(max_share=1.0))
+        world.fill()
+        in_bags, needed = world.store.merged_bytes()
+        parts = world.store.parts("/odom")
+        shares = [([part.number], 0) for part in parts]
+        assert len(shares) == 3
+        for some in [shares] if together else [[each] for each in shares]:
+            assert world.store.thin(some, share * needed / in_bags)
+        return count(world, "part", "dropped <> ''")
+
+    at_once = dropped("together", together=True)
+    assert at_once == dropped("alone", together=False)
+    assert at_once == {0.0: 3, 0.3: 3, 0.6: 2, 0.9: 1}[share]
+
+
 def test_the_topic_that_is_the_largest_in_all_parts_is_dropped_first(tmp_path: Path) -> None:
     draw = random.Random(1)
     for number in range(4):
