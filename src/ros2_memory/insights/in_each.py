@@ -43,10 +43,12 @@ def in_each(
     are of one snapshot of the index.
 
     Raises:
-        InvalidArgumentsError: the window has too many days.
+        InvalidArgumentsError: the window has too many days, or is around a moment.
         NoDataError: nothing is recorded in these hours.
         QueryTimeoutError: the call's time runs out before any answer.
     """
+    if span.around_s is not None:
+        raise InvalidArgumentsError("between cannot be combined with around: one moment is asked")
     wall = memory.clock.now()
     snapshot = memory.index.snapshot(min(search_window(span, wall).stop, wall))
     whole = search_window(span, memory.now(wall, snapshot.latest, call))

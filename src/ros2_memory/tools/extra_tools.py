@@ -47,7 +47,7 @@ _RECAP = ToolDeclaration(
     (ToolName("recap", "What happened", RecapTime),),
     "What happened {when}: path, stops, speed drops, things in view, toggled booleans, goals, "
     "errors, gaps, silences. Reply: {{distance_m, max_speed, stood_s, events: [{{timestamp, ago_s, "
-    "duration_s, text, in, score, before: changes in the 10 s before}}], counts}}. With "
+    "duration_s, text, in, score, before: changes 10 s before}}], counts}}. With "
     "around: {{before: [{{text, s_before}}], after (5 s), looked_at, robot, state}}.",
     RecapArguments,
     recap_or_before,
@@ -63,8 +63,8 @@ _STATUS = ToolDeclaration(
 _VISITS = ToolDeclaration(
     (ToolName("visits", "Visits"),),
     "When, how long and how often the robot was in a place (where, or near x, y), newest first, in "
-    "{map_frame} if transforms lead there, else {pose_topic}'s; without a place, "
-    "all named ones. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
+    "{map_frame} if transforms lead there, else {pose_topic}'s; without one, "
+    "all named. Reply: {{frame_id, there_now, visits: [{{arrived, departed, duration_s, "
     "closest_m, ago_s}}], total, minutes, unknown_s}} or "
     "{{places: [{{place, minutes, entries}}]}}.",
     VisitsArguments,

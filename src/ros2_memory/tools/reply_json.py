@@ -43,6 +43,8 @@ _SUMMED: Final = (
     "visits",
     "distance_m",
     "duration_s",
+    "stood_s",
+    "inside_s",
     "unknown_s",
 )
 """Numbers of the replies for several windows that are added up."""

@@ -56,6 +56,7 @@ QUESTIONS: dict[str, dict[str, Any]] = {
     "find_matches": {**HELLO, "where": "hall", "limit": 100},
     "visits": {"where": "kitchen", "limit": 100},
     "trajectory_summary": {"farthest_from": {"x": 0, "y": 0}},
+    "recap": {"where": "kitchen"},
     "get_topic_in_range": {"topic": "/odom", "fields": ["position.x"], "by": "hour"},
 }
 
@@ -128,6 +129,7 @@ def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path)
         ("visits", {"between": ["19:00", 99]}, "is not two times of day"),
         ("visits", {"between": 19}, "is not two times of day"),
         ("find_things", {"between": "19:00-22:00"}, 'unknown argument "between"'),
+        ("recap", {"between": "19:00-22:00", "around": BEGIN}, "cannot be combined with around"),
     ],
 )
 def test_what_are_no_hours_is_named(
