@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ros2_memory.tools.arguments import Arguments, TimeArgument
 
 _MAX_UNKNOWN_NAMED: Final = 5
+_MAX_PROBLEMS_NAMED: Final = 10
 _MAX_NAME_CHARS: Final = 64
 _KINDS: Final = {
     "string": "a text",
@@ -104,8 +105,8 @@ class Signature:
         """Returns the checked arguments. A null for an optional one counts as not given.
 
         Raises:
-            InvalidArgumentsError: one is unknown, missing, or invalid; the message names each, with
-                the value that was given and an example.
+            InvalidArgumentsError: one is unknown, missing, or invalid; the message names the first
+                ten, with the value that was given and an example, and counts the others.
         """
         present = {
             name: value
@@ -126,16 +127,24 @@ class Signature:
         else:
             if not problems:
                 return arguments
-        raise InvalidArgumentsError("; ".join(problems))
+        more = len(problems) - _MAX_PROBLEMS_NAMED
+        raise InvalidArgumentsError(
+            "; ".join(problems[:_MAX_PROBLEMS_NAMED])
+            + (f"; and {more} more wrong arguments" if more > 0 else "")
+        )
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
         names = ", ".join(self._properties)
         known = f"the arguments are: {names}" if names else "the tool takes none"
         unknown = (name for name in given if name not in self._properties)
+        is_told = True
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
             near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
-            hint = f"do you mean {near[0]}?" if near else known
-            yield f"unknown argument {abbreviate(name)}; {hint}"
+            hint = f"; do you mean {near[0]}?" if near else ""
+            yield f"unknown argument {abbreviate(name)}{hint}"
+            is_told = is_told and bool(near)
+        if not is_told:
+            yield known
         if more := sum(1 for _ in unknown):
             yield f"and {more} more unknown arguments"
 
