@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.coverage import Covering
-from ros2_memory.columns.fragments import Fragments
+from ros2_memory.columns.fragments import DAY_NS, Fragments
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Zone, column_bytes
 from ros2_memory.columns.units import GoneError, PartUnit
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
-    from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
+    from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray
@@ -49,6 +50,8 @@ CACHE_MB: Final = 48
 """How much unpacked columns may take in memory, in MiB."""
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
+_FEW_DAYS_NS: Final = 3 * DAY_NS
+"""Of so much what is known of parts is read for itself."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 
@@ -91,6 +94,12 @@ class _Heads:
         """Returns the parts that may have rows in a window."""
         here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
         return [self.heads[nth] for nth in np.flatnonzero(here).tolist()]
+
+
+def _whole_days(window: TimeWindow) -> TimeWindow:
+    """Returns the days (UTC) that a window touches."""
+    first, stop = window.start // DAY_NS, -(-window.stop // DAY_NS)
+    return TimeWindow(first * DAY_NS, stop * DAY_NS).intersect(TimeWindow.everything())
 
 
 class Scanner:
@@ -171,18 +180,23 @@ class Scanner:
         if self.store is None:
             return []
         state = coverage.state
-        known = self._heads.get(topic)
+        span = TimeWindow.everything()
+        known = self._heads.get((topic, span))
+        if known is None and (days := _whole_days(window)).stop - days.start <= _FEW_DAYS_NS:
+            span = days
+            known = self._heads.get((topic, span))
         if known is None or known.coverage is not coverage:
             failures = self.store.failures
             heads: list[PartHead] = []
             if known is not None and known.coverage.state.deletion == state.deletion:
                 heads = [*known.heads]
             if known is None or known.coverage.state != state:
-                heads += self.store.parts(topic, max((head.number for head in heads), default=0))
+                newest = max((head.number for head in heads), default=0)
+                heads += self.store.parts(topic, span, newest)
                 heads.sort(key=lambda head: (head.first, head.number))
             known = _Heads.of(heads, coverage)
             if self.store.failures == failures:
-                self._heads.put(topic, known, 1000 + _HEAD_BYTES * len(heads))
+                self._heads.put((topic, span), known, 1000 + _HEAD_BYTES * len(heads))
         return known.within(window)
 
     def matching(

@@ -42,7 +42,7 @@ from ros2_memory.columns.writing import (
 )
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
-from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ if TYPE_CHECKING:
 FILE: Final = "columns.sqlite"
 CATALOGUE: Final = "catalogue.sqlite"
 """The file of digests that lay in its place in versions before it."""
+_ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 
@@ -93,7 +94,7 @@ CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TE
 CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
   first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
   bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, whole INTEGER NOT NULL);
-CREATE INDEX part_of_topic ON part (topic);
+CREATE INDEX part_of_topic ON part (topic, first_ns, last_ns);
 CREATE INDEX part_not_whole ON part (id) WHERE NOT whole;
 CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
   data BLOB, UNIQUE (part, path));
@@ -360,20 +361,21 @@ class ColumnStore(Database):
         found = known.get(number) if offset == self.offset else None
         return found or self.topics().get(number)
 
-    def parts(self, topic: str, after: int = 0) -> list[PartHead]:
+    def parts(self, topic: str, span: TimeWindow = _ALL_TIME, after: int = 0) -> list[PartHead]:
         """Returns the parts of a topic, of all its types, in the order of their first messages.
 
         Args:
             topic: its name.
+            span: of log time.
             after: a part; those that are newer are returned.
         """
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
                 "SELECT id, topic, first_ns, last_ns, bags, messages, dropped, whole FROM part"
-                " WHERE topic IN (SELECT id FROM topic WHERE name = ?) AND id > ?"
-                " ORDER BY first_ns, id",
-                (topic, max(after - self.offset, 0)),
+                " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
+                " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
+                (topic, span.stop, span.start, max(after - self.offset, 0)),
             )
             return [
                 PartHead(

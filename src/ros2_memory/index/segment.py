@@ -151,32 +151,38 @@ class Segment:
         return all(bag.state is BagState.CLOSED for bag in self.bags)
 
     @cached_property
+    def _folder_rows(self) -> tuple[list[str], NDArray[np.uint16]]:
+        """The folders of the bags, and the number of each bag's among them."""
+        known: dict[str, int] = {}
+        numbers = [known.setdefault(folder_of(bag), len(known)) for bag in self.bags]
+        return [*known], np.array(numbers, np.uint16)
+
+    @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
-        return frozenset(map(folder_of, self.bags))
+        return frozenset(self._folder_rows[0])
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        spans: dict[str, Span] = {}
-        for bag in self.bags:
-            folder = folder_of(bag)
-            spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
-        return spans
+        folders, of = self._folder_rows
+        firsts = [bag.start for bag in self.bags]
+        lasts = [bag.end for bag in self.bags]
+        return dict(zip(folders, _spans_of(len(folders), of, firsts, lasts), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        counts = np.zeros(len(self.bags), np.int64)
+        folders, of = self._folder_rows
+        tallies = np.zeros((len(folders), 3), np.int64)
+        messages = np.zeros(len(self.bags), np.int64)
         for _, rows, numbers in _columns(self).groups:
-            counts[rows] = numbers[:, :, 0].sum(axis=1)
-        found: dict[str, list[int]] = {}
-        for bag, messages in zip(self.bags, counts.tolist(), strict=True):
-            tally = found.setdefault(folder_of(bag), [0, 0, 0])
-            tally[0] += 1
-            tally[1] += messages
-            tally[2] += bag.size
-        return {folder: Tally(*tally) for folder, tally in found.items()}
+            messages[rows] = numbers[:, :, 0].sum(axis=1)
+        sizes = np.array([bag.size for bag in self.bags], np.int64)
+        np.add.at(tallies, of, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
+        return {
+            folder: Tally(*tally) for folder, tally in zip(folders, tallies.tolist(), strict=True)
+        }
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
@@ -231,22 +237,16 @@ class Segment:
         column = _columns(self).of(topic)
         if column is None:
             return {}
-        recordings, numbers = self._recordings
-        of = numbers[column.bags]
-        firsts, lasts = np.full(len(recordings), MAX_NS), np.full(len(recordings), MIN_NS)
-        np.minimum.at(firsts, of, column.firsts)
-        np.maximum.at(lasts, of, column.lasts)
-        spans = [*zip(firsts.tolist(), lasts.tolist(), strict=True)]
-        return {recordings[number]: spans[number] for number in dict.fromkeys(of.tolist())}
+        of = self._folder_rows[1][column.bags]
+        spans = _spans_of(len(self._recordings), of, column.firsts, column.lasts)
+        return {self._recordings[number]: spans[number] for number in dict.fromkeys(of.tolist())}
 
     @cached_property
-    def _recordings(self) -> tuple[list[Path], NDArray[np.uint16]]:
-        """The recordings of the bags, and the number of each bag's among them."""
-        known: dict[str, int] = {}
-        numbers = [known.setdefault(folder_of(bag), len(known)) for bag in self.bags]
-        first = [numbers.index(number) for number in range(len(known))]
+    def _recordings(self) -> list[Path]:
+        """The recordings of the bags, as their folders are numbered."""
         # A path for each bag of a week would take longer than all else.
-        return [self.bags[row].recording for row in first], np.array(numbers, np.uint16)
+        first = np.unique(self._folder_rows[1], return_index=True)[1].tolist()
+        return [self.bags[row].recording for row in first]
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
@@ -307,7 +307,7 @@ class Segment:
     @cached_property
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
-        return _presences_of(self.bags)
+        return _presences_of(self)
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -344,6 +344,16 @@ def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, N
     """Adds totals of a type to those that are known."""
     known, added = totals.get(type_name), TopicTotals(*more)
     totals[type_name] = added if known is None else known | added
+
+
+def _spans_of(
+    count: int, of: NDArray[np.uint16], firsts: Sequence[Ns] | _Times, lasts: Sequence[Ns] | _Times
+) -> list[Span]:
+    """Returns the first and the last time of each of so many folders, given that of each row."""
+    spans = np.full(count, MAX_NS), np.full(count, MIN_NS)
+    np.minimum.at(spans[0], of, firsts)
+    np.maximum.at(spans[1], of, lasts)
+    return [*zip(spans[0].tolist(), spans[1].tolist(), strict=True)]
 
 
 def folder_of(bag: BagFile) -> str:
@@ -413,9 +423,9 @@ def _columns(segment: Segment) -> _Columns:
 # the numbers of all bags and topics of a segment at a time.
 
 
-def _presences_of(bags: Sequence[BagFile]) -> dict[str, Presence]:
+def _presences_of(segment: Segment) -> dict[str, Presence]:
     """Returns by topic when the bags hold it, and how often; a topic's types count together."""
-    groups = _Columns(bags).groups
+    bags, groups = segment.bags, _columns(segment).groups
     topics = sorted({topic for schema, _, _ in groups for topic in schema.positions})
     at = {topic: column for column, topic in enumerate(topics)}
     counts, firsts, lasts = _tables((len(bags), len(topics)), groups, at)

@@ -8,12 +8,13 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.units import GoneError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
@@ -27,12 +28,12 @@ S = 10**9
 T0 = 1_700_000_000 * S
 
 
-def cut(bag_dir: Path, cuts: list[int], count: int = 40) -> None:
+def cut(bag_dir: Path, cuts: list[int], count: int = 40, each: int = 50 * S) -> None:
     """One recording of one robot, cut into splits at these messages."""
     messages = [
         message
         for n in range(count)
-        for message in (odom(T0 + n * 50 * S, n / 3, -n / 7), text(T0 + n * 50 * S + 1, f"w{n}"))
+        for message in (odom(T0 + n * each, n / 3, -n / 7), text(T0 + n * each + 1, f"w{n}"))
     ]
     edges = [0, *sorted({*cuts}), len(messages)]
     for number, (begin, end) in enumerate(pairwise(edges)):
@@ -66,6 +67,33 @@ def test_bags_that_are_not_stored_are_left_out_where_that_is_asked(tmp_path: Pat
     assert [*scan(View(without, Call()), "/odom", EVERYTHING, stored=True)] == []
 
 
+@pytest.mark.parametrize("whole_first", [False, True])
+def test_windows_of_hours_and_of_all_time_have_the_same_rows(
+    tmp_path: Path, *, whole_first: bool
+) -> None:
+    hours = 6 * 3600 * S
+    cut(tmp_path, [9, 30, 31, 60], each=hours)  # ten days
+    world = World.of(tmp_path)
+    bags = world.memory.index.snapshot().timeline.bags
+    edges = [T0 + nth * hours + 1 for nth in range(-1, 41)]
+    windows = [TimeWindow(*pair) for pair in pairwise(edges)]
+
+    def check() -> None:
+        if whole_first:
+            assert check_rows(world, "/odom") == 40
+        assert sum(check_rows(world, "/odom", window) for window in windows) == 40
+        assert check_rows(world, "/odom") == 40
+
+    world.fill_alone(bags[:2])
+    check()
+    world.fill()
+    check()
+    [first, *_] = sorted(world.store.paths())
+    assert world.store.delete([first])
+    assert first not in world.store.paths()
+    check()
+
+
 def test_parts_that_another_process_makes_meanwhile_hide_no_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -75,9 +103,9 @@ def test_parts_that_another_process_makes_meanwhile_hide_no_row(
     assert check_rows(world, "/odom") == 40
     parts = world.store.parts
 
-    def after_a_merge(topic: str, after: int = 0) -> list[PartHead]:
+    def after_a_merge(*asked: Any) -> list[PartHead]:
         other.fill()
-        return parts(topic, after)
+        return parts(*asked)
 
     world = replace(world, memory=replace(world.memory, columns=Scanner(world.store, tmp_path)))
     monkeypatch.setattr(world.store, "parts", after_a_merge)
