@@ -51,7 +51,7 @@ CACHE_MB: Final = 48
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
-"""Of so much what is known of parts is read for itself."""
+"""Of windows up to this long, only the parts of the days that they touch are looked up."""
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 

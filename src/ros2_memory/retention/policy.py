@@ -380,22 +380,23 @@ def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
     old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
     by_recording = frozenset(bag.path for bag in stock.bags if bag.recording in old)
     doubtful = {bag.path for bag in stock.bags if bag.recording in stock.doubtful}
-    by_dates = _aged(stock.bags, eras, max_age_ns) - doubtful | by_recording & doubtful
+    by_dates = _aged(stock, eras, max_age_ns) - doubtful | by_recording & doubtful
     return Ages(frozenset(by_dates), by_recording)
 
 
-def _aged(bags: Sequence[StoredBag], eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
+def _aged(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
     """Returns the bags that are too old compared with the newest of their era, by their dates.
 
+    Dates in the future, of a clock that was ahead for a while, make no other bag older.
     An undated bag belongs to the present era if it was written in it, else to none.
     """
     aged: set[str] = set()
     for era in eras:
-        oldest = max(bag.end for bag in era) - max_age_ns
+        oldest = min(max(bag.end for bag in era), stock.now) - max_age_ns
         aged.update(bag.path for bag in era if bag.end < oldest)
         if era is eras[-1]:
             begun = min(bag.start for bag in era)
-            undated = _without(bags, *eras)
+            undated = _without(stock.bags, *eras)
             aged.update(bag.path for bag in undated if begun <= bag.written < oldest)
     return aged
 

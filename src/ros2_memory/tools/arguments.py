@@ -338,7 +338,7 @@ _Between: TypeAlias = Annotated[
     WithJsonSchema(
         {
             "type": "string",
-            "description": "Local 19:00-22:00; a reply a day.",
+            "description": "e.g. 19:00-22:00, local; each day.",
             "examples": ["19:00-22:00"],
         }
     ),
@@ -471,13 +471,13 @@ class RecapTime(TimeArgument):
     around_s: _Until | None = Field(
         default=None,
         alias="around",
-        description="What changed just before and after.",
+        description="What changed before and after.",
         examples=[1784023230],
     )
     before_s: Annotated[
         _Positive,
         AfterValidator(partial(_check_most, LONGEST_REASON_S)),
-        Field(description="Before around."),
+        Field(description="How far before it."),
     ] = Field(default=10, alias="seconds_before")
 
 
@@ -645,7 +645,7 @@ class VisitsArguments(Arguments):
     where: _Where | None = None
     start_s: _Start = None
     end_s: _End = None
-    frame_id: Annotated[_Name, Field(description="Of x and y; default: the map.")] | None = None
+    frame_id: Annotated[_Name, Field(description="Of x, y; default: the map.")] | None = None
     radius_m: Annotated[_Positive, Field(description="Radius, m.")] | None = None
     limit: _Limit = 10
     by: _By | None = None

@@ -130,20 +130,20 @@ class Signature:
         more = len(problems) - _MAX_PROBLEMS_NAMED
         raise InvalidArgumentsError(
             "; ".join(problems[:_MAX_PROBLEMS_NAMED])
-            + (f"; and {more} more wrong arguments" if more > 0 else "")
+            + (f"; and {more} more problems" if more > 0 else "")
         )
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
         names = ", ".join(self._properties)
         known = f"the arguments are: {names}" if names else "the tool takes none"
         unknown = (name for name in given if name not in self._properties)
-        is_told = True
+        lacks_hint = False
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
             near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
             hint = f"; do you mean {near[0]}?" if near else ""
             yield f"unknown argument {abbreviate(name)}{hint}"
-            is_told = is_told and bool(near)
-        if not is_told:
+            lacks_hint = lacks_hint or not near
+        if lacks_hint:
             yield known
         if more := sum(1 for _ in unknown):
             yield f"and {more} more unknown arguments"

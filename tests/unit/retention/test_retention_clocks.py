@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import RECORDED_FILE
@@ -176,7 +176,7 @@ def too_old_by_dates(bags: list[StoredBag], now: int, max_age: int) -> set[str]:
             if further <= reach:
                 break
             reach = further
-        newest[bag.path] = reach
+        newest[bag.path] = min(reach, now)
     old = {bag.path for _, end, bag in dated if end < newest[bag.path] - max_age}
     if dated:
         last = max(newest.values())
@@ -282,6 +282,19 @@ events = st.one_of(
 @given(
     st.lists(st.tuples(events, st.booleans()), min_size=1, max_size=14),
     st.none() | st.integers(0, 30),
+)
+@example(  # a clock that was ahead dates the newest bag a minute after now
+    [
+        (("record", 1, 25 * MINUTE), False),
+        (("no clock", 0, 0), False),
+        (("record", 3, 0), False),
+        (("set", 0, 0), False),
+        (("record", 5, 0), True),
+        (("record", 12, 0), False),
+        (("record", 3, -25 * MINUTE), False),
+        (("record", 1, 25 * MINUTE), True),
+    ],
+    None,
 )
 @settings(deadline=None)
 def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(

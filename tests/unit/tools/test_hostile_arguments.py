@@ -93,7 +93,7 @@ def test_many_wrong_arguments_are_told_in_few_words(dispatcher: Dispatcher) -> N
     wrong = {name: float("nan") for name in TOOLS["find_matches"]["properties"]}
     shown = held(asked(dispatcher, "find_matches", wrong))
     assert shown["error"] == "invalid_arguments"
-    assert re.search(r"; and \d more wrong arguments$", shown["detail"])
+    assert re.search(r"; and \d more problems$", shown["detail"])
 
 
 @pytest.mark.parametrize(
