@@ -16,8 +16,8 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.memory.index import MOST_BAGS
-from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.index import MOST_BAGS
+from ros2_memory.lake.memory import lake_memory
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
 from ros2_memory.serving.backfill import make_fragments
@@ -64,11 +64,11 @@ def lake_robots(
     *,
     days: int = 31,
     most_bags: int = MOST_BAGS,
-) -> dict[str, LakeRobot]:
+) -> dict[str, Memory]:
     """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
     lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
     return {
-        name: LakeRobot(
+        name: lake_memory(
             lake,
             name,
             clock,
@@ -87,9 +87,8 @@ def lake_robots(
     }
 
 
-def store_columns(robot: LakeRobot) -> Filling:
+def store_columns(memory: Memory) -> Filling:
     """Fills the store of a lake's robot, as a server does; returns what filled it."""
-    memory = robot.memory
     filling = Filling(
         memory.columns,
         memory.reader,

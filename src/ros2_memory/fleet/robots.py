@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -15,7 +16,7 @@ from ros2_memory.core.errors import (
     RefusedError,
 )
 from ros2_memory.core.text import abbreviate, listed
-from ros2_memory.core.timebase import MIN_NS, Clock
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -52,24 +53,6 @@ class FromLake(NamedTuple):
     notes: tuple[str, ...] = ()
 
 
-class LakeSource(Protocol):
-    """What a lake has of one robot."""
-
-    @property
-    def memory(self) -> Memory:
-        """The robot's memory over its rows, always the same one."""
-
-    @property
-    def latest(self) -> Ns | None:
-        """The log time of the newest message that was shipped; None if there is none."""
-
-    def notes(self, begin: Ns | None = None) -> Iterable[str]:
-        """Returns the notes for the answer that this thread has just computed.
-
-        `begin` is from when (log time) the answer is; None for one that is of all days.
-        """
-
-
 class Robot:
     """One robot of a fleet. Its memory is built when it is first needed; no bag is read for that.
 
@@ -77,13 +60,11 @@ class Robot:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
         build: what builds its memory.
-        lake: what a lake has of it, which is asked first.
+        lake: its memory over what was shipped to a lake.
         is_mounted: whether there is a memory besides that of the lake.
 
     Attributes:
-        name: see above.
-        bag_dir: see above.
-        is_mounted: see above.
+        name: see above; likewise `bag_dir`, `lake` and `is_mounted`.
     """
 
     def __init__(
@@ -92,14 +73,14 @@ class Robot:
         bag_dir: Path,
         build: Callable[[], Memory],
         *,
-        lake: LakeSource | None = None,
+        lake: Memory | None = None,
         is_mounted: bool = True,
     ) -> None:
         self.name = name
         self.bag_dir = bag_dir
+        self.lake = lake
         self.is_mounted = is_mounted
         self._build = build
-        self._lake_source = lake
         self._lock = threading.Lock()
         self._memory: Memory | None = None
 
@@ -110,56 +91,41 @@ class Robot:
                 self._memory = self._build()
             return self._memory
 
-    @property
-    def lake_memory(self) -> Memory | None:
-        """Its memory over what was shipped to a lake; None without one."""
-        return None if self._lake_source is None else self._lake_source.memory
-
     def asked(
         self,
-        ask: Callable[[Memory], T],
+        ask: Callable[[Memory, Call], T],
+        call: Call,
         *,
-        lake: bool,
+        lake_first: bool,
         begin_of: Callable[[T, Ns], Ns | None] = lambda *_: None,
     ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
-        With `lake` the memory of the lake comes first, where it has anything of the robot; the
-        mounted one answers what needs messages that the lake does not have. Without `lake` the
-        mounted one comes first, unless it has no bag; the lake answers where it has no data, as
-        retention deletes bags. `begin_of` returns from when an answer is, by it and the newest log
-        time.
+        With `lake_first` the lake answers, where it has anything of the robot; the mounted memory
+        does where that needs messages that the lake does not have. Without, the mounted one does,
+        unless it has no bag, and the lake where that has no data, as retention deletes bags.
+        `begin_of` returns from when an answer is, by it and the newest log time.
 
         Raises:
             NoDataError: none of the two has an answer; it is that of the mounted one, if any.
             NotInLakeError: it needs such messages, and the robot has no bags of its own.
         """
-        source = self._lake_source
-        if source is None:
-            return ask(self.memory()), None
-        if not lake and self._has_bags():
-            return self._own_first(source, ask, begin_of)
+        lake = self.lake
+        if lake is None:
+            return ask(self.memory(), call), None
+        if lake_first or not self._has_bags():
+            if not self.is_mounted or lake.index.snapshot().latest is not None:
+                try:
+                    return _of_lake(lake, ask, call, begin_of)
+                except NotInLakeError:
+                    if not self._has_bags():
+                        raise
+            return ask(self.memory(), call), None
         try:
-            found = _of_lake(source, ask, begin_of)
-            if source.latest is not None or not self.is_mounted:
-                return found
-        except NoDataError:
-            if source.latest is not None or not self.is_mounted:
-                raise
-        except NotInLakeError:
-            if not self._has_bags():
-                raise
-        return ask(self.memory()), None
-
-    def _own_first(
-        self, source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
-    ) -> tuple[T, FromLake | None]:
-        """Returns what the mounted memory has; where it has no data, what the lake has."""
-        try:
-            return ask(self.memory()), None
+            return ask(self.memory(), call), None
         except NoDataError as error:
             try:
-                return _of_lake(source, ask, begin_of)
+                return _of_lake(lake, ask, call, begin_of)
             except NoDataError:
                 raise error from None
             except (RefusedError, LakeError, QueryTimeoutError) as failure:
@@ -184,21 +150,36 @@ class Robot:
 
 
 def _of_lake(
-    source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
+    lake: Memory,
+    ask: Callable[[Memory, Call], T],
+    call: Call,
+    begin_of: Callable[[T, Ns], Ns | None],
 ) -> tuple[T, FromLake]:
     """Returns what `ask` finds in a lake, with its notes; raises what it raises."""
-    begin: Ns | None = None
+    call.older = MAX_NS
     try:
-        try:
-            found = ask(source.memory)
-            if source.latest is not None:
-                begin = begin_of(found, source.latest)
-        finally:
-            # Also of an answer that failed: they are not those of the next one.
-            notes = (*source.notes(begin),)
+        found = ask(lake, call)
     except NoDataError as error:
-        raise NoDataError(error.reason, "; ".join((error.detail, *notes)), error.notes) from error
-    return found, FromLake(source.latest, notes)
+        raise NoDataError(
+            error.reason, "; ".join((error.detail, *_unseen(call, None))), error.notes
+        ) from error
+    published = lake.index.published
+    latest = None if published is None else published.latest
+    begin = None if latest is None else begin_of(found, latest)
+    return found, FromLake(latest, _unseen(call, begin))
+
+
+def _unseen(call: Call, begin: Ns | None) -> tuple[str, ...]:
+    """Returns the note on days that an answer from `begin` on would need, and was not shown."""
+    older = call.older
+    if older is None or older == MAX_NS or (begin is not None and begin > older):
+        return ()
+    since = datetime.fromtimestamp((older + 1) // NS_PER_S, tz=UTC).date()
+    note = (
+        f"the lake has days before {since}, which were not looked at: an end (or before, or a "
+        "time) there has them looked at"
+    )
+    return (note,)
 
 
 class Fleet:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.fleet.robots import Fleet, FromLake
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Answer, OneAnswer
+    from ros2_memory.results import OneAnswer
     from ros2_memory.tools.declaration import Question, Tool
 
 ROBOT: Final = "robot"
@@ -152,8 +152,9 @@ class _FleetQuestions:
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
             answer, lake = robot.asked(
-                lambda memory: _single(_answer(asked.question, memory, own)),
-                lake=self._is_of_lake,
+                partial(_answer, asked.question),
+                own,
+                lake_first=self.tool.name in OF_LAKE,
                 begin_of=partial(_begin_of, asked.given),
             )
             return answer, lake, own.now
@@ -164,10 +165,6 @@ class _FleetQuestions:
         answer, lake, now = found
         notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
         return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
-
-    @property
-    def _is_of_lake(self) -> bool:
-        return self.tool.name in OF_LAKE
 
     def _of_all(self, asked: _Asked, call: Call) -> OfFleet:
         robots, given = self.fleet.allowed(call), asked.given
@@ -207,12 +204,13 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(memory: Memory) -> tuple[RobotReply, OneAnswer]:
+        def ask(memory: Memory, call: Call) -> tuple[RobotReply, OneAnswer]:
             return self._replied(asked.question, replace(memory, clock=now), page, robot, call)
 
         (reply, _), lake = robot.asked(
             ask,
-            lake=self._is_of_lake,
+            call,
+            lake_first=self.tool.name in OF_LAKE,
             begin_of=lambda found, latest: _begin_of(asked.given, found[1], latest),
         )
         return replace(reply, lake=lake)
@@ -228,7 +226,7 @@ class _FleetQuestions:
         is_ahead = latest is not None and latest > memory.clock.now() + _AHEAD_NS
         # Rows of those whose clock is ahead come last, whenever they are.
         call.rows_in = None if is_ahead else page.window()
-        answer = _single(_answer(question, memory, call))
+        answer = _answer(question, memory, call)
         if isinstance(answer, Sightings) and not is_ahead:
             page.add(each.last for each in answer.sightings)
             page.add(each.until for each in answer.episodes)
@@ -257,13 +255,10 @@ def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns) -> Ns 
     return latest - ns_from_unix(last_s) if isinstance(last_s, int | float) else None
 
 
-def _answer(question: Question, memory: Memory, call: Call) -> Answer:
+def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:
     """Returns a robot's answer, in the thread that it is asked in."""
     with call.reading(memory.large):
-        return question(memory, call)
-
-
-def _single(answer: Answer) -> OneAnswer:
+        answer = question(memory, call)
     if isinstance(answer, OfRobot | OfFleet):
         raise TypeError("a tool of one robot answered for several")
     return answer

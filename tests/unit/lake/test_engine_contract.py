@@ -18,8 +18,8 @@ from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.files import Lake
+from ros2_memory.lake.rows import taken_apart
 from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables
-from ros2_memory.lake.typed_values import taken_apart
 
 DAY = date(2026, 11, 20)
 ROBOTS = ("attic", "hall", "it's")
@@ -154,9 +154,7 @@ def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
     now = TABLES["messages"]
     before = replace(now, columns=dict(islice(now.columns.items(), len(now.columns) - len(MAPS))))
     catalog.create_namespace(NAMESPACE)
-    table = catalog.create_table(
-        f"{NAMESPACE}.messages", before.schema(), partition_spec=before.partition()
-    )
+    table = before.create(catalog, f"{NAMESPACE}.messages")
     old = {"robot": "hall", "bag_id": "one", "day": DAY, "topic": "/a", "time_ns": 1}
     table.append(before.filled([{**old, "value": '{"x":1,"on":null}'}]))
     value: JsonValue = {"x": 2, "on": True, "y": 0.5, "name": "ß", "list": [1]}

@@ -17,17 +17,19 @@ from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.forgetting import Forgotten, forget_in_lake
+from ros2_memory.lake.forgetting import (
+    TOMBSTONES_FILE,
+    Forgotten,
+    Tombstone,
+    append_tombstone,
+    forget_in_lake,
+    read_tombstones,
+)
 from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.shipper import Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.tombstones import (
-    TOMBSTONES_FILE,
-    Tombstone,
-    append_tombstone,
-    read_tombstones,
-)
 from ros2_memory.lake.upkeep import compact, expire
+from ros2_memory.lake.warehouse import LakeTables
 from ros2_memory.lake.written_files import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
@@ -64,16 +66,14 @@ def tombstone(number: int = 7) -> Tombstone:
 def forget(lake: Path, what: Tombstone) -> Forgotten:
     where = location(lake)
     append_tombstone(where.state_dir, what, done=False)
-    with where.opened() as catalog:
-        return forget_in_lake(where, where.tables(catalog, TABLES), what, LATER)
+    with where.writable() as tables:
+        return forget_in_lake(tables, what)
 
 
 def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
     where = location(lake)
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
+    with where.writable() as tables:
         return Shipper(
-            where,
             tables,
             [robot_bags("hall", bag_dir)],
             FixedClock(LATER),
@@ -257,19 +257,19 @@ def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
     write_bag(bag_dir, 0)
     ship(lake, [robot_bags("hall", bag_dir)])
     secret_bag(bag_dir)
-    overwrite = Shipper._overwrite
+    replace = LakeTables.replace
 
-    def killed(self: Shipper, name: str, *given: object) -> None:
+    def killed(self: LakeTables, name: str, *given: object) -> None:
         if name == "bags":
             raise LakeError("killed")
-        overwrite(self, name, *given)  # type: ignore[arg-type]
+        replace(self, name, *given)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patched:
-        patched.setattr(Shipper, "_overwrite", killed)
+        patched.setattr(LakeTables, "replace", killed)
         with pytest.raises(LakeError):
             ship(lake, [robot_bags("hall", bag_dir)])
     assert files_with(lake, MARKER)
-    assert forget(lake, tombstone()).bags == 0
+    assert forget(lake, tombstone()).bags == 1
     assert files_with(lake, MARKER) == []
 
 
@@ -277,9 +277,8 @@ def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     secret_bag(bag_dir)
     ship(lake, [robot_bags("hall", bag_dir)])
-    where = location(lake)
-    with where.opened() as catalog:
-        table = where.tables(catalog, ["messages"])["messages"]
+    with location(lake).writable() as tables:
+        table = tables.current("messages")
         snapshot = table.current_snapshot()
         assert snapshot is not None
         table.manage_snapshots().create_tag(snapshot.snapshot_id, "audit").commit()
@@ -298,11 +297,10 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     where = location(lake)
     files = {path for path in lake.rglob("*") if path.is_file()}
     now = max(each.at for each in WRITTEN.rows(where.state_dir)) + NS_PER_S
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
-        assert expire(where, tables, now, DAY_NS) == 0
+    with where.writable() as tables:
+        assert expire(tables, now - DAY_NS) == 0
         assert {path for path in lake.rglob("*") if path.is_file()} == files
-        assert expire(where, tables, now + DAY_NS, DAY_NS) > 10
+        assert expire(tables, now) > 10
     assert foreign.exists()
     assert len(lake_column(lake, "messages", "texts")) == 2
 
@@ -318,18 +316,16 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) ->
         ship(lake, [robot_bags(robot, tmp_path / robot) for robot in robots])
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
     values = lake_column(lake, "messages", "texts")
-    where = location(lake)
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
-        messages = tables["messages"].refresh()
+    with location(lake).writable() as tables:
+        messages = tables.current("messages")
         versions = len(messages.snapshots())
-        assert compact(where, tables, (START_S + 3600) * NS_PER_S) == 0
-        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
+        assert compact(tables, (START_S + 3600) * NS_PER_S) == 0
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
         files = Counter(task.file.partition[0] for task in messages.refresh().scan().plan_files())
         assert files == {"hall": 1, "roof": 1, "yard": 1}
         # What was deleted, and what was written instead.
         assert len(messages.snapshots()) == versions + 2
-        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values
 

@@ -182,7 +182,7 @@ async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: P
     fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
     assert fleet is not None
     robots = [*fleet.robots.values()]
-    indexes = [each.lake_memory.index for each in robots if each.lake_memory is not None]
+    indexes = [each.lake.index for each in robots if each.lake is not None]
     assert [each.published for each in indexes] == [None, None]
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:

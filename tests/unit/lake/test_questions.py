@@ -19,7 +19,6 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.fleets import LENGTH_S, SEEN, fleet_memory, seeded, write_robot
@@ -38,7 +37,7 @@ class Robots(NamedTuple):
 
     mounted: Fleet
     lake: Fleet
-    of_lake: dict[str, LakeRobot]
+    of_lake: dict[str, Memory]
 
 
 @pytest.fixture(scope="module")
@@ -60,11 +59,8 @@ def robots(
     return asked_both_ways(memories, lake_robots(catalog, engine, [*memories]))
 
 
-def asked_both_ways(memories: dict[str, Memory], of_lake: dict[str, LakeRobot]) -> Robots:
-    over_lake = {name: each.memory for name, each in of_lake.items()}
-    return Robots(
-        fleet_of(memories, shared_map=True), fleet_of(over_lake, shared_map=True), of_lake
-    )
+def asked_both_ways(memories: dict[str, Memory], of_lake: dict[str, Memory]) -> Robots:
+    return Robots(fleet_of(memories, shared_map=True), fleet_of(of_lake, shared_map=True), of_lake)
 
 
 def reply(fleet: Fleet, name: str, given: dict[str, object]) -> Any:

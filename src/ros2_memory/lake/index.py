@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
@@ -16,7 +17,6 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.partitions import newest
 from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.partitions import Days, LakeFile
+    from ros2_memory.lake.files import Days, Lake, LakeFile
     from ros2_memory.retention.foreign import Foreign
 
 MOST_BAGS: Final = 45_000
@@ -115,6 +114,24 @@ class _Window:
     files: Mapping[str, tuple[LakeBag, BagFile]] = field(default_factory=dict)
 
 
+def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
+    """Returns the newest days with rows up to one, and the one before them, if there is one.
+
+    They are those of `fewest` days, and more while all have at most `rows` rows.
+    """
+    order = [*days]
+    begin = end = bisect_right(order, until)
+    total = 0
+    while begin:
+        day = order[begin - 1]
+        total += sum(file.rows for file in days[day])
+        if total > rows and day <= order[end - 1] - timedelta(days=fewest):
+            break
+        begin -= 1
+    found = {day: days[day] for day in order[begin:end]}
+    return found, order[begin - 1] if begin else None
+
+
 class LakeIndex:
     """What a lake has of one robot, as of some seconds ago. Thread-safe.
 
@@ -155,7 +172,6 @@ class LakeIndex:
         self._newest = _Window()
         self._older: dict[date, _Window] = {}
         self._snapshot: Snapshot | None = None
-        self._asked = threading.local()
 
     @property
     def published(self) -> Snapshot | None:
@@ -177,7 +193,6 @@ class LakeIndex:
         if reach is not None and window.since is not None and day_of(reach) < window.since:
             window = self._window_before(day_of(reach))
             known = replace(known, timeline=window.timeline, older=window.older)
-        self._note(window)
         return known
 
     def refresh(self) -> Snapshot:
@@ -196,15 +211,6 @@ class LakeIndex:
                 older=self._newest.older,
             )
             return self._snapshot
-
-    def unseen_before(self) -> date | None:
-        """Returns before which day the lake has days that this thread was not shown since it asked.
-
-        None where it was shown all.
-        """
-        found: date = getattr(self._asked, "since", date.min)
-        self._asked.since = date.max
-        return found if date.min < found < date.max else None
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -227,10 +233,6 @@ class LakeIndex:
                 return found
         raise BagVanishedError(str(path), "it is not in the lake any more")
 
-    def _note(self, window: _Window) -> None:
-        known: date = getattr(self._asked, "since", date.max)
-        self._asked.since = min(known, window.since or date.min)
-
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
         with self._lock:
@@ -240,7 +242,7 @@ class LakeIndex:
             last = max(own, default=day)
             window = self._window(own, before, self._older.get(last, _Window()))
             # A new dict: other threads look for the bags of their answers in the old one.
-            others = [each for each in self._older.items() if each[0] != last]
+            others = [known for known in self._older.items() if known[0] != last]
             self._older = dict([*others[1 - _MOST_WINDOWS :], (last, window)])
             return window
 
@@ -262,7 +264,7 @@ class LakeIndex:
         if days.keys() == made_of.keys() == known.days.keys():
             return bounds
         paths = _Paths(known.files)
-        days |= self._read({day: each for day, each in made_of.items() if day not in days}, paths)
+        days |= self._read({day: made_of[day] for day in made_of if day not in days}, paths)
         files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
         before = {file: bag for file, (_, bag) in known.files.items()}
         now = {file: bag for file, (_, bag) in files.items()}

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.memory.index import LakeBag, LakeIndex
+    from ros2_memory.lake.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Batch, Definition, Record
 
 _MOST_ALONE: Final = 2
