@@ -207,7 +207,7 @@ class Fleet:
         shared_map: bool = False,
         join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
     ) -> None:
-        self.robots: Mapping[str, Robot] = {each.name: each for each in robots}
+        self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
         self.clock = clock
         self.shared_map = shared_map
         self.grows = join is not None
@@ -225,13 +225,13 @@ class Fleet:
         with self._lock:
             found = [*self._join(self.robots)]
             # A new dict: other threads iterate over the old one.
-            self.robots = {**self.robots, **{each.name: each for each in found}}
+            self.robots = {**self.robots, **{robot.name: robot for robot in found}}
         return found
 
     def allowed(self, call: Call) -> list[Robot]:
         """Returns the robots that a call may ask about, in the order of the configuration."""
         robots = call.robots
-        return [each for name, each in self.robots.items() if robots is None or name in robots]
+        return [robot for name, robot in self.robots.items() if robots is None or name in robots]
 
     def named(self, name: object, call: Call) -> Robot:
         """Returns the robot of a name.
@@ -244,31 +244,17 @@ class Fleet:
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
-        for each in allowed:
-            if each.name == name:
-                return each
+        for robot in allowed:
+            if robot.name == name:
+                return robot
         raise InvalidArgumentsError(
             f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
-        )
-
-    def the_one(self, tool: str, call: Call) -> Robot:
-        """Returns the only robot that a call may ask about.
-
-        Raises:
-            InvalidArgumentsError: there are several; the sentence names them.
-        """
-        allowed = self.allowed(call)
-        if len(allowed) == 1:
-            return allowed[0]
-        example = f", e.g. robot={allowed[0].name}" if allowed else ""
-        raise InvalidArgumentsError(
-            f"which robot? {tool} answers for one: pass robot{example}; there {names_of(allowed)}"
         )
 
 
 def names_of(robots: Iterable[Robot]) -> str:
     """Returns the names of robots for a sentence."""
-    names = [each.name for each in robots]
+    names = [robot.name for robot in robots]
     if not names:
         return "is none"
     return f"{'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"

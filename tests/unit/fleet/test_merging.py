@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.errors import EpisodicError, QueryTimeoutError, RefusedError
 from ros2_memory.fleet.merging import RobotReply, merged
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ NAMES = st.lists(
 
 
 def reply_of(tool: str, replies: Sequence[RobotReply], **how: Any) -> dict[str, Any]:
-    failures: Mapping[str, str] = how.pop("failures", {})
+    failures: Mapping[str, EpisodicError] = how.pop("failures", {})
     found = merged(tool, replies, failures, max_chars=how.pop("max_chars", MANY), **how)
     assert json.loads(json.dumps(found)) == found
     return found
@@ -204,9 +205,14 @@ def test_rows_that_are_too_long_together_are_given_shortly() -> None:
 
 
 def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
-    failures = {"r1": "the disk is gone", "r2": "too slow", "r3": "the disk is gone"}
+    failures = {
+        "r1": RefusedError("the disk is gone"),
+        "r2": QueryTimeoutError("too slow"),
+        "r3": RefusedError("the disk is gone"),
+    }
     found = reply_of("find_things", [RobotReply("r4", {"things": []})], failures=failures)
     assert found["notes"] == [
         "no answer of r1, r3: the disk is gone",
         "no answer of r2: too slow",
     ]
+    assert found["robots_failed"] == {"r1": "refused", "r2": "timeout", "r3": "refused"}

@@ -274,6 +274,16 @@ class TestWhichRobot:
         found = reply(fleet_over(folder, ("r3",)), "list_frames", {})
         assert found["robot_name"] == "r3"
 
+    def test_several_that_are_named_answer_as_all_do(self, folder: Path) -> None:
+        fleet = fleet_over(folder, NAMES)
+        some: dict[str, object] = {"robot": "r3, r1"}
+        found = reply(fleet, "find_matches", {**LAST, **some})
+        assert found == reply(fleet_over(folder, ("r1", "r3")), "find_matches", LAST)
+        rows = reply(fleet, "memory_status", some)["robots"]
+        assert {row["robot_name"] for row in rows} == {"r1", "r3"}
+        for robot, said in (("r1, r9", "no robot"), ("r1, r2", "which robot?")):
+            assert said in reply(fleet, "list_frames", {"robot": robot})["detail"]
+
     @pytest.mark.parametrize("robot", ["../r1", "r4", "", "/", 7, ["r1"], {"r1": 1}])
     def test_a_name_that_is_none_is_refused_whatever_it_is(
         self, folder: Path, robot: object
@@ -418,6 +428,7 @@ class TestTrouble:
         assert found["never"] == ["r1"]
         missing = "the bag directory does not exist (yet): check .../away, from fleet.robots"
         assert found["notes"] == [f"no answer of away: {missing}"]
+        assert found["robots_failed"] == {"away": "refused"}
         assert str(tmp_path) not in json.dumps(found)
         status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
         assert "from fleet.robots" in status["doubts"]
