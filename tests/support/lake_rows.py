@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from pyiceberg.catalog import Catalog
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.columns.fill import Filling, StoreLimits
@@ -56,7 +57,7 @@ def shipped(robot: str, bag: BagFile) -> ShippedBag:
 
 
 def lake_robots(
-    catalog: SqlCatalog,
+    catalog: Catalog,
     engine: LakeEngine,
     names: Sequence[str],
     limits: QuerySettings | None = None,

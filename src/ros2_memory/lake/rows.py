@@ -36,6 +36,7 @@ from ros2_memory.lake.tables import ROWS_VERSION, TABLES
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
@@ -126,8 +127,9 @@ def sha256_of(path: Path) -> str:
 def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
     """Returns what the rows of a bag depend on besides its bytes.
 
-    That is which of its messages count, the static transforms in force, the settings (`config`)
-    and the topics whose `messages` are shipped.
+    That is which of its messages count, the static transforms in force, what the robot is placed
+    by, the spellings of labels, the settings (`config`) and the topics whose `messages` are
+    shipped.
     """
     counted = [
         (known.topic, known.type, known.count, known.first, known.last)
@@ -136,7 +138,11 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     view = View(memory, Call())
     among = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, among), bag.end))
-    parts = json.dumps([ROWS_VERSION, config, statics, sorted(messages), counted])
+    labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
+    parts = json.dumps(
+        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted],
+        sort_keys=True,
+    )
     return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
@@ -159,8 +165,10 @@ class _BagRows:
     def __init__(self, memory: Memory, bag: BagFile) -> None:
         self._memory = memory
         self._bag = bag
-        self._pose_topic = memory.limits.pose_topic
-        self._poses = poses_of_bag(View(memory, Call()), bag, self._pose_topic)
+        view = View(memory, Call())
+        self._pose_topic = view.pose_topic
+        self._poses = poses_of_bag(view, bag, self._pose_topic)
+        self._thing = Labels(memory.limits.labels).key
         self._types: dict[str, list[str]] = {}
         for known in bag.summary.topics:
             self._types.setdefault(known.topic, []).append(known.type)
@@ -174,7 +182,7 @@ class _BagRows:
             self._rows["poses"] += self._vertices(frame, track)
         self._rows["things"] += self._things()
         for topic, found in events.items():
-            self._rows["events"] += _events_of(topic, found)
+            self._rows["events"] += self._events_of(topic, found)
         driven = self._driven()
         # What the events of a topic rule out is not decoded.
         seen = {
@@ -234,10 +242,11 @@ class _BagRows:
         for one in Watching(View(self._memory, Call())).in_bag(self._bag):
             for sights in one.sights:
                 for spot in sights.spots.tolist():
-                    best = spot[Spot.BEST]
+                    best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
                     yield {
                         "topic": sights.topics[spot[Spot.TOPIC]],
-                        "label": sights.labels[spot[Spot.LABEL]],
+                        "label": label,
+                        "thing": self._thing(label),
                         "count": spot[Spot.N],
                         "first_ns": spot[Spot.FIRST],
                         "last_ns": spot[Spot.LAST],
@@ -320,22 +329,23 @@ class _BagRows:
             for detection in found:
                 place = dict(zip("xyz", detection.place or (), strict=False))
                 more = {name: getattr(detection, name) for name in ("label", "score", "frame_id")}
-                self._rows["sightings"].append({**row, **more, **place})
+                thing = self._thing(detection.label)
+                self._rows["sightings"].append({**row, **more, "thing": thing, **place})
         return channels.rows()
+
+    def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
+        for seen in found.visible.intervals():
+            thing = {"thing": self._thing(seen.label), "value": seen.best}
+            yield _event(topic, "thing", seen.first, seen.label, last_ns=seen.last, **thing)
+        for flip in found.of_kind(FLAG)[1]:
+            yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
+        for error in found.errors:
+            reports = {"last_ns": error.last, "count": error.reports}
+            yield _event(topic, "error", error.first, error.text, **reports)
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
     return {"topic": topic, "kind": kind, "first_ns": first, "text": text, **more}
-
-
-def _events_of(topic: str, found: TopicEvents) -> Iterator[Row]:
-    for seen in found.visible.intervals():
-        yield _event(topic, "thing", seen.first, seen.label, last_ns=seen.last, value=seen.best)
-    for flip in found.of_kind(FLAG)[1]:
-        yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
-    for error in found.errors:
-        more = {"last_ns": error.last, "count": error.reports}
-        yield _event(topic, "error", error.first, error.text, **more)
 
 
 def taken_apart(value: JsonValue) -> Row:

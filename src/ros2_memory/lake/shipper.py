@@ -247,7 +247,13 @@ class Shipper:
             if bag.state is BagState.CLOSED and not is_carried(bag.path)
         ]
         bags = [bag for bag in closed if is_settled(bag, robot.bag_dir, now)]
-        done.waiting += len(closed) - len(bags)
+        open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
+        done.waiting += len(closed) - len(bags) + len(open_bags)
+        done.problems += [
+            f"{robot.name}: {bag.file} was left open by a crash: ros2-memory recover closes it"
+            for bag in open_bags
+        ]
+        done.problems += [f"{robot.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
         known = self._look_up(robot, bags)
         by_file = {shipped.file: shipped for shipped in known.values()}
         ids: set[str] = set()

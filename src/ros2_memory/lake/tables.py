@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 27
+ROWS_VERSION: Final = 28
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _NS_PER_US: Final = 1_000
@@ -70,7 +70,7 @@ class LakeTable:
                 "id": number,
                 "name": name,
                 "type": _iceberg_type(kind, _INNER_IDS + 2 * number),
-                "required": name in _KEYS,
+                "required": name in KEYS,
                 "doc": meaning,
             }
             for number, (name, (kind, meaning)) in enumerate(self.columns.items(), 1)
@@ -136,14 +136,14 @@ def _iceberg_type(kind: str, inner_id: int) -> object:
 
 
 _DECLARED: Final = yaml.safe_load(files(__package__).joinpath("tables.yaml").read_text("utf-8"))
-_KEYS: Final[Mapping[str, tuple[str, str]]] = _DECLARED["keys"]
+KEYS: Final[Mapping[str, tuple[str, str]]] = _DECLARED["keys"]
 """Columns of all tables; a row has a value for each."""
 
 TABLES: Final[Mapping[str, LakeTable]] = {
     name: LakeTable(
         name,
         table["row"],
-        {**_KEYS, **table["columns"]},
+        {**KEYS, **table["columns"]},
         tuple(table["order"]),
         table.get("row_group", _ROW_GROUP),
     )

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,14 +96,6 @@ def test_every_question_is_answered_by_a_lake_as_by_the_bags(robots: Robots) -> 
         if "error" not in expected:
             answered.add(tool)
     assert answered == tools - OF_DIRECTORIES
-
-
-def test_eight_questions_at_once_and_again_are_answered_as_one_by_one(robots: Robots) -> None:
-    asked = [*questions()][::7]
-    expected = [reply(robots.mounted, *each) for each in asked]
-    with ThreadPoolExecutor(8) as threads:
-        for _ in range(2):
-            assert [*threads.map(lambda each: reply(robots.lake, *each), asked)] == expected
 
 
 def mixed(robots: Robots, *, is_mounted: bool) -> Fleet:
