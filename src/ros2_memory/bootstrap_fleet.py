@@ -17,7 +17,7 @@ from ros2_memory.bootstrap import (
 )
 from ros2_memory.bootstrap_lake import open_lake, require_extra
 from ros2_memory.config import NullRecorderNode, is_robot_name
-from ros2_memory.core.errors import BagError, ConfigError
+from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
 
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import Settings
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.files import Lake
@@ -156,18 +155,12 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
             "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
         )
 
-    def first_in(path: Path) -> Ns:
-        summary = shared.reader.summarize(path)
-        if summary.empty:
-            raise BagError(str(path), "it holds no message")
-        return summary.start
-
     robots = {name: robot_settings(settings, name) for name in settings.fleet.robots}
     return [
         RobotBags(
             name,
             build_memory(own, shared, setting=ROBOTS_SETTING),
-            first_in,
+            shared.reader,
             reading_of(own, shared.schemas),
         )
         for name, own in robots.items()

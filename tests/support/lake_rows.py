@@ -65,9 +65,10 @@ def lake_robots(
     *,
     days: int = 31,
     most_bags: int = MOST_BAGS,
+    now: int = NOW,
 ) -> dict[str, Memory]:
-    """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
-    lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
+    """The robots of a lake; with a folder for `stores` each has one."""
+    lake, clock, decoder = Lake(catalog, engine), FixedClock(now), McapReader()
     return {
         name: lake_memory(
             lake,
@@ -107,12 +108,12 @@ def store_columns(memory: Memory) -> Filling:
     return filling
 
 
-def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False) -> Fleet:
-    """The fleet of some memories, asked at `NOW`."""
+def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False, now: int = NOW) -> Fleet:
+    """The fleet of some memories."""
     robots = [
         Robot(name, Path("/") / name, partial(_same, memory)) for name, memory in memories.items()
     ]
-    return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
+    return Fleet(robots, FixedClock(now), shared_map=shared_map)
 
 
 def _same(memory: Memory) -> Memory:

@@ -42,8 +42,7 @@ def robot_bags(name: str, bag_dir: Path, clock: Clock | None = None) -> RobotBag
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    reader = McapReader()
-    return RobotBags(name, memory, lambda path: reader.summarize(path).start, "test")
+    return RobotBags(name, memory, McapReader(), "test")
 
 
 def location(folder: Path) -> LakeLocation:

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
     from ros2_memory.lake.warehouse import LakeTables
+    from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
 
@@ -62,13 +63,13 @@ class RobotBags:
     Attributes:
         name: the robot.
         memory: over its bag directory.
-        first_in: returns the log time of the first message in a file, whether it counts or not.
+        reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
     """
 
     name: str
     memory: Memory
-    first_in: Callable[[Path], Ns]
+    reader: BagReader
     config: str
 
     @property
@@ -320,7 +321,10 @@ class Shipper:
         state, known = (bag.size, bag.mtime_ns, bag.sidecar_ns), self._of[robot.name].seen
         seen = known.get(bag.file)
         if seen is None or seen.state != state:
-            seen = _Seen(state, bag_id_of(robot.name, bag, robot.first_in(bag.path)))
+            summary = robot.reader.summarize(bag.path)
+            if summary.empty:
+                raise BagError(bag.file, "it holds no message")
+            seen = _Seen(state, bag_id_of(robot.name, bag, summary.start))
             known[bag.file] = seen
         return seen
 

@@ -24,9 +24,8 @@ from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
-from tests.support.fleets import SEEN
+from tests.support.fleets import SEEN, reply
 from tests.support.lakes import START_S, robot_bags, ship, write_bag
-from tests.unit.lake.test_questions import reply
 
 CUP: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
 

@@ -18,10 +18,9 @@ from ros2_memory.queries import find_last_match, value_when
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.fleets import NOW, SEEN, START_S
+from tests.support.fleets import NOW, SEEN, START_S, reply
 from tests.support.lake_rows import fill, lake_in, lake_robots
 from tests.support.memories import memory_of, with_store
-from tests.unit.lake.test_questions import reply
 
 DAY_S = 86_400
 DAYS = 7

@@ -19,10 +19,9 @@ from ros2_memory.lake.tables import TABLES, open_tables
 from ros2_memory.lake.warehouse import quiet_deletes
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, text, write_mcap
-from tests.support.fleets import SEEN, START_S
+from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots, store_columns
 from tests.support.memories import memory_of, with_store
-from tests.unit.lake.test_questions import reply
 
 AT = START_S * NS_PER_S
 EVERYTHING = TimeWindow.everything()
