@@ -76,6 +76,11 @@ def ship(folder: Path, robots: Sequence[RobotBags], *, most_bags: int = 2) -> Sh
         return shipper.run()
 
 
+def ship_from(folder: Path, *names: str) -> Shipped:
+    """One pass over robots in a folder, into its lake."""
+    return ship(folder / "lake", [robot_bags(name, folder / name) for name in names or ("hall",)])
+
+
 def lake_column(folder: Path, table: str, column: str) -> list[object]:
     """The values of a column of the lake, sorted by their text."""
     with location(folder).writable() as lake:

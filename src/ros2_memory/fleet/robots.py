@@ -46,11 +46,35 @@ class FromLake(NamedTuple):
 
     Attributes:
         latest: the log time of the newest message that was shipped; None if there is none.
-        notes: what else was not looked at, or is not exact.
+        older: up to which log time (inclusive) there is more, which was not looked at; None if not.
     """
 
     latest: Ns | None
-    notes: tuple[str, ...] = ()
+    older: Ns | None = None
+
+    @classmethod
+    def of(cls, lake: Memory, call: Call) -> FromLake:
+        """Returns what is to be reported of a call that a lake has answered."""
+        published = lake.index.published
+        latest = None if published is None else published.latest
+        return cls(latest, None if call.older == MAX_NS else call.older)
+
+    def since(self, begin: Ns | None) -> FromLake:
+        """Returns that of an answer from a log time on; None stands for all times."""
+        is_whole = self.older is None or (begin is not None and begin > self.older)
+        return self._replace(older=None) if is_whole else self
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The note on days that the answer would need, if any."""
+        if self.older is None:
+            return ()
+        since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
+        note = (
+            f"the lake has days before {since}, which were not looked at: an end (or before, or a "
+            "time) there has them looked at"
+        )
+        return (note,)
 
 
 class Robot:
@@ -92,19 +116,13 @@ class Robot:
             return self._memory
 
     def asked(
-        self,
-        ask: Callable[[Memory, Call], T],
-        call: Call,
-        *,
-        lake_first: bool,
-        begin_of: Callable[[T, Ns], Ns | None] = lambda *_: None,
+        self, ask: Callable[[Memory, Call], T], call: Call, *, lake_first: bool
     ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
         With `lake_first` the lake answers, where it has anything of the robot; the mounted memory
         does where that needs messages that the lake does not have. Without, the mounted one does,
         unless it has no bag, and the lake where that has no data, as retention deletes bags.
-        `begin_of` returns from when an answer is, by it and the newest log time.
 
         Raises:
             NoDataError: none of the two has an answer; it is that of the mounted one, if any.
@@ -116,7 +134,7 @@ class Robot:
         if lake_first or not self._has_bags():
             if not self.is_mounted or lake.index.snapshot().latest is not None:
                 try:
-                    return _of_lake(lake, ask, call, begin_of)
+                    return _of_lake(lake, ask, call)
                 except NotInLakeError:
                     if not self._has_bags():
                         raise
@@ -125,7 +143,7 @@ class Robot:
             return ask(self.memory(), call), None
         except NoDataError as error:
             try:
-                return _of_lake(lake, ask, call, begin_of)
+                return _of_lake(lake, ask, call)
             except NoDataError:
                 raise error from None
             except (RefusedError, LakeError, QueryTimeoutError) as failure:
@@ -149,37 +167,15 @@ class Robot:
         return MIN_NS if latest is None else latest
 
 
-def _of_lake(
-    lake: Memory,
-    ask: Callable[[Memory, Call], T],
-    call: Call,
-    begin_of: Callable[[T, Ns], Ns | None],
-) -> tuple[T, FromLake]:
-    """Returns what `ask` finds in a lake, with its notes; raises what it raises."""
+def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
+    """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
     call.older = MAX_NS
     try:
         found = ask(lake, call)
     except NoDataError as error:
-        raise NoDataError(
-            error.reason, "; ".join((error.detail, *_unseen(call, None))), error.notes
-        ) from error
-    published = lake.index.published
-    latest = None if published is None else published.latest
-    begin = None if latest is None else begin_of(found, latest)
-    return found, FromLake(latest, _unseen(call, begin))
-
-
-def _unseen(call: Call, begin: Ns | None) -> tuple[str, ...]:
-    """Returns the note on days that an answer from `begin` on would need, and was not shown."""
-    older = call.older
-    if older is None or older == MAX_NS or (begin is not None and begin > older):
-        return ()
-    since = datetime.fromtimestamp((older + 1) // NS_PER_S, tz=UTC).date()
-    note = (
-        f"the lake has days before {since}, which were not looked at: an end (or before, or a "
-        "time) there has them looked at"
-    )
-    return (note,)
+        detail = "; ".join((error.detail, *FromLake.of(lake, call).notes))
+        raise NoDataError(error.reason, detail, error.notes) from error
+    return found, FromLake.of(lake, call)
 
 
 class Fleet:

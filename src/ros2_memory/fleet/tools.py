@@ -156,19 +156,18 @@ class _FleetQuestions:
         """
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
-            answer, lake = robot.asked(
-                partial(_answer, asked.question),
-                own,
-                lake_first=self.tool.name in OF_LAKE,
-                begin_of=partial(_begin_of, asked.given),
-            )
+            question, lake_first = partial(_answer, asked.question), self.tool.name in OF_LAKE
+            answer, lake = robot.asked(question, own, lake_first=lake_first)
             return answer, lake, own.now
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
             raise found
         answer, lake, now = found
-        notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
+        notes: tuple[str, ...] = ()
+        if lake is not None:
+            unseen = lake.since(_begin_of(asked.given, answer, lake.latest)).notes
+            notes = (*shipped_to({robot.name: lake.latest}), *unseen)
         return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
 
     def _of_all(self, robots: list[Robot], asked: _Asked, call: Call) -> OfFleet:
@@ -209,36 +208,27 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(memory: Memory, call: Call) -> tuple[RobotReply, OneAnswer]:
-            return self._replied(asked.question, replace(memory, clock=now), page, robot, call)
+        def ask(memory: Memory, own: Call) -> tuple[RobotReply, OneAnswer]:
+            snapshot = memory.index.snapshot()
+            if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
+                # "Never" would be a claim about bags that were not searched.
+                raise RefusedError(snapshot.problem)
+            latest = snapshot.latest
+            is_ahead = latest is not None and latest > now.at + _AHEAD_NS
+            # Rows of those whose clock is ahead come last, whenever they are.
+            own.rows_in = None if is_ahead else page.window()
+            answer = _answer(asked.question, replace(memory, clock=now), own)
+            if isinstance(answer, Sightings) and not is_ahead:
+                page.add(sighting.last for sighting in answer.sightings)
+                page.add(episode.until for episode in answer.episodes)
+            value = as_json(answer, memory.index.bag_dir)
+            if own.now is not None and isinstance(value, dict):
+                value = {"now": unix_rounded_up(own.now), **value}
+            return RobotReply(robot.name, value, latest, is_ahead), answer
 
-        (reply, _), lake = robot.asked(
-            ask,
-            call,
-            lake_first=self.tool.name in OF_LAKE,
-            begin_of=lambda found, latest: _begin_of(asked.given, found[1], latest),
-        )
-        return replace(reply, lake=lake)
-
-    def _replied(
-        self, question: Question, memory: Memory, page: Page, robot: Robot, call: Call
-    ) -> tuple[RobotReply, OneAnswer]:
-        snapshot = memory.index.snapshot()
-        if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
-            # "Never" would be a claim about bags that were not searched.
-            raise RefusedError(snapshot.problem)
-        latest = snapshot.latest
-        is_ahead = latest is not None and latest > memory.clock.now() + _AHEAD_NS
-        # Rows of those whose clock is ahead come last, whenever they are.
-        call.rows_in = None if is_ahead else page.window()
-        answer = _answer(question, memory, call)
-        if isinstance(answer, Sightings) and not is_ahead:
-            page.add(each.last for each in answer.sightings)
-            page.add(each.until for each in answer.episodes)
-        value = as_json(answer, memory.index.bag_dir)
-        if call.now is not None and isinstance(value, dict):
-            value = {"now": unix_rounded_up(call.now), **value}
-        return RobotReply(robot.name, value, latest, is_ahead), answer
+        (reply, answer), lake = robot.asked(ask, call, lake_first=self.tool.name in OF_LAKE)
+        begin = None if lake is None else _begin_of(asked.given, answer, lake.latest)
+        return replace(reply, lake=lake and lake.since(begin))
 
     def _limit(self, given: object) -> int | None:
         """Returns how many rows a call wants, all robots together."""
@@ -250,14 +240,16 @@ class _FleetQuestions:
         return default if isinstance(default, int) else None
 
 
-def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns) -> Ns | None:
+def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None) -> Ns | None:
     """Returns from when an answer is: its match, or the start that was given; None if from ever."""
     if isinstance(answer, Match) and answer.found is not None:
         return answer.found.sample.time
     start, last_s = given.get("start"), given.get("last_s", given.get("seconds"))
     if isinstance(start, int | float):
         return ns_from_unix(start)
-    return latest - ns_from_unix(last_s) if isinstance(last_s, int | float) else None
+    if latest is None or not isinstance(last_s, int | float):
+        return None
+    return latest - ns_from_unix(last_s)
 
 
 def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:

@@ -42,6 +42,7 @@ from tests.support.lakes import (
     location,
     robot_bags,
     ship,
+    ship_from,
     write_bag,
 )
 from tests.support.log_lines import with_checks
@@ -108,7 +109,7 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
     write_bag(bag_dir, 0)
     kept = secret_bag(bag_dir)
     late = shutil.copy(kept, tmp_path / "late.mcap")
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     suffixes = {path.suffix for path in files_with(lake, MARKER)}
     assert suffixes == {".parquet", ".avro"}  # so the scan finds it where it is
     kept.unlink()
@@ -139,7 +140,7 @@ def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path
     own_all(bag_dir)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     assert files_with(lake, MARKER)
     return bag_dir, lake, late
 
@@ -155,7 +156,7 @@ def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
     bag_dir, lake, late = shipped_robot
     assert forget_on_robot() == 0
     assert "next pass of ros2-memory ship" in capsys.readouterr().out
-    done = ship(lake, [robot_bags("hall", bag_dir)])
+    done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 0, [])
     assert files_with(lake, MARKER) == []
     assert len(lake_column(lake, "bags", "bag_id")) == 2
@@ -175,7 +176,7 @@ def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_
     bag_dir, lake, late = shipped_robot
     topics = sorted({str(each) for each in lake_column(lake, "sightings", "topic")})
     assert forget_on_robot("--topic", "/chatter", "--topic", topics[0]) == 0
-    done = ship(lake, [robot_bags("hall", bag_dir)])
+    done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 1, [])
     assert len(lake_column(lake, "bags", "bag_id")) == 3
     assert files_with(lake, MARKER) == []
@@ -189,7 +190,7 @@ def test_topics_are_forgotten_only_in_bags_that_hold_them(tmp_path: Path) -> Non
     secret_bag(bag_dir)
     start = (START_S + 70) * NS_PER_S
     write_mcap(bag_dir / "other" / "other_0.mcap", [text(start, "kept")])
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     seen = str(lake_column(lake, "sightings", "topic")[0])
     assert forget(lake, Tombstone("hall", start, start + NS_PER_S, (seen,))).bags == 1
     assert files_with(lake, MARKER) == []
@@ -230,7 +231,7 @@ def test_killed_while_forgetting_it_is_finished_later(
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     secret_bag(bag_dir)
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     commit, calls = SqlCatalog.commit_table, 0
 
     def failing(*given: object) -> object:
@@ -255,7 +256,7 @@ def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
 ) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     secret_bag(bag_dir)
     replace = LakeTables.replace
 
@@ -267,7 +268,7 @@ def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
     with monkeypatch.context() as patched:
         patched.setattr(LakeTables, "replace", killed)
         with pytest.raises(LakeError):
-            ship(lake, [robot_bags("hall", bag_dir)])
+            ship_from(tmp_path)
     assert files_with(lake, MARKER)
     assert forget(lake, tombstone()).bags == 1
     assert files_with(lake, MARKER) == []
@@ -276,7 +277,7 @@ def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
 def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     secret_bag(bag_dir)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     with location(lake).writable() as tables:
         table = tables.current("messages")
         snapshot = table.current_snapshot()
@@ -289,11 +290,11 @@ def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
 def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     foreign = next(lake.rglob("messages/data/*/*/*.parquet")).with_name("foreign.parquet")
     foreign.write_bytes(b"of another program")
     write_bag(bag_dir, 0, most=2)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     where = location(lake)
     files = {path for path in lake.rglob("*") if path.is_file()}
     now = max(each.at for each in WRITTEN.rows(where.state_dir)) + NS_PER_S
