@@ -25,7 +25,10 @@ from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import expire
 
 if TYPE_CHECKING:
+    from datetime import date
     from pathlib import Path
+
+    from pyiceberg.expressions import BooleanExpression
 
     from ros2_memory.bag_dir.state_files import Forgetting
     from ros2_memory.core.model import BagFile
@@ -123,23 +126,35 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    robot = tombstone.robot
-    if tombstone.bags:
-        condition = of_ids(robot, tombstone.bags)
-    else:
-        span = ("first_ns", "last_ns")
-        condition = overlapping(robot, span, tombstone.start, tombstone.stop)
-        if tombstone.topics:
-            condition = And(condition, of_topics(tombstone.topics))
-    # `channels` names each bag of which anything is in the lake: it is the first to be committed,
-    # and the last from which is deleted.
-    rows = lake.rows("channels", condition, ("day", "bag_id")).to_pylist()
-    bags = {(robot, row["day"], row["bag_id"]) for row in rows}
+    # `channels` has a row of each bag of which anything is in the lake: it is the first to be
+    # committed, and the last from which is deleted.
+    bags = _bags(lake, "channels", _of(tombstone, "first_ns", "last_ns"))
+    # In `bags` alone: of which no message counts, and what a killed process was about to replace.
+    listed = _bags(lake, "bags", _of(replace(tombstone, topics=()), "start_ns", "end_ns"))
+    if tombstone.topics and listed:
+        ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
+        listed -= _bags(lake, "channels", ids)
+    bags |= listed
     for name in reversed([*TABLES]):
         lake.delete(name, of_bags(bags))
     # The versions before have what was deleted, so they go whatever their age, and the clock says.
     files = expire(lake, MAX_NS)
     kept_by = lake.older_versions()
     append_tombstone(lake.location.state_dir, tombstone, done=True)
-    log.info("forgotten_in_lake", robot=robot, bags=len(bags), files=files)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
     return Forgotten(len(bags), files, kept_by)
+
+
+def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
+    """Returns robot, day and id of the bags that have some rows."""
+    columns = ("robot", "day", "bag_id")
+    rows = lake.rows(name, condition, columns).to_pylist()
+    return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
+
+
+def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+    """Returns the condition on rows of what is forgotten; the columns have their span."""
+    if tombstone.bags:
+        return of_ids(tombstone.robot, tombstone.bags)
+    reaching = overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)
+    return And(reaching, of_topics(tombstone.topics)) if tombstone.topics else reaching
