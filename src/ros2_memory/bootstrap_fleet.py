@@ -1,4 +1,4 @@
-"""The composition root of a fleet: a memory for each robot, from settings derived for it."""
+"""The composition root of many robots: a memory for each, and its bags as they are shipped."""
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from ros2_memory.bootstrap import (
     reading_of,
     shared_parts,
 )
+from ros2_memory.bootstrap_lake import open_lake, require_extra
 from ros2_memory.config import NullRecorderNode, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
@@ -26,9 +27,9 @@ if TYPE_CHECKING:
     from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import Settings
     from ros2_memory.fleet.robots import Fleet, Robot
-    from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.history.context import Memory
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.memory.robot import LakeRobot
+    from ros2_memory.lake.shipper import RobotBags
 
 log = get_logger(__name__)
 
@@ -43,35 +44,24 @@ LAKE_REFRESH_S: Final = 60.0
 def build_fleet(settings: Settings) -> Fleet | None:
     """Returns the robots of `fleet.robots`, whose bags are only read; None if there are none.
 
-    A robot's memory is built when it is first asked; what reads and decodes bags is shared.
+    With a lake also those that it alone has. A robot's memory is built when it is first asked; what
+    reads and decodes bags is shared.
 
     Raises:
         ConfigError: other settings are not those of a fleet, or a robot's places are refused.
         LakeError: there is to be a lake, and it cannot be opened.
     """
-    fleet = settings.fleet
-    if not fleet.robots:
+    if not settings.fleet.robots:
         return None
-    from ros2_memory.fleet.robots import Fleet, Robot
+    from ros2_memory.fleet.robots import Fleet
 
     _require_only_reading(settings)
     shared = shared_parts(settings)
-    lake = None
-    if settings.lake.engine is not None:
-        from ros2_memory.bootstrap_lake import open_lake
-
-        lake = open_lake(settings, settings.lake.engine)
-    robots = []
-    for name, bag_dir in fleet.robots.items():
-        own = robot_settings(settings, name)
-        # Here, so that a file of places that is refused keeps the server from starting.
-        limits = _limits_of(settings, own)
-        build = partial(_memory_of, own, shared, limits)
-        source = None if lake is None else _source_of(lake, name, own, shared, limits)
-        is_mounted = lake is None or bag_dir.is_dir()
-        robots.append(Robot(name, bag_dir, build, lake=source, is_mounted=is_mounted))
-    join = None if lake is None else partial(_only_in, lake, settings, shared)
-    found = Fleet(robots, WallClock(), shared_map=fleet.shared_map, join=join)
+    engine = settings.lake.engine
+    lake = None if engine is None else open_lake(settings, engine)
+    robots = [_robot(settings, name, shared, lake) for name in settings.fleet.robots]
+    join = None if lake is None else partial(_robots_of, lake, settings, shared)
+    found = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
     found.joined()
     if lake is not None and not lake.robots():
         log.warning(
@@ -83,41 +73,39 @@ def build_fleet(settings: Settings) -> Fleet | None:
     return found
 
 
-def _only_in(
+def _robots_of(
     lake: Lake, settings: Settings, shared: SharedParts, known: Collection[str]
 ) -> Iterator[Robot]:
     """Yields the robots of a lake besides the known ones."""
-    from ros2_memory.fleet.robots import Robot
-
     lake.refresh(_JOINED_AGAIN_S)
     for name in lake.robots():
-        if name in known or not is_robot_name(name):
-            continue
-        own = robot_settings(settings, name)
-        source = _source_of(lake, name, own, shared, _limits_of(settings, own))
-        yield Robot(name, Path(name), partial(_lake_of, source), lake=source, is_mounted=False)
+        if name not in known and is_robot_name(name):
+            yield _robot(settings, name, shared, lake)
 
 
-def _limits_of(settings: Settings, own: Settings) -> QuerySettings:
-    """Returns the settings of queries to a robot; with named places only if they are of its map.
+def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
+    """Returns a robot with bags of its own, in a lake, or both.
 
     Raises:
-        ConfigError: their file is refused.
+        ConfigError: the file of its places is refused.
     """
+    from ros2_memory.fleet.robots import Robot
+
+    own = robot_settings(settings, name)
     limits = query_settings_of(own)
-    if settings.fleet.shared_map or own.data.places_file != settings.data.places_file:
-        return limits
-    # `data.places_file` is about some other map.
-    return replace(limits, places=(), places_file="")
+    if not settings.fleet.shared_map and own.data.places_file == settings.data.places_file:
+        # `data.places_file` is about some other map.
+        limits = replace(limits, places=(), places_file="")
 
+    def mounted() -> Memory:
+        return replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
 
-def _source_of(
-    lake: Lake, name: str, own: Settings, shared: SharedParts, limits: QuerySettings
-) -> LakeRobot:
-    """Returns what a lake has of a robot."""
-    from ros2_memory.lake.memory.robot import LakeRobot
+    bag_dir = settings.fleet.robots.get(name)
+    if lake is None:
+        return Robot(name, own.recording.bag_dir, mounted)
+    from ros2_memory.lake.memory import lake_memory
 
-    return LakeRobot(
+    shipped = lake_memory(
         lake,
         name,
         WallClock(),
@@ -129,10 +117,9 @@ def _source_of(
         settings=reading_of(own, shared.schemas),
         refresh_s=LAKE_REFRESH_S,
     )
-
-
-def _lake_of(source: LakeRobot) -> Memory:
-    return source.memory
+    if bag_dir is None:
+        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)
+    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir())
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:
@@ -153,8 +140,31 @@ def robot_settings(settings: Settings, name: str) -> Settings:
     )
 
 
-def _memory_of(own: Settings, shared: SharedParts, limits: QuerySettings) -> Memory:
-    return replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
+def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
+    """Returns the robots of `fleet.robots` as they are shipped, all with `shared`.
+
+    Raises:
+        ConfigError: there are none, or their settings are refused.
+    """
+    require_extra()
+    from ros2_memory.lake.shipper import RobotBags
+
+    if not settings.fleet.robots:
+        raise ConfigError(
+            "fleet.robots: must name the robots whose bags are shipped: choose "
+            "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
+        )
+
+    robots = {name: robot_settings(settings, name) for name in settings.fleet.robots}
+    return [
+        RobotBags(
+            name,
+            build_memory(own, shared, setting=ROBOTS_SETTING),
+            shared.reader,
+            reading_of(own, shared.schemas),
+        )
+        for name, own in robots.items()
+    ]
 
 
 def _require_only_reading(settings: Settings) -> None:

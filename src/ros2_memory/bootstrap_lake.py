@@ -1,4 +1,4 @@
-"""The composition root of a lake: where it is, and the robots whose bags are shipped into it."""
+"""The composition root of a lake: where it is, and what reads it."""
 # ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
 
 from __future__ import annotations
@@ -11,19 +11,15 @@ from typing import TYPE_CHECKING
 
 import yaml
 
-from ros2_memory.bootstrap import build_memory, instantiated, reading_of
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
-from ros2_memory.core.errors import BagError, ConfigError
+from ros2_memory.bootstrap import instantiated
+from ros2_memory.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.bootstrap import SharedParts
     from ros2_memory.config import DuckdbNode, Settings
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.engines.base import LakeEngine
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import LakeLocation
 
 
@@ -78,7 +74,7 @@ def _secrets_of(path: Path) -> dict[str, str]:
     except (ValueError, yaml.YAMLError):
         found = None
     if not isinstance(found, dict) or not all(
-        isinstance(each, str) for pair in found.items() for each in pair
+        isinstance(text, str) for pair in found.items() for text in pair
     ):
         raise ConfigError(
             f'lake.secrets_file: {path} must have lines like s3.access-key-id: "...", names and '
@@ -121,33 +117,3 @@ def engine_of(node: DuckdbNode) -> LakeEngine:
     from ros2_memory.lake.engines.base import LakeEngine
 
     return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
-
-
-def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
-    """Returns the robots of `fleet.robots`, whose bags are only read, all with `shared`.
-
-    Raises:
-        ConfigError: there are none, or their settings are refused.
-    """
-    require_extra()
-    if not settings.fleet.robots:
-        raise ConfigError(
-            "fleet.robots: must name the robots whose bags are shipped: choose "
-            "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
-        )
-    return [_robot(settings, name, shared) for name in settings.fleet.robots]
-
-
-def _robot(settings: Settings, name: str, shared: SharedParts) -> RobotBags:
-    from ros2_memory.lake.shipper import RobotBags
-
-    own = robot_settings(settings, name)
-    memory = build_memory(own, shared, setting=ROBOTS_SETTING)
-
-    def first_in(path: Path) -> Ns:
-        summary = shared.reader.summarize(path)
-        if summary.empty:
-            raise BagError(str(path), "it holds no message")
-        return summary.start
-
-    return RobotBags(name, memory, first_in, reading_of(own, shared.schemas))

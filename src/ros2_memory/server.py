@@ -332,7 +332,7 @@ async def _fleet_in_background(
 
     def all_fillers() -> list[tuple[Memory, Filler]]:
         for each in [*fleet.robots.values()]:  # more robots may have joined
-            memory = each.lake_memory
+            memory = each.lake
             if memory is not None and each.name not in shipped:
                 shipped[each.name] = memory, Filler(of_lake(memory))
         return [*fillers, *shipped.values()]
@@ -358,7 +358,7 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
         while True:
             limiter.total_tokens += 2 * len(robots)
             for each in robots:
-                shipped = each.lake_memory
+                shipped = each.lake
                 if each.memory() is not shipped:
                     tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
                 if shipped is not None:

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.bag_dir.state_files import read_receipts
 from ros2_memory.core.errors import LakeError
@@ -104,14 +105,12 @@ def test_killed_a_hundred_times_it_loses_and_doubles_nothing(tmp_path: Path) -> 
 
 def check(folder: Path, bags: int) -> None:
     """Every message is in the lake once, in whole bags, and no other file is there."""
-    where = location(folder / "lake")
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
-        rows = {name: table.scan().to_arrow().to_pylist() for name, table in tables.items()}
+    with location(folder / "lake").writable() as lake:
+        rows = {name: lake.rows(name, AlwaysTrue()).to_pylist() for name in TABLES}
         used = {
             task.file.file_path.removeprefix("file://")
-            for table in tables.values()
-            for task in table.scan().plan_files()
+            for name in TABLES
+            for task in lake.current(name).scan().plan_files()
         }
     for name in ROBOTS:
         here = {

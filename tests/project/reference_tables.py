@@ -18,6 +18,7 @@ from pydantic import TypeAdapter
 
 from ros2_memory.cli.app import COMMANDS, COMMON_EXIT_CODES
 from ros2_memory.config import DuckdbNode, Ros2BagNode, Rosbag2Node, Settings
+from ros2_memory.lake.tables import KEYS, TABLES
 from ros2_memory.recorder import event_log
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.tools.arguments import TIME_KINDS
@@ -74,6 +75,24 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
         for line in (named, *rows)
     )
     return "\n".join((head, "|---" * len(named) + "|", *lines))
+
+
+def lake_tables() -> str:
+    """The columns of each table of a lake."""
+    keys = [(f"`{name}`", *column) for name, column in KEYS.items()]
+    parts = [f"## Of all\n\n{table(('column', 'type', 'what it is'), keys)}"]
+    for lake_table in TABLES.values():
+        rows = [
+            (f"`{name}`", *column)
+            for name, column in lake_table.columns.items()
+            if name not in KEYS
+        ]
+        columns = table(("column", "type", "what it is"), rows)
+        order = ", ".join(f"`{name}`" for name in lake_table.order)
+        parts.append(
+            f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{columns}"
+        )
+    return "\n\n".join(parts)
 
 
 def exit_table() -> str:

@@ -155,6 +155,10 @@ def test_every_command_stands_there_with_its_exit_codes() -> None:
     compare("commands", "exits", reference.exit_table())
 
 
+def test_every_column_of_a_lake_stands_there_with_what_it_means() -> None:
+    compare("lake", "columns", reference.lake_tables())
+
+
 def test_every_log_event_stands_there_with_its_fields() -> None:
     expected = reference.event_list(page("log-events"))
     compare("log-events", "events", expected)

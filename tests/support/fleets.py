@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from random import Random
-from typing import Final
+from typing import Any, Final
 
+from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.fleet.tools import fleet_tools
+from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.tools.declaration import Tool
+from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -31,6 +37,7 @@ NOW: Final = (START_S + 600) * NS_PER_S
 LENGTH_S: Final = 60
 LABELS: Final = ("mug", "scissors", "table")
 SEEN: Final = "/vision/scene/scene_objects"
+MOST_CHARS: Final = 10**6
 
 
 @dataclass(frozen=True)
@@ -92,3 +99,29 @@ def fleet_over(folder: Path, names: tuple[str, ...], *, shared_map: bool = False
     """The fleet of `folder/<name>`, asked at `NOW`."""
     robots = [Robot(name, folder / name, partial(fleet_memory, folder / name)) for name in names]
     return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
+
+
+def tools_of(fleet: Fleet, at_once: int = 4, max_chars: int = MOST_CHARS) -> dict[str, Tool]:
+    """The tools of a fleet by name."""
+    tools = build_tools(QuerySettings(), writing=True)
+    return {tool.name: tool for tool in fleet_tools(tools, fleet, max_chars, at_once)}
+
+
+def reply(fleet: Fleet, tool: str, given: dict[str, object], call: Call | None = None) -> Any:
+    """The JSON of a fleet's reply, be it an error; robots are asked one after another.
+
+    So what the first answer decides what the others need not.
+    """
+    return reply_of(tools_of(fleet, at_once=1)[tool], given, call)
+
+
+def reply_of(tool: Tool, given: dict[str, object], call: Call | None = None) -> Any:
+    """The JSON of a tool of a fleet, be it an error."""
+    replies = Replies(Path("nowhere"), MOST_CHARS)
+    # The memory is that of no robot.
+    none: Any = None
+    try:
+        answer = replies.answer(tool.question(given)(none, call or Call()))
+    except EpisodicError as error:
+        answer = replies.error(error)
+    return json.loads(answer.text)

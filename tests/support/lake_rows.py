@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 
+from pyiceberg.catalog import Catalog
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.columns.fill import Filling, StoreLimits
@@ -16,8 +17,8 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.memory.index import MOST_BAGS
-from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.index import MOST_BAGS
+from ros2_memory.lake.memory import lake_memory
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
 from ros2_memory.serving.backfill import make_fragments
@@ -56,7 +57,7 @@ def shipped(robot: str, bag: BagFile) -> ShippedBag:
 
 
 def lake_robots(
-    catalog: SqlCatalog,
+    catalog: Catalog,
     engine: LakeEngine,
     names: Sequence[str],
     limits: QuerySettings | None = None,
@@ -64,11 +65,12 @@ def lake_robots(
     *,
     days: int = 31,
     most_bags: int = MOST_BAGS,
-) -> dict[str, LakeRobot]:
-    """The robots of a lake, asked at `NOW`; with a folder for `stores` each has one."""
-    lake, clock, decoder = Lake(catalog, engine), FixedClock(NOW), McapReader()
+    now: int = NOW,
+) -> dict[str, Memory]:
+    """The robots of a lake; with a folder for `stores` each has one."""
+    lake, clock, decoder = Lake(catalog, engine), FixedClock(now), McapReader()
     return {
-        name: LakeRobot(
+        name: lake_memory(
             lake,
             name,
             clock,
@@ -87,9 +89,8 @@ def lake_robots(
     }
 
 
-def store_columns(robot: LakeRobot) -> Filling:
+def store_columns(memory: Memory) -> Filling:
     """Fills the store of a lake's robot, as a server does; returns what filled it."""
-    memory = robot.memory
     filling = Filling(
         memory.columns,
         memory.reader,
@@ -107,12 +108,12 @@ def store_columns(robot: LakeRobot) -> Filling:
     return filling
 
 
-def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False) -> Fleet:
-    """The fleet of some memories, asked at `NOW`."""
+def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False, now: int = NOW) -> Fleet:
+    """The fleet of some memories."""
     robots = [
         Robot(name, Path("/") / name, partial(_same, memory)) for name, memory in memories.items()
     ]
-    return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
+    return Fleet(robots, FixedClock(now), shared_map=shared_map)
 
 
 def _same(memory: Memory) -> Memory:

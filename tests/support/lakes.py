@@ -8,12 +8,13 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
+from pyiceberg.expressions import AlwaysTrue
+
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
-from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.warehouse import LakeLocation, location_of
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
@@ -41,8 +42,7 @@ def robot_bags(name: str, bag_dir: Path, clock: Clock | None = None) -> RobotBag
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    reader = McapReader()
-    return RobotBags(name, memory, lambda path: reader.summarize(path).start, "test")
+    return RobotBags(name, memory, McapReader(), "test")
 
 
 def location(folder: Path) -> LakeLocation:
@@ -60,11 +60,9 @@ def shipping(
     most_bags: int = 2,
 ) -> Iterator[Shipper]:
     """What ships these robots' bags, two in each batch."""
-    where = location(folder)
-    with where.opened() as catalog:
+    with location(folder).writable() as lake:
         yield Shipper(
-            where,
-            where.tables(catalog, TABLES),
+            lake,
             robots,
             FixedClock(LATER),
             messages=messages,
@@ -78,11 +76,15 @@ def ship(folder: Path, robots: Sequence[RobotBags], *, most_bags: int = 2) -> Sh
         return shipper.run()
 
 
+def ship_from(folder: Path, *names: str) -> Shipped:
+    """One pass over robots in a folder, into its lake."""
+    return ship(folder / "lake", [robot_bags(name, folder / name) for name in names or ("hall",)])
+
+
 def lake_column(folder: Path, table: str, column: str) -> list[object]:
     """The values of a column of the lake, sorted by their text."""
-    where = location(folder)
-    with where.opened() as catalog:
-        found = where.tables(catalog, [table])[table].scan(selected_fields=(column,)).to_arrow()
+    with location(folder).writable() as lake:
+        found = lake.rows(table, AlwaysTrue(), (column,))
     return sorted(found[column].to_pylist(), key=str)
 
 
@@ -94,11 +96,9 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
     for number in (0, 1):
         write_bag(folder, number)
         for shipped in (1, 0):
-            with where.opened() as catalog:
-                tables = where.tables(catalog, TABLES)
+            with where.writable() as tables:
                 robots = [robot_bags("hall", folder)]
-                shipper = Shipper(where, tables, robots, FixedClock(LATER), messages=())
-                assert shipper.run().bags == shipped
+                assert Shipper(tables, robots, FixedClock(LATER)).run().bags == shipped
     with where.opened() as catalog:
         engine = DuckdbEngine()
         lake = Lake(catalog, engine, where.namespace, where.translated)

@@ -7,7 +7,8 @@ import threading
 import time
 from collections import deque
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, Generic, TypeVar
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.core.errors import BusyError, EpisodicError, QueryTimeoutError
 from ros2_memory.core.logging_setup import get_logger
@@ -50,107 +51,104 @@ class FanOut:
 
         Every robot is in it. Takes 0.95 of the time that is left of the call, at most.
         """
-        return _Round(self._at_once, self._stuck, robots, work, call).results()
-
-
-class _Round(Generic[T]):
-    """One question to some robots."""
-
-    def __init__(
-        self,
-        at_once: int,
-        stuck: dict[str, threading.Thread],
-        robots: Sequence[Robot],
-        work: Callable[[Robot, Call], T],
-        call: Call,
-    ) -> None:
-        self._at_once = at_once
-        self._stuck = stuck
-        self._robots = robots
-        self._work = work
-        self._call = call
         left_s = call.deadline.left_s()
-        self._limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
-        self._grace_s = left_s * _GRACE
-        self._end_s = time.monotonic() + left_s * _OF_ALL
-        self._changed = threading.Condition()
-        self._done: dict[str, T | EpisodicError] = {}
-        self._calls: list[Call] = []
-
-    def results(self) -> Mapping[str, T | EpisodicError]:
-        waiting = deque(self._robots)
-        running: dict[str, tuple[threading.Thread, float]] = {}
-        with self._changed:
-            while waiting or running:
-                while waiting and len(running) < self._at_once:
-                    self._begin(waiting.popleft(), running)
+        limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
+        end_s = time.monotonic() + left_s * _OF_ALL
+        waiting = deque(robots)
+        running: dict[str, tuple[threading.Thread, Call, float]] = {}
+        done: dict[str, T | EpisodicError] = {}
+        answers: SimpleQueue[tuple[str, T | EpisodicError]] = SimpleQueue()
+        while waiting or running:
+            while waiting and len(running) < self._at_once:
+                robot = waiting.popleft()
                 now_s = time.monotonic()
-                for name, (thread, until_s) in [*running.items()]:
-                    if name in self._done:
-                        del running[name]
-                    elif now_s >= until_s:
-                        del running[name]
-                        self._stuck[name] = thread
-                        self._done[name] = self._too_slow()
-                if running and not (waiting and len(running) < self._at_once):
-                    first_s = min(until_s for _, until_s in running.values())
+                refused = self._refused(robot, call, is_over=now_s >= end_s)
+                if refused is not None:
+                    done[robot.name] = refused
+                    continue
+                own_s = min(limit_s, end_s - now_s)
+                deadline = call.deadline.within(own_s)
+                own = replace(call, deadline=deadline, stages=Stages(), used_active=False)
+                thread = _started(robot, work, own, answers)
+                running[robot.name] = thread, own, now_s + own_s + left_s * _GRACE
+            if running:
+                first_s = min(until_s for *_, until_s in running.values())
+                try:
                     # Without a deadline there is nothing to wake up for but an answer.
-                    wait_s = first_s - now_s
-                    self._changed.wait(wait_s if wait_s < threading.TIMEOUT_MAX else None)
-            for each in self._calls:
-                for stage, spent in [*each.stages.spent.items()]:
-                    self._call.stages.add(stage, spent)
-                self._call.used_active |= each.used_active
-            return {each.name: self._done[each.name] for each in self._robots}
+                    wait_s = max(first_s - time.monotonic(), 0)
+                    name, answer = answers.get(
+                        timeout=wait_s if wait_s < threading.TIMEOUT_MAX else None
+                    )
+                except Empty:
+                    pass
+                else:
+                    # Where it was given up meanwhile, its answer comes too late.
+                    if name in running:
+                        _, own, _ = running.pop(name)
+                        _add_costs(own, call)
+                        done[name] = answer
+            now_s = time.monotonic()
+            for name, (thread, own, until_s) in [*running.items()]:
+                if now_s >= until_s and answers.empty():
+                    del running[name]
+                    _add_costs(own, call)
+                    self._stuck[name] = thread
+                    done[name] = _too_slow(limit_s, alone=len(robots) == 1)
+        return {robot.name: done[robot.name] for robot in robots}
 
-    def _begin(self, robot: Robot, running: dict[str, tuple[threading.Thread, float]]) -> None:
-        """Has a robot asked in a thread of its own, unless it is stuck or no time is left."""
+    def _refused(self, robot: Robot, call: Call, *, is_over: bool) -> EpisodicError | None:
+        """Returns why a robot is not asked: it is stuck, or no time is left."""
         stuck = self._stuck.get(robot.name)
-        now_s = time.monotonic()
         if stuck is not None and stuck.is_alive():
-            self._done[robot.name] = BusyError(
+            return BusyError(
                 "still busy with an earlier question that it did not finish in time: is its disk "
                 "reachable?"
             )
-            return
-        if now_s >= self._end_s or self._call.deadline.expired():
-            self._done[robot.name] = QueryTimeoutError(
+        if is_over or call.deadline.expired():
+            return QueryTimeoutError(
                 "not asked: the time of the call was up; ask about fewer robots, or a shorter time"
             )
-            return
         self._stuck.pop(robot.name, None)
-        limit_s = min(self._limit_s, self._end_s - now_s)
-        call = replace(
-            self._call,
-            deadline=self._call.deadline.within(limit_s),
-            stages=Stages(),
-            used_active=False,
-        )
-        self._calls.append(call)
-        # A daemon: one that hangs must not keep the program from ending.
-        thread = threading.Thread(
-            target=contextvars.copy_context().run,
-            args=(self._run, robot, call),
-            name=f"robot-{robot.name}",
-            daemon=True,
-        )
-        thread.start()
-        running[robot.name] = thread, now_s + limit_s + self._grace_s
+        return None
 
-    def _run(self, robot: Robot, call: Call) -> None:
-        done: T | EpisodicError
+
+def _started(
+    robot: Robot,
+    work: Callable[[Robot, Call], T],
+    call: Call,
+    answers: SimpleQueue[tuple[str, T | EpisodicError]],
+) -> threading.Thread:
+    """Returns the thread that asks a robot; its answer goes into the queue."""
+
+    def run() -> None:
+        answer: T | EpisodicError
         try:
-            done = self._work(robot, call)
+            answer = work(robot, call)
         except EpisodicError as error:
-            done = error
+            answer = error
         except Exception:
             log.exception("robot_failed", robot=robot.name)
-            done = EpisodicError("failed through a fault in this server; its log has the cause")
-        with self._changed:
-            # Where it was given up meanwhile, its answer comes too late.
-            self._done.setdefault(robot.name, done)
-            self._changed.notify()
+            answer = EpisodicError("failed through a fault in this server; its log has the cause")
+        answers.put((robot.name, answer))
 
-    def _too_slow(self) -> QueryTimeoutError:
-        do = "ask about it alone, or about" if len(self._robots) > 1 else "ask about"
-        return QueryTimeoutError(f"no answer in {self._limit_s:.3g} s; {do} a shorter window")
+    # A daemon: one that hangs must not keep the program from ending.
+    thread = threading.Thread(
+        target=contextvars.copy_context().run,
+        args=(run,),
+        name=f"robot-{robot.name}",
+        daemon=True,
+    )
+    thread.start()
+    return thread
+
+
+def _add_costs(own: Call, call: Call) -> None:
+    """Adds what a robot's answer took to what the whole call did."""
+    for stage, spent in [*own.stages.spent.items()]:
+        call.stages.add(stage, spent)
+    call.used_active |= own.used_active
+
+
+def _too_slow(limit_s: float, *, alone: bool) -> QueryTimeoutError:
+    do = "ask about" if alone else "ask about it alone, or about"
+    return QueryTimeoutError(f"no answer in {limit_s:.3g} s; {do} a shorter window")

@@ -16,9 +16,10 @@ from heapq import merge
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.core.errors import BagError, QueryTimeoutError
 from ros2_memory.core.reply import with_notes
 from ros2_memory.core.text import listed, still_quoted
-from ros2_memory.core.timebase import iso_local
+from ros2_memory.core.timebase import iso_local, unix_rounded_up
 from ros2_memory.results import (
     AnswerWithNotes,
     Before,
@@ -36,6 +37,7 @@ from ros2_memory.tools.reply_size import to_json_text
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
 
+    from ros2_memory.core.errors import EpisodicError
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject, Merging
     from ros2_memory.core.timebase import Ns
@@ -45,6 +47,8 @@ _MOST_NAMED: Final = 8
 """Robots that a note names."""
 _LEFT_OUT: Final = ("notes", "more", "local")
 """Keys that are merged otherwise, or that say nothing of several robots."""
+FAILED: Final = "robots_failed"
+"""The key of the robots without an answer: for each the code of its error, whose note says more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +133,7 @@ TABLE_FOR_ALL: Final = frozenset({"trajectory_summary", "recent_trajectory_summa
 def merged(
     tool: str,
     replies: Sequence[RobotReply],
-    failures: Mapping[str, str],
+    failures: Mapping[str, EpisodicError],
     *,
     limit: int | None = None,
     oldest_first: bool = False,
@@ -145,47 +149,66 @@ def merged(
         oldest_first: whether the rows are wanted in this order; each reply has it already.
         max_chars: where the reply would be longer, rows for each robot are given shortly.
     """
-    order = sorted(replies, key=lambda each: (each.is_ahead, -(each.latest or 0), each.name))
-    if any("columns" in each.body for each in order):
-        reply = _one_table(order)
+    order = sorted(replies, key=lambda reply: (reply.is_ahead, -(reply.latest or 0), reply.name))
+    failed: JsonObject = {FAILED: {name: error.code for name, error in failures.items()}}
+    failed = failed if failures else {}
+    notes = _notes_on(order, failures)
+    if any("columns" in reply.body for reply in order):
+        found = _one_table(order)
     elif tool == "list_recorded_topics":
-        reply = {TOPICS: _by_topic(order)}
+        found = {TOPICS: _by_topic(order)}
     elif tool in MERGED_ROWS:
-        reply = _rows(MERGED_ROWS[tool], order, limit, oldest_first=oldest_first)
+        found = _rows(MERGED_ROWS[tool], order, limit, oldest_first=oldest_first)
     else:
-        return _robot_rows(tool, order, failures, max_chars)
-    return with_notes(reply, [*_notes_of(order), *_notes_on(order, failures)])
+        whole: list[JsonObject] = [{ROBOT_NAME: reply.name, **reply.body} for reply in order]
+        found = with_notes({"robots": [*whole], **failed}, notes)
+        if len(to_json_text(found)) <= max_chars:
+            return found
+        keys = dict.fromkeys((ROBOT_NAME, "now", *SHORT_KEYS[tool]))
+        short = [{key: row[key] for key in keys if key in row} for row in whole]
+        do = "each robot shortly; pass robot for all of it"
+        return with_notes({"robots": [*short], **failed}, [do, *notes])
+    own = by_reason(
+        (reply.name, note)
+        for reply in order
+        # `str(note)` would lose that it is quoted.
+        for note in _items(reply.body, "notes")
+        if isinstance(note, str)
+    )
+    return with_notes({**found, **failed}, [*map(_of_robots, own.values(), own), *notes])
 
 
 def _rows(
     rule: MergedRows, replies: Sequence[RobotReply], limit: int | None, *, oldest_first: bool
 ) -> JsonObject:
-    values = [_as_rows(each) for each in replies]
+    values = {reply.name: _as_rows(reply) for reply in replies}
     key = next(
-        (key for key in rule.rows for value in values if key in value), next(iter(rule.rows))
+        (key for key in rule.rows for value in values.values() if key in value),
+        next(iter(rule.rows)),
     )
     newest = partial(_time_of, rule.rows[key])
     order: Callable[[JsonObject], float] = newest if oldest_first else lambda row: -newest(row)
+    inherited = {name for name, how in rule.merging.items() if how == "inherited"}
     found: list[JsonObject] = []
     for is_ahead in (False, True):
         # Each reply is in order. A robot whose clock is ahead does not have the newest row.
         lists = [
-            [_named_row(rule, each.name, value, row) for row in _list(value.get(key))]
-            for each, value in zip(replies, values, strict=True)
-            if each.is_ahead is is_ahead
+            [
+                {ROBOT_NAME: reply.name, **_only(values[reply.name], inherited), **row}
+                for row in _list(values[reply.name].get(key))
+            ]
+            for reply in replies
+            if reply.is_ahead is is_ahead
         ]
         found += merge(*lists, key=order)
-    reply: JsonObject = {key: [*found[:limit]]}
+    rows: JsonObject = {key: [*found[:limit]]}
     if key == MATCHES:
-        if never := [each.name for each in replies if each.value is None]:
-            reply["never"] = [*never]
-        return reply
-    inherited = {name for name, how in rule.merging.items() if how == "inherited"}
-    reply |= _rest(rule, replies, [_without(value, {key, *inherited}) for value in values])
-    is_cut = len(found) > len(found[:limit])
-    if rule.marks_more and (is_cut or any(value.get("more") for value in values)):
-        reply["more"] = True
-    return reply
+        never = [reply.name for reply in replies if reply.value is None]
+        return {**rows, "never": [*never]} if never else rows
+    rest = {name: _without(value, {key, *inherited}) for name, value in values.items()}
+    is_cut = len(found) > len(found[:limit]) or any(value.get("more") for value in values.values())
+    more: JsonObject = {"more": True} if rule.marks_more and is_cut else {}
+    return {**rows, **_rest(rule, replies, rest), **more}
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -198,75 +221,53 @@ def _as_rows(reply: RobotReply) -> JsonObject:
     return reply.body
 
 
-def _named_row(rule: MergedRows, name: str, reply: JsonObject, row: JsonObject) -> JsonObject:
-    taken = {
-        key: reply[key]
-        for key, how in rule.merging.items()
-        if how == "inherited" and key in reply and key not in row
-    }
-    return {ROBOT_NAME: name, **row, **taken}
-
-
 def _rest(
-    rule: MergedRows, replies: Sequence[RobotReply], values: Sequence[JsonObject]
+    rule: MergedRows, replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
 ) -> JsonObject:
     """Returns what the replies have besides rows, and what of it is not the same for all."""
-    reply: JsonObject = {}
-    by_robot: dict[str, JsonValue] = {}
-    for key in dict.fromkeys(key for value in values for key in value):
+    found: JsonObject = {}
+    by_robot: dict[str, JsonObject] = {}
+    # Times of robots whose clock is ahead are compared only where there are no others.
+    dated = [reply.name for reply in replies if not reply.is_ahead] or [*values]
+    for key in dict.fromkeys(key for value in values.values() for key in value):
         if key in _LEFT_OUT:
             continue
-        each = {
-            one.name: value[key] for one, value in zip(replies, values, strict=True) if key in value
-        }
+        own = {name: value[key] for name, value in values.items() if key in value}
         how = rule.merging.get(key)
         if how == "who":
-            reply[key] = [name for name, is_so in each.items() if is_so]
+            found[key] = [name for name, is_so in own.items() if is_so]
         elif how == "counted":
-            reply[key] = _added(each.values())
+            found[key] = _added(own.values())
         elif how in {"earliest", "newest"}:
-            numbers = [
-                _number(each[one.name]) for one in _dated(replies) if each.get(one.name) is not None
-            ]
-            best = min if how == "earliest" else max
-            reply[key] = best(numbers, default=None)
-        elif how == "added" or key == AT_LEAST:
-            reply |= _summed(key, each.values(), values)
-            _add(by_robot, key, each)
-        elif len(each) == len(replies) and len({to_json_text(one) for one in each.values()}) == 1:
-            reply[key] = next(iter(each.values()))
+            numbers = [_number(own[name]) for name in dated if own.get(name) is not None]
+            found[key] = (min if how == "earliest" else max)(numbers, default=None)
+        elif how != "added" and key != AT_LEAST and _agree(own, len(values)):
+            found[key] = next(iter(own.values()))
         else:
-            _add(by_robot, key, each)
-    if by_robot:
-        reply["by_robot"] = by_robot
-    return reply
+            if how == "added" or key == AT_LEAST:
+                found |= _summed(key, own.values(), values.values())
+            for name, value in own.items():
+                by_robot.setdefault(name, {})[key] = value
+    return {**found, "by_robot": {**by_robot}} if by_robot else found
 
 
-def _dated(replies: Sequence[RobotReply]) -> list[RobotReply]:
-    """Returns the replies whose times can be compared; all of them where none can."""
-    return [each for each in replies if not each.is_ahead] or [*replies]
+def _agree(own: Mapping[str, JsonValue], robots: int) -> bool:
+    return len(own) == robots and len({to_json_text(value) for value in own.values()}) == 1
 
 
-def _summed(key: str, own: Iterable[JsonValue], values: Sequence[JsonObject]) -> JsonObject:
+def _summed(key: str, own: Iterable[JsonValue], values: Iterable[JsonObject]) -> JsonObject:
     """Returns a key with its sum; no total where a robot has not counted all, but at least."""
+    values = [*values]
     if key == _TOTAL and any(AT_LEAST in value for value in values):
         return {}
-    others = (value.get(_TOTAL) for value in values) if key == AT_LEAST else ()
-    numbers = [each for each in (*own, *others) if isinstance(each, int | float)]
-    return {key: round(sum(numbers), 2)}
-
-
-def _add(by_robot: dict[str, JsonValue], key: str, values: Mapping[str, JsonValue]) -> None:
-    for name, value in values.items():
-        row = by_robot.setdefault(name, {})
-        if isinstance(row, dict):
-            row[key] = value
+    others = [value.get(_TOTAL) for value in values] if key == AT_LEAST else []
+    return {key: round(sum(map(_number, (*own, *others))), 2)}
 
 
 def _added(objects: Iterable[JsonValue]) -> JsonObject:
     sums: Counter[str] = Counter()
-    for each in objects:
-        for key, count in each.items() if isinstance(each, dict) else ():
+    for counts in objects:
+        for key, count in counts.items() if isinstance(counts, dict) else ():
             sums[key] += count if isinstance(count, int) else 0
     return dict(sums.most_common())
 
@@ -274,17 +275,17 @@ def _added(objects: Iterable[JsonValue]) -> JsonObject:
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
     """Returns a row for each topic of a type, with the names of the robots that record it."""
     topics: dict[tuple[str, str], JsonObject] = {}
-    for each in replies:  # those whose clock ran ahead come last
-        for row in _list(each.value):
+    robots: dict[tuple[str, str], list[JsonValue]] = {}
+    for reply in replies:  # those whose clock ran ahead come last
+        for row in _list(reply.value):
             key = str(row["topic"]), str(row["type"])
-            known = topics.setdefault(key, {**row, "count": 0, f"{ROBOT_NAME}s": []})
+            known = topics.setdefault(key, {**row, "count": 0})
             for time, best in (("first_ts", min), ("last_ts", max)):
-                if not each.is_ahead:
+                if not reply.is_ahead:
                     known[time] = best(_number(known[time]), _number(row[time]))
             known["count"] = int(_number(known["count"]) + _number(row["count"]))
-            names = known[f"{ROBOT_NAME}s"]
-            if isinstance(names, list):
-                names.append(each.name)
+            known[f"{ROBOT_NAME}s"] = robots.setdefault(key, [])
+            robots[key].append(reply.name)
     return [*sorted(topics.values(), key=lambda row: (-_number(row["last_ts"]), str(row["topic"])))]
 
 
@@ -293,36 +294,20 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
 
     A column that one of them lacks is null there.
     """
-    headers = [[str(name) for name in _items(each.body, "columns")] for each in replies]
-    columns = [*dict.fromkeys(name for own in headers for name in own)]
+    headers = {reply.name: [*map(str, _items(reply.body, "columns"))] for reply in replies}
+    columns = [*dict.fromkeys(name for own in headers.values() for name in own)]
     rows: list[JsonValue] = []
     every: JsonObject = {}
-    for each, own in zip(replies, headers, strict=True):
-        for row in _items(each.body, "rows"):
+    for reply in replies:
+        own = headers[reply.name]
+        for row in _items(reply.body, "rows"):
             cells = dict(zip(own, row if isinstance(row, list) else (), strict=True))
-            rows.append([each.name, *(cells.get(name) for name in columns)])
-        if total := _items(each.body, "all"):
-            cells = dict(zip(own[1:], total, strict=True))
-            every[each.name] = [cells.get(name) for name in columns[1:]]
-    rest = [_without(each.body, {"columns", "rows", "all"}) for each in replies]
+            rows.append([reply.name, *map(cells.get, columns)])
+        if total := _items(reply.body, "all"):
+            every[reply.name] = [*map(dict(zip(own[1:], total, strict=True)).get, columns[1:])]
+    rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": every}
     return table | _rest(MergedRows({}), replies, rest)
-
-
-def _robot_rows(
-    tool: str, replies: Sequence[RobotReply], failures: Mapping[str, str], max_chars: int
-) -> JsonObject:
-    """Returns a row for each robot; shortly where they would be too long otherwise."""
-    whole: list[JsonObject] = [{ROBOT_NAME: each.name, **each.body} for each in replies]
-    notes = _notes_on(replies, failures)
-    reply = with_notes({"robots": [*whole]}, notes)
-    if len(to_json_text(reply)) <= max_chars:
-        return reply
-    keys = dict.fromkeys((ROBOT_NAME, "now", *SHORT_KEYS[tool]))
-    short = [{key: row[key] for key in keys if key in row} for row in whole]
-    return with_notes(
-        {"robots": [*short]}, ["each robot shortly; pass robot for all of it", *notes]
-    )
 
 
 def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
@@ -333,33 +318,33 @@ def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     return found
 
 
-def _notes_of(replies: Sequence[RobotReply]) -> list[str]:
-    """Returns the notes of the replies, each with the names of its robots."""
-    # `str(note)` would lose that it is quoted.
-    said = [
-        (each.name, note)
-        for each in replies
-        for note in _items(each.body, "notes")
-        if isinstance(note, str)
-    ]
-    return [_of_robots(names, note) for note, names in by_reason(said).items()]
+def reason_of(error: EpisodicError) -> str:
+    """Returns why a robot has no answer, as a phrase; names no path of this machine."""
+    match error:
+        case BagError():
+            return f"a bag cannot be read: {error.reason}"
+        case QueryTimeoutError(searched_back_to=int(back_to)):
+            return f"{error} (searched back to {unix_rounded_up(back_to):.3f})"
+        case _:
+            return str(error)
 
 
 def _of_robots(names: Sequence[str], note: str) -> str:
     return still_quoted(f"{listed(names, at_most=_MOST_NAMED)}: {note}", note)
 
 
-def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, str]) -> list[str]:
+def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicError]) -> list[str]:
     """Returns what is to be known of robots: who did not answer and why, whose clock is ahead."""
+    failed = by_reason((name, reason_of(error)) for name, error in failures.items())
     notes = [
         still_quoted(f"no answer of {_of_robots(names, reason)}", reason)
-        for reason, names in by_reason(failures.items()).items()
+        for reason, names in failed.items()
     ]
-    of_lake = {each.name: each.lake for each in replies if each.lake is not None}
-    said = ((name, note) for name, lake in of_lake.items() for note in lake.notes)
-    notes += [_of_robots(names, note) for note, names in by_reason(said).items()]
+    of_lake = {reply.name: reply.lake for reply in replies if reply.lake is not None}
+    unseen = by_reason((name, note) for name, lake in of_lake.items() for note in lake.notes)
+    notes += map(_of_robots, unseen.values(), unseen)
     notes += shipped_to({name: lake.latest for name, lake in of_lake.items()})
-    if ahead := [each.name for each in replies if each.is_ahead]:
+    if ahead := [reply.name for reply in replies if reply.is_ahead]:
         notes.append(
             f"{listed(ahead, at_most=_MOST_NAMED)}: dated in the future by a clock that ran ahead, "
             "so listed last: their times cannot be compared with others'"
@@ -372,18 +357,22 @@ def shipped_to(latest: Mapping[str, Ns | None]) -> list[str]:
     if not latest:
         return []
     order = sorted(latest, key=lambda name: latest[name] or 0)
-    parts = [f"{name} up to {_moment(latest[name])}" for name in order[:_MOST_NAMED]]
+    parts = []
+    for name in order[:_MOST_NAMED]:
+        time = latest[name]
+        at = "no time" if time is None else iso_local(time) or str(time)
+        parts.append(f"{name} up to {at}")
     if order[_MOST_NAMED:]:
         parts.append(f"{len(order) - _MOST_NAMED} others up to later")
     return [f"from the lake, which has what was shipped: {', '.join(parts)}"]
 
 
-def _moment(time: Ns | None) -> str:
-    return "no time" if time is None else iso_local(time) or str(time)
-
-
 def _without(value: JsonObject, keys: set[str]) -> JsonObject:
     return {key: item for key, item in value.items() if key not in keys}
+
+
+def _only(value: JsonObject, keys: set[str]) -> JsonObject:
+    return {key: item for key, item in value.items() if key in keys}
 
 
 def _items(reply: JsonObject, key: str) -> list[JsonValue]:

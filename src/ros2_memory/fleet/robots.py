@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -15,7 +16,7 @@ from ros2_memory.core.errors import (
     RefusedError,
 )
 from ros2_memory.core.text import abbreviate, listed
-from ros2_memory.core.timebase import MIN_NS, Clock
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -45,29 +46,35 @@ class FromLake(NamedTuple):
 
     Attributes:
         latest: the log time of the newest message that was shipped; None if there is none.
-        notes: what else was not looked at, or is not exact.
+        older: up to which log time (inclusive) there is more, which was not looked at; None if not.
     """
 
     latest: Ns | None
-    notes: tuple[str, ...] = ()
+    older: Ns | None = None
 
+    @classmethod
+    def of(cls, lake: Memory, call: Call) -> FromLake:
+        """Returns what is to be reported of a call that a lake has answered."""
+        published = lake.index.published
+        latest = None if published is None else published.latest
+        return cls(latest, None if call.older == MAX_NS else call.older)
 
-class LakeSource(Protocol):
-    """What a lake has of one robot."""
+    def since(self, begin: Ns | None) -> FromLake:
+        """Returns that of an answer from a log time on; None stands for all times."""
+        is_whole = self.older is None or (begin is not None and begin > self.older)
+        return self._replace(older=None) if is_whole else self
 
     @property
-    def memory(self) -> Memory:
-        """The robot's memory over its rows, always the same one."""
-
-    @property
-    def latest(self) -> Ns | None:
-        """The log time of the newest message that was shipped; None if there is none."""
-
-    def notes(self, begin: Ns | None = None) -> Iterable[str]:
-        """Returns the notes for the answer that this thread has just computed.
-
-        `begin` is from when (log time) the answer is; None for one that is of all days.
-        """
+    def notes(self) -> tuple[str, ...]:
+        """The note on days that the answer would need, if any."""
+        if self.older is None:
+            return ()
+        since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
+        note = (
+            f"the lake has days before {since}, which were not looked at: an end (or before, or a "
+            "time) there has them looked at"
+        )
+        return (note,)
 
 
 class Robot:
@@ -77,13 +84,11 @@ class Robot:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
         build: what builds its memory.
-        lake: what a lake has of it, which is asked first.
+        lake: its memory over what was shipped to a lake.
         is_mounted: whether there is a memory besides that of the lake.
 
     Attributes:
-        name: see above.
-        bag_dir: see above.
-        is_mounted: see above.
+        name: see above; likewise `bag_dir`, `lake` and `is_mounted`.
     """
 
     def __init__(
@@ -92,14 +97,14 @@ class Robot:
         bag_dir: Path,
         build: Callable[[], Memory],
         *,
-        lake: LakeSource | None = None,
+        lake: Memory | None = None,
         is_mounted: bool = True,
     ) -> None:
         self.name = name
         self.bag_dir = bag_dir
+        self.lake = lake
         self.is_mounted = is_mounted
         self._build = build
-        self._lake_source = lake
         self._lock = threading.Lock()
         self._memory: Memory | None = None
 
@@ -110,56 +115,35 @@ class Robot:
                 self._memory = self._build()
             return self._memory
 
-    @property
-    def lake_memory(self) -> Memory | None:
-        """Its memory over what was shipped to a lake; None without one."""
-        return None if self._lake_source is None else self._lake_source.memory
-
     def asked(
-        self,
-        ask: Callable[[Memory], T],
-        *,
-        lake: bool,
-        begin_of: Callable[[T, Ns], Ns | None] = lambda *_: None,
+        self, ask: Callable[[Memory, Call], T], call: Call, *, lake_first: bool
     ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
-        With `lake` the memory of the lake comes first, where it has anything of the robot; the
-        mounted one answers what needs messages that the lake does not have. Without `lake` the
-        mounted one comes first, unless it has no bag; the lake answers where it has no data, as
-        retention deletes bags. `begin_of` returns from when an answer is, by it and the newest log
-        time.
+        With `lake_first` the lake answers, where it has anything of the robot; the mounted memory
+        does where that needs messages that the lake does not have. Without, the mounted one does,
+        unless it has no bag, and the lake where that has no data, as retention deletes bags.
 
         Raises:
             NoDataError: none of the two has an answer; it is that of the mounted one, if any.
             NotInLakeError: it needs such messages, and the robot has no bags of its own.
         """
-        source = self._lake_source
-        if source is None:
-            return ask(self.memory()), None
-        if not lake and self._has_bags():
-            return self._own_first(source, ask, begin_of)
+        lake = self.lake
+        if lake is None:
+            return ask(self.memory(), call), None
+        if lake_first or not self._has_bags():
+            if not self.is_mounted or lake.index.snapshot().latest is not None:
+                try:
+                    return _of_lake(lake, ask, call)
+                except NotInLakeError:
+                    if not self._has_bags():
+                        raise
+            return ask(self.memory(), call), None
         try:
-            found = _of_lake(source, ask, begin_of)
-            if source.latest is not None or not self.is_mounted:
-                return found
-        except NoDataError:
-            if source.latest is not None or not self.is_mounted:
-                raise
-        except NotInLakeError:
-            if not self._has_bags():
-                raise
-        return ask(self.memory()), None
-
-    def _own_first(
-        self, source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
-    ) -> tuple[T, FromLake | None]:
-        """Returns what the mounted memory has; where it has no data, what the lake has."""
-        try:
-            return ask(self.memory()), None
+            return ask(self.memory(), call), None
         except NoDataError as error:
             try:
-                return _of_lake(source, ask, begin_of)
+                return _of_lake(lake, ask, call)
             except NoDataError:
                 raise error from None
             except (RefusedError, LakeError, QueryTimeoutError) as failure:
@@ -183,22 +167,15 @@ class Robot:
         return MIN_NS if latest is None else latest
 
 
-def _of_lake(
-    source: LakeSource, ask: Callable[[Memory], T], begin_of: Callable[[T, Ns], Ns | None]
-) -> tuple[T, FromLake]:
-    """Returns what `ask` finds in a lake, with its notes; raises what it raises."""
-    begin: Ns | None = None
+def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
+    """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
+    call.older = MAX_NS
     try:
-        try:
-            found = ask(source.memory)
-            if source.latest is not None:
-                begin = begin_of(found, source.latest)
-        finally:
-            # Also of an answer that failed: they are not those of the next one.
-            notes = (*source.notes(begin),)
+        found = ask(lake, call)
     except NoDataError as error:
-        raise NoDataError(error.reason, "; ".join((error.detail, *notes)), error.notes) from error
-    return found, FromLake(source.latest, notes)
+        detail = "; ".join((error.detail, *FromLake.of(lake, call).notes))
+        raise NoDataError(error.reason, detail, error.notes) from error
+    return found, FromLake.of(lake, call)
 
 
 class Fleet:
@@ -226,7 +203,7 @@ class Fleet:
         shared_map: bool = False,
         join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
     ) -> None:
-        self.robots: Mapping[str, Robot] = {each.name: each for each in robots}
+        self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
         self.clock = clock
         self.shared_map = shared_map
         self.grows = join is not None
@@ -244,13 +221,13 @@ class Fleet:
         with self._lock:
             found = [*self._join(self.robots)]
             # A new dict: other threads iterate over the old one.
-            self.robots = {**self.robots, **{each.name: each for each in found}}
+            self.robots = {**self.robots, **{robot.name: robot for robot in found}}
         return found
 
     def allowed(self, call: Call) -> list[Robot]:
         """Returns the robots that a call may ask about, in the order of the configuration."""
         robots = call.robots
-        return [each for name, each in self.robots.items() if robots is None or name in robots]
+        return [robot for name, robot in self.robots.items() if robots is None or name in robots]
 
     def named(self, name: object, call: Call) -> Robot:
         """Returns the robot of a name.
@@ -263,31 +240,17 @@ class Fleet:
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
-        for each in allowed:
-            if each.name == name:
-                return each
+        for robot in allowed:
+            if robot.name == name:
+                return robot
         raise InvalidArgumentsError(
             f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
-        )
-
-    def the_one(self, tool: str, call: Call) -> Robot:
-        """Returns the only robot that a call may ask about.
-
-        Raises:
-            InvalidArgumentsError: there are several; the sentence names them.
-        """
-        allowed = self.allowed(call)
-        if len(allowed) == 1:
-            return allowed[0]
-        example = f", e.g. robot={allowed[0].name}" if allowed else ""
-        raise InvalidArgumentsError(
-            f"which robot? {tool} answers for one: pass robot{example}; there {names_of(allowed)}"
         )
 
 
 def names_of(robots: Iterable[Robot]) -> str:
     """Returns the names of robots for a sentence."""
-    names = [each.name for each in robots]
+    names = [robot.name for robot in robots]
     if not names:
         return "is none"
     return f"{'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"

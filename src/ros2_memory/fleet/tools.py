@@ -11,7 +11,6 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import (
-    BagError,
     EpisodicError,
     InvalidArgumentsError,
     NoDataError,
@@ -31,10 +30,11 @@ from ros2_memory.fleet.merging import (
     RobotReply,
     by_reason,
     merged,
+    reason_of,
     shipped_to,
 )
 from ros2_memory.fleet.page import Page
-from ros2_memory.fleet.robots import Robot, StoppedClock
+from ros2_memory.fleet.robots import Robot, StoppedClock, names_of
 from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.fleet.robots import Fleet, FromLake
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Answer, OneAnswer
+    from ros2_memory.results import OneAnswer
     from ros2_memory.tools.declaration import Question, Tool
 
 ROBOT: Final = "robot"
@@ -90,27 +90,23 @@ def fleet_tools(
 
 
 def _described(tool: Tool) -> tuple[str, JsonObject]:
-    text, schema = tool.description, tool.schema
-    needs = "Its name; without it, all." if tool.name in ANSWER_FOR_ALL else "Its name."
+    """Returns the description, with the shape of the reply for all robots, and the schema."""
+    text, needs = tool.description, "Its name."
     if tool.name in TABLE_FOR_ALL:
-        needs = "Its name; without it, by of all."
-    properties = schema.get("properties")
+        needs = "Its name; without it, or with several (a, b), by of all."
+    if tool.name in ANSWER_FOR_ALL:
+        needs = "Its name, or several (a, b); without it, all."
+        shape = f"{{robots: [{{{ROBOT_NAME}, ...}}]}}"
+        if tool.name in MERGED_ROWS:
+            key = next(iter(MERGED_ROWS[tool.name].rows))
+            name = f"{ROBOT_NAME}s" if key == TOPICS else ROBOT_NAME
+            also = ", never: robots that never did" if key == MATCHES else ""
+            shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
+        text = f"{text} Of all robots: {shape}."
+    properties = tool.schema.get("properties")
     known = properties if isinstance(properties, dict) else {}
     argument: JsonObject = {"type": "string", "description": needs}
-    return _for_all(tool.name, text), {**schema, "properties": {ROBOT: argument, **known}}
-
-
-def _for_all(tool: str, text: str) -> str:
-    """Returns a description with the shape of the reply for all robots."""
-    if tool not in ANSWER_FOR_ALL:
-        return text
-    shape = f"{{robots: [{{{ROBOT_NAME}, ...}}]}}"
-    if tool in MERGED_ROWS:
-        key = next(iter(MERGED_ROWS[tool].rows))
-        name = f"{ROBOT_NAME}s" if key == TOPICS else ROBOT_NAME
-        also = ", never: robots that never did" if key == MATCHES else ""
-        shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
-    return f"{text} Of all robots: {shape}."
+    return text, {**tool.schema, "properties": {ROBOT: argument, **known}}
 
 
 class _Asked(NamedTuple):
@@ -122,7 +118,7 @@ class _Asked(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _FleetQuestions:
-    """Checks the arguments of a call, and returns what asks one robot or all."""
+    """Checks the arguments of a call, and returns what asks one robot or several."""
 
     tool: Tool
     fleet: Fleet
@@ -131,17 +127,26 @@ class _FleetQuestions:
 
     def __call__(self, given: Mapping[str, object]) -> Question:
         own = {name: value for name, value in given.items() if name != ROBOT}
-        asked = _Asked(self.tool.question(own), own)
-        name = given.get(ROBOT)
-        if name is not None:
-            return lambda _, call: self._of_one(self.fleet.named(name, call), asked, call)
+        asked, named = _Asked(self.tool.question(own), own), given.get(ROBOT)
         is_table = self.tool.name in TABLE_FOR_ALL and given.get("by") is not None
         is_of_all = self.tool.name in ANSWER_FOR_ALL or is_table
-        if not is_of_all or given.get("between") is not None:
-            return lambda _, call: self._of_one(
-                self.fleet.the_one(self.tool.name, call), asked, call
+        several = named.split(",") if isinstance(named, str) and "," in named else None
+
+        def ask(_: Memory, call: Call) -> OfRobot | OfFleet:
+            if named is not None and several is None:
+                return self._of_one(self.fleet.named(named, call), asked, call)
+            robots = (
+                self.fleet.allowed(call)
+                if several is None
+                else [
+                    self.fleet.named(name, call) for name in dict.fromkeys(map(str.strip, several))
+                ]
             )
-        return lambda _, call: self._of_all(asked, call)
+            if is_of_all and given.get("between") is None:
+                return self._of_all(robots, asked, call)
+            return self._of_one(_only_one(self.tool.name, robots), asked, call)
+
+        return ask
 
     def _of_one(self, robot: Robot, asked: _Asked, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
@@ -151,26 +156,22 @@ class _FleetQuestions:
         """
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
-            answer, lake = robot.asked(
-                lambda memory: _single(_answer(asked.question, memory, own)),
-                lake=self._is_of_lake,
-                begin_of=partial(_begin_of, asked.given),
-            )
+            question, lake_first = partial(_answer, asked.question), self.tool.name in OF_LAKE
+            answer, lake = robot.asked(question, own, lake_first=lake_first)
             return answer, lake, own.now
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
             raise found
         answer, lake, now = found
-        notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
+        notes: tuple[str, ...] = ()
+        if lake is not None:
+            unseen = lake.since(_begin_of(asked.given, answer, lake.latest)).notes
+            notes = (*shipped_to({robot.name: lake.latest}), *unseen)
         return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
 
-    @property
-    def _is_of_lake(self) -> bool:
-        return self.tool.name in OF_LAKE
-
-    def _of_all(self, asked: _Asked, call: Call) -> OfFleet:
-        robots, given = self.fleet.allowed(call), asked.given
+    def _of_all(self, robots: list[Robot], asked: _Asked, call: Call) -> OfFleet:
+        given = asked.given
         if not robots:
             raise RefusedError("there is no robot that this token may ask about")
         if len(robots) > 1 and not self.fleet.shared_map and (name := _coordinates_in(given)):
@@ -183,15 +184,15 @@ class _FleetQuestions:
         limit, oldest_first = self._limit(given.get("limit")), given.get("oldest_first") is True
         page = Page(limit, oldest_first=oldest_first)
         found = self.fan_out.ask(robots, partial(self._reply, asked, now, page), call)
-        replies = [each for each in found.values() if isinstance(each, RobotReply)]
-        errors = {name: each for name, each in found.items() if isinstance(each, EpisodicError)}
+        replies = [reply for reply in found.values() if isinstance(reply, RobotReply)]
+        errors = {name: error for name, error in found.items() if isinstance(error, EpisodicError)}
         if not replies:
             raise _shared_error(errors)
         return OfFleet(
             merged(
                 self.tool.name,
                 replies,
-                {name: _reason(each) for name, each in errors.items()},
+                errors,
                 limit=limit,
                 oldest_first=oldest_first,
                 max_chars=self.max_chars,
@@ -207,35 +208,27 @@ class _FleetQuestions:
             EpisodicError: it has none.
         """
 
-        def ask(memory: Memory) -> tuple[RobotReply, OneAnswer]:
-            return self._replied(asked.question, replace(memory, clock=now), page, robot, call)
+        def ask(memory: Memory, own: Call) -> tuple[RobotReply, OneAnswer]:
+            snapshot = memory.index.snapshot()
+            if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
+                # "Never" would be a claim about bags that were not searched.
+                raise RefusedError(snapshot.problem)
+            latest = snapshot.latest
+            is_ahead = latest is not None and latest > now.at + _AHEAD_NS
+            # Rows of those whose clock is ahead come last, whenever they are.
+            own.rows_in = None if is_ahead else page.window()
+            answer = _answer(asked.question, replace(memory, clock=now), own)
+            if isinstance(answer, Sightings) and not is_ahead:
+                page.add(sighting.last for sighting in answer.sightings)
+                page.add(episode.until for episode in answer.episodes)
+            value = as_json(answer, memory.index.bag_dir)
+            if own.now is not None and isinstance(value, dict):
+                value = {"now": unix_rounded_up(own.now), **value}
+            return RobotReply(robot.name, value, latest, is_ahead), answer
 
-        (reply, _), lake = robot.asked(
-            ask,
-            lake=self._is_of_lake,
-            begin_of=lambda found, latest: _begin_of(asked.given, found[1], latest),
-        )
-        return replace(reply, lake=lake)
-
-    def _replied(
-        self, question: Question, memory: Memory, page: Page, robot: Robot, call: Call
-    ) -> tuple[RobotReply, OneAnswer]:
-        snapshot = memory.index.snapshot()
-        if snapshot.problem is not None and self.tool.name not in _REPORTS_ITSELF:
-            # "Never" would be a claim about bags that were not searched.
-            raise RefusedError(snapshot.problem)
-        latest = snapshot.latest
-        is_ahead = latest is not None and latest > memory.clock.now() + _AHEAD_NS
-        # Rows of those whose clock is ahead come last, whenever they are.
-        call.rows_in = None if is_ahead else page.window()
-        answer = _single(_answer(question, memory, call))
-        if isinstance(answer, Sightings) and not is_ahead:
-            page.add(each.last for each in answer.sightings)
-            page.add(each.until for each in answer.episodes)
-        value = as_json(answer, memory.index.bag_dir)
-        if call.now is not None and isinstance(value, dict):
-            value = {"now": unix_rounded_up(call.now), **value}
-        return RobotReply(robot.name, value, latest, is_ahead), answer
+        (reply, answer), lake = robot.asked(ask, call, lake_first=self.tool.name in OF_LAKE)
+        begin = None if lake is None else _begin_of(asked.given, answer, lake.latest)
+        return replace(reply, lake=lake and lake.since(begin))
 
     def _limit(self, given: object) -> int | None:
         """Returns how many rows a call wants, all robots together."""
@@ -247,23 +240,22 @@ class _FleetQuestions:
         return default if isinstance(default, int) else None
 
 
-def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns) -> Ns | None:
+def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None) -> Ns | None:
     """Returns from when an answer is: its match, or the start that was given; None if from ever."""
     if isinstance(answer, Match) and answer.found is not None:
         return answer.found.sample.time
     start, last_s = given.get("start"), given.get("last_s", given.get("seconds"))
     if isinstance(start, int | float):
         return ns_from_unix(start)
-    return latest - ns_from_unix(last_s) if isinstance(last_s, int | float) else None
+    if latest is None or not isinstance(last_s, int | float):
+        return None
+    return latest - ns_from_unix(last_s)
 
 
-def _answer(question: Question, memory: Memory, call: Call) -> Answer:
+def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:
     """Returns a robot's answer, in the thread that it is asked in."""
     with call.reading(memory.large):
-        return question(memory, call)
-
-
-def _single(answer: Answer) -> OneAnswer:
+        answer = question(memory, call)
     if isinstance(answer, OfRobot | OfFleet):
         raise TypeError("a tool of one robot answered for several")
     return answer
@@ -281,20 +273,23 @@ def _coordinates_in(given: Mapping[str, object]) -> str | None:
     return next((name for name in ("x", "y") if given.get(name) is not None), None)
 
 
-def _reason(error: EpisodicError) -> str:
-    """Returns why a robot has no answer, as a phrase; names no path of this machine."""
-    match error:
-        case BagError():
-            return f"a bag cannot be read: {error.reason}"
-        case QueryTimeoutError(searched_back_to=int(back_to)):
-            return f"{error} (searched back to {unix_rounded_up(back_to):.3f})"
-        case _:
-            return str(error)
+def _only_one(tool: str, robots: Sequence[Robot]) -> Robot:
+    """Returns the only one of some robots.
+
+    Raises:
+        InvalidArgumentsError: there are several, or none; the sentence names them.
+    """
+    if len(robots) == 1:
+        return robots[0]
+    example = f", e.g. robot={robots[0].name}" if robots else ""
+    raise InvalidArgumentsError(
+        f"which robot? {tool} answers for one: pass robot{example}; there {names_of(robots)}"
+    )
 
 
 def _shared_error(errors: Mapping[str, EpisodicError]) -> EpisodicError:
     """Returns the error where no robot has an answer."""
-    reasons = by_reason((name, _reason(error)) for name, error in errors.items())
+    reasons = by_reason((name, reason_of(error)) for name, error in errors.items())
     text = "; ".join(f"{listed(names)}: {reason}" for reason, names in reasons.items())
     kinds = {type(error) for error in errors.values()}
     first = next(iter(errors.values()))

@@ -56,6 +56,7 @@ class BagAccess:
         self.call = call
         with call.stages.timed("index"):
             self.snapshot = memory.index.snapshot(reach)
+        call.saw(self.snapshot)
         self.notes = Notes()
         self._deadline = call.deadline
 

@@ -242,6 +242,8 @@ class Call:
         rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
             count all the same. None for all.
         now: what the answer's ages count from, where that is not the wall clock.
+        older: up to which log time (inclusive) there are bags that it was not shown, as those of a
+            lake are shown some days at a time; None where it was shown all, `MAX_NS` before any.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
@@ -250,6 +252,14 @@ class Call:
     robots: frozenset[str] | None = None
     rows_in: TimeWindow | None = None
     now: Ns | None = None
+    older: Ns | None = MAX_NS
+
+    def saw(self, snapshot: Snapshot) -> None:
+        """Notes that the call was shown what a snapshot has."""
+        if snapshot.older is None or self.older is None:
+            self.older = None
+        else:
+            self.older = min(self.older, snapshot.older)
 
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""

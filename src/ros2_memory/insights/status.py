@@ -221,6 +221,10 @@ def missing_data(view: View) -> Iterator[str]:
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
     yield from describe_absent(view.memory.absent_splits(snapshot))
+    newest = max(snapshot.bags, key=lambda bag: bag.end, default=None)
+    if newest is not None and (alone := view.memory.reader.times_alone(newest.path)):
+        topics = counted(len(alone), "topic")
+        yield f"of {topics} there are only the times here: {listed(sorted(alone))}"
     if undecodable := {each.topic for each in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"

@@ -5,19 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, cast
 
 from pyiceberg.expressions import (
+    AlwaysFalse,
     And,
     EqualTo,
     GreaterThanOrEqual,
     In,
-    IsNull,
     LessThan,
     LessThanOrEqual,
-    NotIn,
     Or,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Sequence
+    from collections.abc import Callable, Collection, Iterable
     from datetime import date
 
     from pyiceberg.expressions import BooleanExpression
@@ -31,24 +30,12 @@ _equal: Final = cast("Predicate", EqualTo)
 _at_least: Final = cast("Predicate", GreaterThanOrEqual)
 _at_most: Final = cast("Predicate", LessThanOrEqual)
 _below: Final = cast("Predicate", LessThan)
-_is_null: Final = cast("Callable[[str], BooleanExpression]", IsNull)
 _one_of: Final = cast("Predicate", In)
-_none_of: Final = cast("Predicate", NotIn)
 
 
-def any_of(conditions: Sequence[BooleanExpression]) -> BooleanExpression:
-    """Returns the condition that one of some conditions holds, of which there is at least one."""
-    return Or(*conditions) if len(conditions) > 1 else conditions[0]
-
-
-def except_bags(condition: BooleanExpression, ids: Collection[str]) -> BooleanExpression:
-    """Returns a condition without the rows of some bags."""
-    return And(condition, _none_of("bag_id", ids)) if ids else condition
-
-
-def of_topics(condition: BooleanExpression, topics: Collection[str]) -> BooleanExpression:
-    """Returns a condition on rows of some topics alone."""
-    return And(condition, _one_of("topic", topics))
+def of_topics(topics: Collection[str]) -> BooleanExpression:
+    """Returns the condition on rows of some topics."""
+    return _one_of("topic", topics)
 
 
 def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
@@ -56,34 +43,30 @@ def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
     return And(_one_of("robot", robots), _equal("day", day.isoformat()))
 
 
-def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
-    """Returns the condition on rows of bags, at least one, given by robot, day and id.
+def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
+    """Returns the condition on rows of bags of a robot, of any day.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
+    bounds = And(_at_least("bag_id", min(ids)), _at_most("bag_id", max(ids)))
+    return And(_equal("robot", robot), bounds, _one_of("bag_id", ids))
+
+
+def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
+    """Returns the condition on rows of bags, given by robot, day and id."""
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    return any_of(
-        [And(of_robots([robot], day), of_ids(robot, some)) for (robot, day), some in ids.items()]
-    )
-
-
-def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
-    """Returns the condition on rows of bags of a robot, of any day."""
-    return And(
-        _equal("robot", robot),
-        _at_least("bag_id", min(ids)),
-        _at_most("bag_id", max(ids)),
-        _one_of("bag_id", ids),
-    )
+    found: BooleanExpression = AlwaysFalse()
+    for (robot, day), some in ids.items():
+        found = Or(found, And(of_robots([robot], day), of_ids(robot, some)))
+    return found
 
 
 def overlapping(robot: str, columns: tuple[str, str], start: Ns, stop: Ns) -> BooleanExpression:
     """Returns the condition on rows of a robot whose span reaches into `[start, stop)`.
 
-    `columns` have its first and last time (inclusive); a last time that is null is the first.
+    `columns` have its first and last time (inclusive).
     """
     first, last = columns
-    ends = Or(_at_least(last, start), And(_is_null(last), _at_least(first, start)))
-    return And(_equal("robot", robot), _below(first, stop), ends)
+    return And(_equal("robot", robot), _below(first, stop), _at_least(last, start))

@@ -1,4 +1,8 @@
-"""The data files of a lake's tables that hold what a question is about."""
+"""The data files of a lake's tables by robot and day, and selects over them.
+
+A plan of pyiceberg reads all manifests that can have a day, again for each day; over years that
+takes most of an answer. Manifests never change, so each is read once.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +10,120 @@ import math
 import threading
 import time
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Final
+from datetime import date, timedelta
+from itertools import chain
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from pyiceberg.exceptions import NoSuchTableError
+from pyiceberg.manifest import ManifestContent
+from pyiceberg.transforms import IdentityTransform
 
+from ros2_memory.core.errors import RefusedError
 from ros2_memory.lake.engines.base import DataFiles
-from ros2_memory.lake.partitions import Partitions
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from contextlib import AbstractContextManager
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
+    from pyiceberg.manifest import ManifestFile
+    from pyiceberg.partitioning import PartitionSpec
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
-    from ros2_memory.lake.partitions import Days, LakeFile
 
+_EPOCH: Final = date(1970, 1, 1)
+_LAST: Final = "\U0010ffff"
+"""After all ids of bags."""
 _MESSAGE_BYTES: Final = 64 << 20
+
+
+class LakeFile(NamedTuple):
+    """A Parquet file, how many rows it has, and its size (bytes).
+
+    No id of a bag in it is before `first`, nor after `last`.
+    """
+
+    location: str
+    rows: int
+    size: int = 0
+    first: str = ""
+    last: str = _LAST
+
+
+Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
+"""The files of one robot in one table by day, in order of the days."""
+_Files: TypeAlias = "Mapping[tuple[str, date], Sequence[LakeFile]]"
+"""Files by robot and day."""
+
+
+class Partitions:
+    """The files of the versions of one table that it was last shown. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._snapshot: int | None = None
+        self._read: dict[str, _Files] = {}
+        self._robots: dict[str, dict[date, Sequence[LakeFile]]] = {}
+
+    def look(self, table: IcebergTable) -> Mapping[str, Days]:
+        """Returns the files of a table's current version, by robot.
+
+        Raises:
+            RefusedError: another program wrote what cannot be read by robot and day.
+        """
+        snapshot = table.current_snapshot()
+        if snapshot is None or snapshot.snapshot_id == self._snapshot:
+            return self._robots
+        read: dict[str, _Files] = {}
+        for manifest in snapshot.manifests(table.io):
+            path = manifest.manifest_path
+            read[path] = self._read.get(path) or _files(table, manifest)
+        found: dict[tuple[str, date], list[LakeFile]] = {}
+        for part, files in chain.from_iterable(some.items() for some in read.values()):
+            found.setdefault(part, []).extend(files)
+        self._robots = {}
+        for robot, day in sorted(found):
+            self._robots.setdefault(robot, {})[day] = found[robot, day]
+        self._read, self._snapshot = read, snapshot.snapshot_id
+        return self._robots
+
+
+def _files(table: IcebergTable, manifest: ManifestFile) -> _Files:
+    entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
+    if entries and manifest.content is ManifestContent.DELETES:
+        raise RefusedError(
+            f"the lake's table {table.name()[-1]} has delete files, which another program "
+            "wrote: rewrite them into its data files first (copy-on-write)"
+        )
+    spec = table.specs()[manifest.partition_spec_id]
+    robot, day = (_position(table, spec, column) for column in ("robot", "day"))
+    bag_id = table.schema().find_field("bag_id").field_id
+    found: dict[tuple[str, date], list[LakeFile]] = {}
+    for data in (entry.data_file for entry in entries):
+        when = _EPOCH + timedelta(days=data.partition[day])
+        first, last = (
+            bytes(bounds.get(bag_id) or b"").decode()
+            for bounds in (data.lower_bounds or {}, data.upper_bounds or {})
+        )
+        file = LakeFile(
+            data.file_path, data.record_count, data.file_size_in_bytes, first, last or _LAST
+        )
+        found.setdefault((str(data.partition[robot]), when), []).append(file)
+    return found
+
+
+def _position(table: IcebergTable, spec: PartitionSpec, column: str) -> int:
+    source = table.schema().find_field(column).field_id
+    for position, part in enumerate(spec.fields):
+        if part.source_id == source and isinstance(part.transform, IdentityTransform):
+            return position
+    raise RefusedError(
+        f"the lake's table {table.name()[-1]} has files that are not of one {column}, which "
+        "another program wrote: partition it by robot and day again"
+    )
 
 
 def _as_they_are(_: str) -> AbstractContextManager[None]:
@@ -69,7 +166,7 @@ class Lake:
         `bags` is committed last, so nothing else changes for those who ask about its rows.
 
         Raises:
-            RefusedError: the lake cannot be read.
+            RefusedError: the lake cannot be read; so do all others.
         """
         with self._lock, self._translated("looking into the lake"):
             if time.monotonic() - self._looked_at < within_s:
@@ -80,37 +177,28 @@ class Lake:
             self._looked_at = time.monotonic()
 
     def robots(self) -> list[str]:
-        """Returns the names of all robots that have bags, in order; no file of rows is read.
-
-        Raises:
-            RefusedError: the lake cannot be read.
-        """
-        with self._lock, self._translated("looking into the lake"):
-            return [*self._days("bags")]
+        """Returns the names of all robots that have bags, in order; no file of rows is read."""
+        return [*self._days("bags")]
 
     def days(self, name: str, robot: str) -> Days:
-        """Returns the files of a robot in a table, in which no row of another one is.
-
-        Raises:
-            RefusedError: the lake cannot be read.
-        """
-        with self._lock, self._translated("looking into the lake"):
-            return self._days(name).get(robot, {})
+        """Returns the files of a robot in a table, in which no row of another one is."""
+        return self._days(name).get(robot, {})
 
     def select(
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
     ) -> pa.Table:
-        """Returns the rows of a select (see `LakeEngine`) over some files of a table.
-
-        Raises:
-            RefusedError: the lake cannot be read.
-        """
+        """Returns the rows of a select (see `LakeEngine`) over some files of a table."""
         with self._lock, self._translated("looking into the lake"):
             table = self._table(name)
         store = {} if table is None else dict(table.io.properties)
-        locations = tuple(each.location for each in files)
+        locations = tuple(file.location for file in files)
         found = DataFiles(TABLES[name].arrow_schema, locations, store)
         return self._engine.select(sql, {name: found}, parameters or {})
+
+    def _days(self, name: str) -> Mapping[str, Days]:
+        with self._lock, self._translated("looking into the lake"):
+            table = self._table(name)
+            return {} if table is None else self._partitions[name].look(table)
 
     def _table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:
@@ -119,7 +207,3 @@ class Lake:
             except NoSuchTableError:
                 return None
         return self._tables[name]
-
-    def _days(self, name: str) -> Mapping[str, Days]:
-        table = self._table(name)
-        return {} if table is None else self._partitions[name].look(table)

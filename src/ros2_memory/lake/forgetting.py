@@ -1,40 +1,114 @@
-"""Forgets a time of a robot in a lake: rows, old versions and files.
+"""Forgets a time of a robot in a lake, for good: rows, old versions, files, and late copies.
 
-Each bag that reaches into the time goes as a whole, or, where topics are forgotten, that holds some
+Each bag goes as a whole that has something of that time, or, where topics are forgotten, something
 of them: where its file is still there without the messages, it is shipped again.
+
+Tombstones lie in the lake's state directory and are kept for ever. Each is written durably before
+anything is deleted, and again as done when all of it is gone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import astuple, dataclass, field, replace
+from typing import TYPE_CHECKING, Final
 
+from pyiceberg.expressions import And
+
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
+from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.lake.conditions import (
-    any_of,
-    except_bags,
-    of_bags,
-    of_ids,
-    of_topics,
-    overlapping,
-)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.lake.conditions import of_bags, of_ids, of_topics, overlapping
+from ros2_memory.lake.rows import id_of_file
 from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.tombstones import append_tombstone
 from ros2_memory.lake.upkeep import expire
-from ros2_memory.lake.warehouse import quiet_deletes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from datetime import date
+    from pathlib import Path
 
     from pyiceberg.expressions import BooleanExpression
-    from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.lake.tombstones import Tombstone
-    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.bag_dir.state_files import Forgetting
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.lake.warehouse import LakeTables
+    from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
+
+TOMBSTONES_FILE: Final = "tombstones.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Tombstone:
+    """Messages of a robot that were forgotten: those of a window (log times, half-open).
+
+    Where there are `topics`, only theirs; where there are `bags`, all of these alone, by their ids.
+    `done`: all of it is gone; two that differ in that alone are equal.
+    """
+
+    robot: str
+    start: Int64
+    stop: Int64
+    topics: tuple[str, ...] = ()
+    bags: tuple[str, ...] = ()
+    done: bool = field(default=False, compare=False)
+
+    @classmethod
+    def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
+        """Returns what a robot's bag directory asks for."""
+        ids = [id_of_file(robot, *astuple(bag)) for bag in forgetting.bags]
+        return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
+
+    def forbids(self, reader: BagReader, robot: str, bag: BagFile, bag_id: str) -> bool:
+        """Returns whether a bag has a message that was forgotten.
+
+        Raises:
+            BagError: it cannot be read.
+        """
+        window = TimeWindow(self.start, self.stop)
+        if self.bags:
+            return robot == self.robot and bag_id in self.bags
+        if robot != self.robot or not window.overlaps(bag.start, bag.end):
+            return False
+        topics = {known.topic for known in bag.summary.topics}
+        wanted = tuple(topics.intersection(self.topics) if self.topics else topics)
+        return any(True for _ in reader.records(bag.path, wanted, window))
+
+
+TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
+
+
+def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> None:
+    """Appends a tombstone durably, or that it is done.
+
+    Raises:
+        LakeError: it cannot be written.
+    """
+    try:
+        TOMBSTONES.append(state_dir, [replace(tombstone, done=done)])
+    except OSError as error:
+        path = state_dir / TOMBSTONES_FILE
+        raise LakeError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
+    """Returns the tombstones, and whether each is done.
+
+    Raises:
+        LakeError: they cannot be read, or a line is damaged: nothing may be shipped then.
+    """
+    found: dict[Tombstone, bool] = {}
+    try:
+        for _, tombstone in TOMBSTONES.all_rows(state_dir):
+            found[tombstone] = tombstone.done or found.get(tombstone, False)
+    except (OSError, ValueError) as error:
+        raise LakeError(
+            f"{state_dir / TOMBSTONES_FILE}: {error}; nothing is shipped until it is repaired, "
+            "since what was forgotten could come back"
+        ) from error
+    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,56 +120,41 @@ class Forgotten:
     kept_by: tuple[str, ...] = ()
 
 
-def forget_in_lake(
-    location: LakeLocation, tables: Mapping[str, IcebergTable], tombstone: Tombstone, now: Ns
-) -> Forgotten:
+def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     """Deletes what a tombstone names, which is written already; killed anywhere, it is done again.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    with location.translated("forgetting in the lake"):
-        named = of_ids(tombstone.robot, tombstone.bags) if tombstone.bags else None
-        found = _bags(tables["bags"], named or _reaching(tombstone, "bags"))
-        spared: set[str] = set()
-        if tombstone.topics:
-            # What is in the lake of a bag shows in its channels.
-            holding = of_topics(_reaching(tombstone, "channels"), tombstone.topics)
-            holders = {bag_id for _, bag_id in _bags(tables["channels"], holding)}
-            spared = {bag_id for _, bag_id in found} - holders
-        bags = [(tombstone.robot, *each) for each in found if each[1] not in spared]
-        # `bags` last: until then it lists the rows to delete.
-        for name in TABLES:
-            # By their own times, too: a killed process left rows without one in `bags`.
-            conditions = [named or except_bags(_reaching(tombstone, name), spared)]
-            if bags:
-                conditions.append(of_bags(bags))
-            table = tables[name]
-            with quiet_deletes():
-                table.refresh().delete(any_of(conditions))
-            # The list of what a version deleted has the bounds of its columns, which are texts of
-            # rows; the next version does not refer to it.
-            table.append(table.schema().as_arrow().empty_table())
-    # The versions before hold what was deleted, so they go whatever their age.
-    files = expire(location, tables, now, 0)
-    kept_by = tuple(
-        f"{name}: {ref}"
-        for name, table in tables.items()
-        for ref, each in table.metadata.refs.items()
-        if each.snapshot_id != table.metadata.current_snapshot_id
-    )
-    append_tombstone(location.state_dir, tombstone, done=True)
+    # `channels` has a row of each bag of which anything is in the lake: it is the first to be
+    # committed, and the last from which is deleted.
+    bags = _bags(lake, "channels", _of(tombstone, "first_ns", "last_ns"))
+    # In `bags` alone: of which no message counts, and what a killed process was about to replace.
+    listed = _bags(lake, "bags", _of(replace(tombstone, topics=()), "start_ns", "end_ns"))
+    if tombstone.topics and listed:
+        ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
+        listed -= _bags(lake, "channels", ids)
+    bags |= listed
+    for name in reversed([*TABLES]):
+        lake.delete(name, of_bags(bags))
+    # The versions before have what was deleted, so they go whatever their age, and the clock says.
+    files = expire(lake, MAX_NS)
+    kept_by = lake.older_versions()
+    append_tombstone(lake.location.state_dir, tombstone, done=True)
     log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
     return Forgotten(len(bags), files, kept_by)
 
 
-def _bags(table: IcebergTable, condition: BooleanExpression) -> list[tuple[date, str]]:
-    """Returns the day and the bag of each of some rows."""
-    scan = table.refresh().scan(row_filter=condition, selected_fields=("bag_id", "day"))
-    found = scan.to_arrow()
-    return [*zip(found["day"].to_pylist(), found["bag_id"].to_pylist(), strict=True)]
+def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
+    """Returns robot, day and id of the bags that have some rows."""
+    columns = ("robot", "day", "bag_id")
+    rows = lake.rows(name, condition, columns).to_pylist()
+    return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
 
 
-def _reaching(tombstone: Tombstone, name: str) -> BooleanExpression:
-    """Returns the condition on rows of a table that reach into the window."""
-    return overlapping(tombstone.robot, TABLES[name].span, tombstone.start, tombstone.stop)
+def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+    """Returns the condition on rows of what is forgotten; the columns have their span."""
+    if tombstone.bags:
+        return of_ids(tombstone.robot, tombstone.bags)
+    reaching = overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)
+    return And(reaching, of_topics(tombstone.topics)) if tombstone.topics else reaching

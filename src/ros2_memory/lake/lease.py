@@ -1,8 +1,10 @@
 """One writer for one lake: a lock that the system releases when its holder dies, and a lease.
 
-The lock is a file in the lake's state directory, on a file system that supports locks. For those
-with another state directory there is a lease in the warehouse, whose holder renews its term: a
-state directory that has it goes on at once, another one when the term is over.
+A commit of pyiceberg compares and swaps, so two writers would not lose a bag, nor have it twice.
+But each would delete files that the other is about to commit, and only one knows what was
+forgotten. So there is one: by a lock in the lake's state directory, on a file system that supports
+locks, and for those with another state directory by a lease in the warehouse, whose holder renews
+its term. A state directory that has it goes on at once, another one when the term is over.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import json
 import os
 import socket
 import uuid
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from pyiceberg.io import load_file_io
@@ -26,8 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from pyiceberg.io import FileIO
-
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.warehouse import LakeLocation
 
@@ -36,7 +36,6 @@ TERM_NS: Final[Ns] = 600 * NS_PER_S
 """How long the lease in the warehouse holds: longer than any commit takes."""
 _RENEWED_NS: Final = TERM_NS // 4
 _ID_FILE: Final = "writer.id"
-_FLAGS: Final = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
 _MAX_TEXT: Final = 1000
 
 
@@ -47,29 +46,13 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
     Raises:
         LakeError: another process holds it, which the sentence names; or nothing can be locked.
     """
-    path = state_dir / LEASE_FILE
-    try:
-        state_dir.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, _FLAGS, 0o644)
-    except OSError as error:
-        raise LakeError(f"{path} cannot be opened: {error.strerror}") from error
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+    with _locked(state_dir, os.O_RDWR | os.O_CREAT, fcntl.LOCK_EX) as (descriptor, holder):
+        if holder is not None:
             raise LakeError(
-                f"{_holder(descriptor)} writes into this lake; a lake has one writer: stop that "
-                "process first"
-            ) from None
-        except OSError as error:
-            raise LakeError(
-                f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file "
-                "system that supports locks"
-            ) from error
+                f"{holder} writes into this lake; a lake has one writer: stop that process first"
+            )
         write_holder(descriptor)
         yield
-    finally:
-        os.close(descriptor)
 
 
 def holder_of(state_dir: Path) -> str | None:
@@ -78,21 +61,43 @@ def holder_of(state_dir: Path) -> str | None:
     Raises:
         LakeError: that cannot be found out.
     """
-    path = state_dir / LEASE_FILE
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        with _locked(state_dir, os.O_RDONLY, fcntl.LOCK_SH) as (_, holder):
+            return holder
     except FileNotFoundError:
         return None
+
+
+@contextmanager
+def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str | None]]:
+    """Locks the file, if nobody else has; yields its descriptor, and who has.
+
+    Raises:
+        FileNotFoundError: there is none, and it is not to be made.
+        LakeError: it cannot be opened, or not be locked.
+    """
+    path = state_dir / LEASE_FILE
+    try:
+        if flags & os.O_CREAT:
+            state_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+    except FileNotFoundError:
+        raise
     except OSError as error:
         raise LakeError(f"{path} cannot be opened: {error.strerror}") from error
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return _holder(descriptor)
-    except OSError as error:
-        raise LakeError(f"{path} cannot be locked: {error.strerror}") from error
-    else:
-        return None
+        holder = None
+        try:
+            fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+        except BlockingIOError:
+            pid, host = read_holder(descriptor)
+            holder = "another process" if pid is None else f"process {pid} on {host}"
+        except OSError as error:
+            raise LakeError(
+                f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file "
+                "system that supports locks"
+            ) from error
+        yield descriptor, holder
     finally:
         os.close(descriptor)
 
@@ -112,6 +117,7 @@ class WarehouseLease:
         self._location = location
         self._clock = clock
         self._file = f"{location.warehouse}/{location.namespace}/writer.json"
+        self._store = load_file_io({**location.properties, **location.secrets}, self._file)
         self._id = _id_in(location.state_dir)
         self._until: Ns = 0
 
@@ -149,34 +155,28 @@ class WarehouseLease:
                 self._write(0)
 
     def _require_mine(self, now: Ns) -> None:
-        held = self._read()
-        until = held.get("until")
-        if held.get("id") != self._id and isinstance(until, int) and until > now:
+        known = self._read()
+        until = known.get("until")
+        if known.get("id") != self._id and isinstance(until, int) and until > now:
             raise LakeError(
-                f"process {held.get('pid')} on {held.get('host')} writes into this lake, with "
+                f"process {known.get('pid')} on {known.get('host')} writes into this lake, with "
                 f"another lake.state_dir, until {iso_local(until)}: a lake has one writer, and one "
                 "state_dir"
             )
 
     def _read(self) -> dict[str, object]:
-        given = self._store().new_input(self._file)
+        given = self._store.new_input(self._file)
         if not given.exists():
             return {}
-        with given.open() as stream:
-            text = stream.read(_MAX_TEXT)
-        try:
-            value: object = json.loads(text)
-        except ValueError:
-            return {}
-        return value if isinstance(value, dict) else {}
+        with given.open() as stream, suppress(ValueError):
+            value: object = json.loads(stream.read(_MAX_TEXT))
+            return value if isinstance(value, dict) else {}
+        return {}
 
     def _write(self, until: Ns) -> None:
-        held = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
-        with self._store().new_output(self._file).create(overwrite=True) as stream:
-            stream.write(json.dumps(held).encode())
-
-    def _store(self) -> FileIO:
-        return load_file_io({**self._location.properties, **self._location.secrets}, self._file)
+        known = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
+        with closing(self._store.new_output(self._file).create(overwrite=True)) as stream:
+            stream.write(json.dumps(known).encode())
 
 
 def _id_in(state_dir: Path) -> str:
@@ -192,8 +192,3 @@ def _id_in(state_dir: Path) -> str:
         return path.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
-
-
-def _holder(descriptor: int) -> str:
-    pid, host = read_holder(descriptor)
-    return "another process" if pid is None else f"process {pid} on {host}"

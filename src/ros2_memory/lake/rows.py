@@ -1,7 +1,8 @@
 """The rows of one closed bag.
 
 The bag is the one that the memory sees: messages that count in another recording are left out, as
-in answers.
+in answers. Its channels are the robot's own bytes: whatever is asked of them is asked as of the
+bag, by a later version, too. All other rows are for people, and follow from the same memory.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import hashlib
 import json
 import math
 from collections import Counter
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
@@ -20,6 +22,7 @@ from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.topic_events import MAX_PER_BAG
+from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
@@ -28,28 +31,37 @@ from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
-from ros2_memory.lake.channel_rows import ChannelRows
+from ros2_memory.lake.packed_messages import packed_messages
 from ros2_memory.lake.tables import ROWS_VERSION, TABLES
-from ros2_memory.lake.typed_values import taken_apart
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.robot_places import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from datetime import date
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.analysis.sights import Sights
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
-    from ros2_memory.storage.base import Record
+    from ros2_memory.messages.detections import Detection
+    from ros2_memory.storage.base import Channel, Record
 
+_MOST_OF_MESSAGE: Final = 512
+"""Packed bytes of each message on average; of a channel with more the lake has the times alone."""
+_LEAST_OF_CHANNEL: Final = 16 << 10
+"""A channel may take this, however few its messages are: a description, a map of a room."""
+_MOST_BYTES: Final = 64 << 20
+"""Payloads of a bag that are in memory at once; beyond it the largest channel goes first."""
+_MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"}
+"""The map of `messages` that has values of a type."""
+_LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
 _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
@@ -112,24 +124,30 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def made_of(memory: Memory, bag: BagFile, config: str, messages: Sequence[str] = ()) -> str:
+def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
     """Returns what the rows of a bag depend on besides its bytes.
 
-    That is which of its messages count, the static transforms in force, the settings (`config`)
-    and the topics whose `messages` are shipped.
+    That is which of its messages count, the static transforms in force, what the robot is placed
+    by, the spellings of labels, the settings (`config`) and the topics whose `messages` are
+    shipped.
     """
     counted = [
-        (each.topic, each.type, each.count, each.first, each.last) for each in bag.summary.topics
+        (known.topic, known.type, known.count, known.first, known.last)
+        for known in bag.summary.topics
     ]
     view = View(memory, Call())
     among = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, among), bag.end))
-    parts = json.dumps([ROWS_VERSION, config, statics, sorted(messages), counted])
+    labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
+    parts = json.dumps(
+        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted],
+        sort_keys=True,
+    )
     return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def rows_of(
-    memory: Memory, bag: BagFile, shipped: ShippedBag, messages: Sequence[str] = ()
+    memory: Memory, bag: BagFile, shipped: ShippedBag, messages: Collection[str] = ()
 ) -> dict[str, list[Row]]:
     """Returns the rows of a bag, by table; `messages` are topics to ship whole.
 
@@ -138,7 +156,7 @@ def rows_of(
     """
     keys = {"robot": shipped.robot, "bag_id": shipped.bag_id, "day": shipped.day}
     found = _BagRows(memory, bag).rows(shipped, messages)
-    return {name: [{**keys, **row} for row in rows] for name, rows in found.items()}
+    return {name: [{**keys, **row} for row in found[name]] for name in TABLES}
 
 
 class _BagRows:
@@ -147,24 +165,48 @@ class _BagRows:
     def __init__(self, memory: Memory, bag: BagFile) -> None:
         self._memory = memory
         self._bag = bag
-        self._pose_topic = memory.limits.pose_topic
-        self._poses = poses_of_bag(View(memory, Call()), bag, self._pose_topic)
+        view = View(memory, Call())
+        self._pose_topic = view.pose_topic
+        self._poses = poses_of_bag(view, bag, self._pose_topic)
+        self._thing = Labels(memory.limits.labels).key
         self._types: dict[str, list[str]] = {}
-        for each in bag.summary.topics:
-            self._types.setdefault(each.topic, []).append(each.type)
+        for known in bag.summary.topics:
+            self._types.setdefault(known.topic, []).append(known.type)
         self._undecodable = 0
         self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
-    def rows(self, shipped: ShippedBag, messages: Sequence[str]) -> dict[str, list[Row]]:
-        tracks = self._tracks()
-        events = self._events()
-        for track in tracks:
-            self._rows["poses"] += self._vertices(*track)
+    def rows(self, shipped: ShippedBag, whole: Collection[str]) -> dict[str, list[Row]]:
+        """Returns the rows without the keys of the bag; `whole` are topics to ship whole."""
+        tracks, events = self._tracks(), self._events()
+        for frame, track in tracks:
+            self._rows["poses"] += self._vertices(frame, track)
         self._rows["things"] += self._things()
-        stood_s = self._add_events(events)
-        in_map: tuple[str | None, RobotTrack] = tracks[0] if tracks else (None, empty_track())
-        self._add_messages(events, messages, *in_map)
-        self._rows["bags"].append({**shipped._asdict(), **self._bag_row(in_map[0], stood_s)})
+        for topic, found in events.items():
+            self._rows["events"] += self._events_of(topic, found)
+        driven = self._driven()
+        # What the events of a topic rule out is not decoded.
+        seen = {
+            topic
+            for topic, found in events.items()
+            if (found.visible.size or found.left_out)
+            and any(map(may_have_detections, self._types[topic]))
+        }
+        first = tracks[0] if tracks else (None, empty_track())
+        self._rows["channels"] += self._add_messages(whole, seen, *first)
+        self._rows["bags"].append(
+            {
+                **shipped._asdict(),
+                "recording": self._bag.recording.name,
+                "messages": self._bag.summary.count,
+                "undecodable": self._undecodable,
+                "detections": len(self._rows["sightings"]),
+                "pose_topic": self._pose_topic,
+                "map_frame": first[0],
+                **driven,
+                "summary": self._bag.summary.schema.to_json(),
+                "counts": self._bag.summary.packed,
+            }
+        )
         return self._rows
 
     def _tracks(self) -> list[tuple[str, RobotTrack]]:
@@ -182,43 +224,13 @@ class _BagRows:
         within = [(frame, cut(track, window)) for frame, track in tracks]
         return [(frame, track) for frame, track in within if len(track.times)]
 
-    def _events(self) -> dict[str, TopicEvents]:
-        """Returns the events on each topic that can have some."""
-        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        found = events_of_bag(View(self._memory, Call()), self._bag, topics)
-        return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
-
-    def _bag_row(self, map_frame: str | None, stood_s: float | None) -> Row:
-        """Returns what the row of the bag has besides what names it."""
-        bag, driven = self._bag, {}
-        if self._poses is not None:
-            path = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps)
-            whole = path.trajectory(0)
-            driven = {
-                "poses": whole.poses,
-                "distance_m": whole.totals.distance_m,
-                "gap_m": whole.totals.gap_m,
-                "max_mps": whole.max_speed,
-            }
-        return {
-            "recording": bag.recording.name,
-            "messages": bag.summary.count,
-            "undecodable": self._undecodable,
-            "detections": len(self._rows["sightings"]),
-            "pose_topic": self._pose_topic,
-            "map_frame": map_frame,
-            **driven,
-            "stood_s": stood_s,
-            "summary": bag.summary.schema.to_json(),
-            "counts": bag.summary.packed,
-        }
-
     def _vertices(self, frame: str, track: RobotTrack) -> Iterator[Row]:
-        shared = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
         columns = (track.times, track.x, track.y, track.heading, track.begins)
-        for time, x, y, heading, begins in zip(*(each.tolist() for each in columns), strict=True):
+        for time, x, y, heading, begins in zip(*(one.tolist() for one in columns), strict=True):
             yield {
-                **shared,
+                "topic": self._pose_topic,
+                "frame_id": frame,
+                "error_m": TOLERANCE_M,
                 "time_ns": time,
                 "x": x,
                 "y": y,
@@ -230,65 +242,64 @@ class _BagRows:
         for one in Watching(View(self._memory, Call())).in_bag(self._bag):
             for sights in one.sights:
                 for spot in sights.spots.tolist():
-                    yield _thing(one.frame_id, sights, spot)
+                    best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
+                    yield {
+                        "topic": sights.topics[spot[Spot.TOPIC]],
+                        "label": label,
+                        "thing": self._thing(label),
+                        "count": spot[Spot.N],
+                        "first_ns": spot[Spot.FIRST],
+                        "last_ns": spot[Spot.LAST],
+                        "frame_id": one.frame_id,
+                        "x": spot[Spot.X] / _MM,
+                        "y": spot[Spot.Y] / _MM,
+                        "z": spot[Spot.Z] / _MM,
+                        "spread_m": spot[Spot.DEV] / _MM,
+                        "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
+                    }
 
-    def _add_events(self, events: Mapping[str, TopicEvents]) -> float | None:
-        """Adds the events of the bag alone, and returns how long the robot stood in it."""
+    def _events(self) -> dict[str, TopicEvents]:
+        """Returns the events on each topic that can have some."""
+        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
+        found = events_of_bag(View(self._memory, Call()), self._bag, topics)
+        return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
 
-        def add(topic: str, kind: str, first: Ns, text: str, **more: object) -> None:
-            row = {"topic": topic, "kind": kind, "first_ns": first, "text": text}
-            self._rows["events"].append({**row, **more})
-
-        for topic, found in events.items():
-            for seen in found.visible.intervals():
-                add(topic, "thing", seen.first, seen.label, last_ns=seen.last, value=seen.best)
-            for flip in found.of_kind(FLAG)[1]:
-                add(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
-            for error in found.errors:
-                add(
-                    topic,
-                    "error",
-                    error.first,
-                    error.text,
-                    last_ns=error.last,
-                    count=error.reports,
-                )
-        if self._poses is None or not are_places(self._poses.positions).any():
-            return None
+    def _driven(self) -> Row:
+        """Returns what the row of the bag has of its poses, whose standstills are events."""
+        if self._poses is None:
+            return {}
+        whole = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps).trajectory(0)
+        driven = {
+            "poses": whole.poses,
+            "distance_m": whole.totals.distance_m,
+            "gap_m": whole.totals.gap_m,
+            "max_mps": whole.max_speed,
+        }
+        if not are_places(self._poses.positions).any():
+            return driven
         stands = stands_of(self._poses, MIN_NS, MAX_NS)
         standstills = standstills_of(stands.blocks)
+        topic, events = self._pose_topic, self._rows["events"]
         for start, end, box in standstills:
             x, y, _ = box.centre
-            add(self._pose_topic, "stop", start, "stood", last_ns=end, x=x, y=y)
+            events.append(_event(topic, "stop", start, "stood", last_ns=end, x=x, y=y))
         for time, before_mps, after_mps in stands.drops:
             text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
-            add(self._pose_topic, "drop", time, text, value=before_mps - after_mps)
-        return unix_from_ns(sum(each.end - each.start for each in standstills))
+            events.append(_event(topic, "drop", time, text, value=before_mps - after_mps))
+        stood_ns = sum(stop.end - stop.start for stop in standstills)
+        return {**driven, "stood_s": unix_from_ns(stood_ns)}
 
     def _add_messages(
-        self,
-        events: Mapping[str, TopicEvents],
-        messages: Sequence[str],
-        frame: str | None,
-        track: RobotTrack,
-    ) -> None:
-        """Reads the bag: its channels, its detections, and the messages of the chosen topics."""
-        # What the events of a topic rule out is not decoded.
-        seen = {
-            topic
-            for topic, found in events.items()
-            if (found.visible.size or found.left_out)
-            and any(map(may_have_detections, self._types[topic]))
-        }
-        whole = {topic for topic in messages if topic in self._types}
-        channels = ChannelRows(whole)
-        numbers = Counter[str]()
+        self, whole: Collection[str], seen: Collection[str], frame: str | None, track: RobotTrack
+    ) -> Iterator[Row]:
+        """Adds whole messages and detections, and returns the channels: the bag is read once."""
+        channels, numbers = _Channels(whole), Counter[str]()
         # Of all topics: a bag with damage anywhere is not shipped as if it were whole.
         every, window = tuple(self._types), TimeWindow.everything()
         for record in self._memory.reader.records(self._bag.path, every, window):
             channels.add(record)
             topic = record.channel.topic
-            nth = numbers[topic]
+            number = numbers[topic]
             numbers[topic] += 1
             if topic not in whole and topic not in seen:
                 continue
@@ -296,63 +307,154 @@ class _BagRows:
                 "topic": topic,
                 "type": record.channel.type,
                 "time_ns": record.log_time,
-                "message": nth,
+                "message": number,
             }
+            value: Row
+            found: Sequence[Detection]
+            try:
+                message = self._memory.reader.decode(record)
+                shown = self._memory.extractor.exact(message, record.channel.type)
+            except UndecodableError as error:
+                self._undecodable += topic in seen
+                value, found = {"undecodable": error.reason}, ()
+            else:
+                value = taken_apart(shown) if topic in whole else {}
+                of_frame = self._memory.extractor.frame(message)
+                found = detections_of(shown, of_frame) if topic in seen else ()
             if topic in whole:
-                self._rows["messages"].append({**row, **self._content(record)})
-            if topic in seen:
-                self._rows["sightings"] += [
-                    {**row, **found} for found in self._sightings(record, frame, track)
-                ]
-        self._rows["channels"] += channels.rows()
+                self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
+            at = place_at(track, record.log_time) if found else None
+            if at is not None:
+                row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
+            for detection in found:
+                place = dict(zip("xyz", detection.place or (), strict=False))
+                more = {name: getattr(detection, name) for name in ("label", "score", "frame_id")}
+                thing = self._thing(detection.label)
+                self._rows["sightings"].append({**row, **more, "thing": thing, **place})
+        return channels.rows()
 
-    def _sightings(self, record: Record, frame: str | None, track: RobotTrack) -> Iterator[Row]:
-        extractor = self._memory.extractor
-        try:
-            message = self._memory.reader.decode(record)
-        except UndecodableError:
-            self._undecodable += 1
-            return
-        shown = extractor.exact(message, record.channel.type)
-        at = place_at(track, record.log_time)
-        robot: Row = {}
-        if at is not None:
-            robot = {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
-        for each in detections_of(shown, extractor.frame(message)):
-            x, y, z = each.place or (None, None, None)
-            yield {
-                "label": each.label,
-                "score": each.score,
-                "frame_id": each.frame_id,
-                "x": x,
-                "y": y,
-                "z": z,
-                **robot,
+    def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
+        for seen in found.visible.intervals():
+            thing = {"thing": self._thing(seen.label), "value": seen.best}
+            yield _event(topic, "thing", seen.first, seen.label, last_ns=seen.last, **thing)
+        for flip in found.of_kind(FLAG)[1]:
+            yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
+        for error in found.errors:
+            reports = {"last_ns": error.last, "count": error.reports}
+            yield _event(topic, "error", error.first, error.text, **reports)
+
+
+def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
+    return {"topic": topic, "kind": kind, "first_ns": first, "text": text, **more}
+
+
+def taken_apart(value: JsonValue) -> Row:
+    """Returns a value as `messages` has it: scalars in maps by dot-path, and `value`, JSON of else.
+
+    In the JSON every scalar that a map has is null. So it is one text for all messages of a type
+    without lists, which Parquet stores once. Lists stay whole, and what has a dot in its name.
+    """
+    found: dict[str, list[tuple[str, object]]] = {name: [] for name in _MAP_OF.values()}
+
+    def rest(inner: JsonValue, path: str) -> JsonValue:
+        if isinstance(inner, dict):
+            return {
+                name: one if "." in name or not name else rest(one, f"{path}.{name}".lstrip("."))
+                for name, one in inner.items()
             }
+        kind = _MAP_OF.get(type(inner))
+        is_large = type(inner) is int and not -_LARGEST <= inner < _LARGEST
+        if kind is None or not path or is_large:
+            return inner
+        found[kind].append((path, inner))
+        return None
 
-    def _content(self, record: Record) -> Row:
-        """Returns when a message was published, and its value in columns."""
-        published = {"publish_ns": record.publish_time}
-        try:
-            message = self._memory.reader.decode(record)
-            value = self._memory.extractor.exact(message, record.channel.type)
-        except UndecodableError as error:
-            return {**published, "undecodable": error.reason}
-        return {**published, **taken_apart(value)}
-
-
-def _thing(frame: str, sights: Sights, spot: Sequence[int]) -> Row:
-    best = spot[Spot.BEST]
     return {
-        "topic": sights.topics[spot[Spot.TOPIC]],
-        "label": sights.labels[spot[Spot.LABEL]],
-        "count": spot[Spot.N],
-        "first_ns": spot[Spot.FIRST],
-        "last_ns": spot[Spot.LAST],
-        "frame_id": frame,
-        "x": spot[Spot.X] / _MM,
-        "y": spot[Spot.Y] / _MM,
-        "z": spot[Spot.Z] / _MM,
-        "spread_m": spot[Spot.DEV] / _MM,
-        "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
+        **found,
+        "value": json.dumps(rest(value, ""), ensure_ascii=False, separators=(",", ":")),
     }
+
+
+@dataclass(slots=True, eq=False)
+class _Messages:
+    """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
+
+    `is_whole`: they are shipped whatever they take.
+    """
+
+    channel: Channel
+    is_whole: bool
+    payloads: list[bytes] | None
+    log_times: list[int] = field(default_factory=list)
+    publish_times: list[int] = field(default_factory=list)
+    size: int = 0
+
+    def packed(self) -> bytes:
+        """Returns them packed; without payloads where these would take too much."""
+        packed = packed_messages(self.log_times, self.publish_times, self.payloads)
+        most = max(_MOST_OF_MESSAGE * len(self.log_times), _LEAST_OF_CHANNEL)
+        if self.payloads is None or self.is_whole or len(packed) <= most:
+            return packed
+        self.payloads = None
+        return packed_messages(self.log_times, self.publish_times, None)
+
+
+class _Channels:
+    """Takes the messages of a bag in order of their log times, and returns its channels as rows.
+
+    Images, clouds, scans and the like have times alone, but for topics that are `whole`.
+    """
+
+    def __init__(self, whole: Collection[str]) -> None:
+        self._whole = whole
+        # By identity, since hashing a channel hashes its definition.
+        self._of: dict[int, _Messages] = {}
+        self._size = 0
+
+    def add(self, record: Record) -> None:
+        """Takes the next message."""
+        channel = record.channel
+        found = self._of.get(id(channel))
+        if found is None:
+            is_whole = channel.topic in self._whole
+            payloads: list[bytes] | None = (
+                [] if is_whole or channel.type not in BULKY_TYPES else None
+            )
+            found = self._of[id(channel)] = _Messages(channel, is_whole, payloads)
+        found.log_times.append(record.log_time)
+        found.publish_times.append(record.publish_time)
+        if found.payloads is not None:
+            found.payloads.append(record.payload)
+            found.size += len(record.payload)
+            self._size += len(record.payload)
+            if self._size > _MOST_BYTES:
+                self._drop_largest()
+
+    def _drop_largest(self) -> None:
+        some = [messages for messages in self._of.values() if not messages.is_whole]
+        largest = max(some, key=lambda messages: messages.size, default=None)
+        if largest is not None:
+            largest.payloads = None
+            self._size -= largest.size
+            largest.size = 0
+
+    def rows(self) -> Iterator[Row]:
+        """Yields the rows, by topic."""
+        order = sorted(self._of.values(), key=lambda one: (one.channel.topic, one.channel.type))
+        for number, messages in enumerate(order):
+            channel, packed = messages.channel, messages.packed()
+            yield {
+                "topic": channel.topic,
+                "channel": number,
+                "type": channel.type,
+                "encoding": channel.encoding,
+                "latched": channel.latched,
+                "schema_encoding": channel.schema.encoding,
+                "schema": channel.schema.text,
+                "metadata": json.dumps(channel.metadata),
+                "messages": len(messages.log_times),
+                "first_ns": messages.log_times[0],
+                "last_ns": messages.log_times[-1],
+                "has_payloads": messages.payloads is not None,
+                "packed": packed,
+            }

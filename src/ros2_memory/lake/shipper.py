@@ -9,7 +9,6 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from datetime import timedelta
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import (
@@ -30,36 +29,31 @@ from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
-from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.lake.conditions import any_of, of_bags, overlapping
-from ros2_memory.lake.forgetting import forget_in_lake
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.lake.conditions import of_bags, overlapping
+from ros2_memory.lake.forgetting import Tombstone, append_tombstone, forget_in_lake
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, end_of
-from ros2_memory.lake.tombstones import Tombstone, append_tombstone
+from ros2_memory.lake.tables import TABLES, day_of
 from ros2_memory.lake.upkeep import compact, expire
-from ros2_memory.lake.warehouse import quiet_deletes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-    from datetime import date
     from pathlib import Path
-
-    import pyarrow as pa
-    from pyiceberg.expressions import BooleanExpression
-    from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
-    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.lake.warehouse import LakeTables
+    from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
 
 MOST_BAGS: Final = 2_000
 MOST_ROWS: Final = 200_000
 """Of one batch: they are in memory until it is committed."""
+_BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
+"""A bag lies in the lake up to so far from where it begins and ends now: more of it counted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,19 +63,27 @@ class RobotBags:
     Attributes:
         name: the robot.
         memory: over its bag directory.
-        first_in: returns the log time of the first message in a file, whether it counts or not.
+        reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
     """
 
     name: str
     memory: Memory
-    first_in: Callable[[Path], Ns]
+    reader: BagReader
     config: str
 
     @property
     def bag_dir(self) -> Path:
         """The bag directory."""
         return self.memory.index.bag_dir
+
+    def name_of(self, bag: BagFile) -> str:
+        """Returns the path of a bag below the bag directory."""
+        return relative(bag.file, str(self.bag_dir))
+
+    def is_moment(self, bag: BagFile) -> bool:
+        """Returns whether a bag is a copy in a saved moment."""
+        return self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")
 
 
 @dataclass(slots=True)
@@ -112,24 +114,22 @@ class _OfRobot:
     """What is known of the bags that a robot has, and no longer of those that it had.
 
     Attributes:
-        days: of which the lake was asked, with those beside them.
-        known: the bags of these days that are in the lake, by their ids.
         seen: the newest state of each, by its path.
+        known: what the lake has of them, by id.
         receipts: by path; None before they were read.
     """
 
-    days: frozenset[date] = frozenset()
-    known: dict[str, ShippedBag] = field(default_factory=dict)
     seen: dict[str, _Seen] = field(default_factory=dict)
+    known: dict[str, ShippedBag] = field(default_factory=dict)
     receipts: dict[str, Receipt] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class _Ready:
-    """A bag of a batch, its rows, and the days and ids under which older ones of it may lie."""
+    """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
     robot: RobotBags
-    known: ShippedBag
+    bag: ShippedBag
     rows: Mapping[str, Sequence[Row]]
     replaced: tuple[ShippedBag, ...]
 
@@ -138,8 +138,7 @@ class Shipper:
     """Ships the bags of several robots into one lake, whose lock the caller holds.
 
     Args:
-        location: the lake.
-        tables: its tables, all of `TABLES`.
+        lake: its tables.
         robots: whose bags are shipped.
         clock: dates receipts.
         messages: topics whose messages are shipped whole.
@@ -151,8 +150,7 @@ class Shipper:
 
     def __init__(
         self,
-        location: LakeLocation,
-        tables: Mapping[str, IcebergTable],
+        lake: LakeTables,
         robots: Sequence[RobotBags],
         clock: Clock,
         *,
@@ -162,8 +160,7 @@ class Shipper:
         alive: Callable[[], object] = lambda: None,
         most_bags: int = MOST_BAGS,
     ) -> None:
-        self._location = location
-        self._tables = tables
+        self._lake = lake
         self._robots = robots
         self._clock = clock
         self._messages = messages
@@ -171,13 +168,8 @@ class Shipper:
         self._pause = pause
         self._alive = alive
         self._most_bags = most_bags
-        self._of = {each.name: _OfRobot() for each in robots}
+        self._of = {robot.name: _OfRobot() for robot in robots}
         self._refused: set[str] = set()
-
-    @property
-    def lake_id(self) -> str:
-        """The id of the lake: another one where its tables were created again."""
-        return str(self._tables["bags"].metadata.table_uuid)
 
     def run(self) -> Shipped:
         """Ships what is new: one pass over all robots.
@@ -186,10 +178,9 @@ class Shipper:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
         done = Shipped()
-        robots = [each for each in self._robots if self._forget(each, done)]
         batch: list[_Ready] = []
         rows = 0
-        for robot in robots:
+        for robot in [robot for robot in self._robots if self._forget(robot, done)]:
             for ready in self._ready(robot, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
@@ -200,43 +191,6 @@ class Shipper:
             self._commit(batch, done)
         return done
 
-    def _forget(self, robot: RobotBags, done: Shipped) -> bool:
-        """Forgets what the robot's bag directory asks for; returns whether that is known.
-
-        Raises:
-            LakeError: the lake cannot be written; what is left is done when it is opened again.
-        """
-        try:
-            wanted = [Tombstone.of(robot.name, each) for each in read_forgettings(robot.bag_dir)]
-        except (OSError, ValueError) as error:
-            done.problems.append(
-                f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}; nothing of this robot "
-                "is shipped until it is repaired, since what was forgotten could come back"
-            )
-            return False
-        new = [each for each in wanted if each not in self._tombstones]
-        for each in new:
-            append_tombstone(self._location.state_dir, each, done=False)
-        for each in new:
-            self._alive()
-            gone = forget_in_lake(self._location, self._tables, each, self._clock.now())
-            done.forgotten += gone.bags
-            done.problems += [
-                f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
-                for kept in gone.kept_by
-            ]
-            self._tombstones.add(each)
-        if new:
-            self._look_again()
-        return True
-
-    def _look_again(self) -> None:
-        """Has the lake asked again what it has, and bags whether they were forgotten."""
-        for each in self._of.values():
-            each.days, each.known = frozenset(), {}
-            for seen in each.seen.values():
-                seen.is_forgotten = None
-
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
 
@@ -244,8 +198,42 @@ class Shipper:
             LakeError: the lake cannot be read or written.
         """
         now = self._clock.now()
-        compact(self._location, self._tables, now, self._alive)
-        expire(self._location, self._tables, now, grace)
+        compact(self._lake, now, self._alive)
+        expire(self._lake, now - grace if grace else MAX_NS)
+
+    def _forget(self, robot: RobotBags, done: Shipped) -> bool:
+        """Forgets what the robot's bag directory asks for; returns whether that is known.
+
+        Raises:
+            LakeError: the lake cannot be written; what is left is done when it is opened again.
+        """
+        try:
+            wanted = [Tombstone.of(robot.name, one) for one in read_forgettings(robot.bag_dir)]
+        except (OSError, ValueError) as error:
+            done.problems.append(
+                f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}; nothing of this robot "
+                "is shipped until it is repaired, since what was forgotten could come back"
+            )
+            return False
+        new = [tombstone for tombstone in wanted if tombstone not in self._tombstones]
+        for tombstone in new:
+            append_tombstone(self._lake.location.state_dir, tombstone, done=False)
+        for tombstone in new:
+            self._alive()
+            gone = forget_in_lake(self._lake, tombstone)
+            done.forgotten += gone.bags
+            done.problems += [
+                f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
+                for kept in gone.kept_by
+            ]
+            self._tombstones.add(tombstone)
+        if new:
+            self._look_again()
+        return True
+
+    def _look_again(self) -> None:
+        """Has everything looked at again, in the bag directories and in the lake."""
+        self._of = {robot.name: _OfRobot() for robot in self._robots}
 
     def _ready(self, robot: RobotBags, done: Shipped) -> Iterator[_Ready]:
         """Yields the bags of a robot that are to be shipped, the oldest first, with their rows."""
@@ -253,82 +241,100 @@ class Shipper:
         if snapshot.problem is not None:
             done.problems.append(f"{robot.name}: {snapshot.problem}")
             return
-        bags = [each for each in snapshot.bags if each.state is BagState.CLOSED]
-        known = self._known_of(robot.name, bags)
-        by_file = {each.file: each for each in known.values()}
+        now = robot.memory.clock.now()
+        closed = [
+            bag
+            for bag in snapshot.bags
+            if bag.state is BagState.CLOSED and not is_carried(bag.path)
+        ]
+        bags = [bag for bag in closed if is_settled(bag, robot.bag_dir, now)]
+        open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
+        done.waiting += len(closed) - len(bags) + len(open_bags)
+        done.problems += [
+            f"{robot.name}: {bag.file} was left open by a crash: ros2-memory recover closes it"
+            for bag in open_bags
+        ]
+        done.problems += [f"{robot.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
+        known = self._look_up(robot, bags)
+        by_file = {shipped.file: shipped for shipped in known.values()}
         ids: set[str] = set()
-        receipts: list[ShippedBag] = []
+        confirmed: list[ShippedBag] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
-        for bag in sorted(bags, key=lambda each: (self._is_moment(robot, each), each.start)):
+        for bag in sorted(bags, key=lambda bag: (robot.is_moment(bag), bag.start)):
             self._alive()
-            if is_carried(bag.path):
-                continue
             try:
-                if not is_settled(bag, robot.bag_dir, robot.memory.clock.now()):
-                    done.waiting += 1
-                    continue
                 seen = self._look(robot, bag)
                 before = known.get(seen.bag_id)
-                is_again = before is not None and self._is_moment(robot, bag)
+                is_again = before is not None and robot.is_moment(bag)
                 if seen.bag_id in ids or is_again or self._is_forgotten(robot, bag, seen, done):
                     continue
                 ids.add(seen.bag_id)
-                now = self._described(robot, bag, seen.bag_id, before)
-                if before is not None and _is_same(before, now):
-                    known[now.bag_id] = now
-                    receipts.append(now)
-                else:
-                    yield self._made(robot, bag, now, before, by_file.get(now.file))
+                shipped = self._described(robot, bag, seen.bag_id, before)
+                if before is not None and _is_same(before, shipped):
+                    known[shipped.bag_id] = shipped
+                    confirmed.append(shipped)
+                    continue
+                rows = rows_of(robot.memory, bag, shipped, self._messages)
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{robot.name}: {error}")
-        self._confirm(robot, receipts, done)
+                continue
+            older = {before, by_file.get(shipped.file)} - {None}
+            replaced = (one for one in older if one and (one is before or _holds(one, shipped)))
+            yield _Ready(robot, shipped, rows, tuple(replaced))
+        self._confirm(robot, confirmed, done)
         self._drop_gone(robot, bags)
+
+    def _look_up(self, robot: RobotBags, bags: Sequence[BagFile]) -> dict[str, ShippedBag]:
+        """Returns what the lake has of a robot's bags; it is asked about the time of new ones.
+
+        Raises:
+            LakeError: the lake cannot be read.
+        """
+        of_robot = self._of[robot.name]
+        new = [bag for bag in bags if bag.file not in of_robot.seen]
+        if new:
+            begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
+            stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
+            condition = overlapping(robot.name, ("start_ns", "end_ns"), begin, stop)
+            for row in self._lake.rows("bags", condition, ShippedBag._fields).to_pylist():
+                shipped = ShippedBag(**row)
+                of_robot.known.setdefault(shipped.bag_id, shipped)
+        return of_robot.known
 
     def _drop_gone(self, robot: RobotBags, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer: a hub runs for years."""
-        of_robot, root = self._of[robot.name], str(robot.bag_dir)
-        files = {each.file for each in bags}
-        of_robot.seen = {file: each for file, each in of_robot.seen.items() if file in files}
+        of_robot = self._of[robot.name]
+        names = {bag.file: robot.name_of(bag) for bag in bags}
+        of_robot.seen = {file: seen for file, seen in of_robot.seen.items() if file in names}
+        ids, own = {seen.bag_id for seen in of_robot.seen.values()}, {*names.values()}
+        of_robot.known = {
+            bag_id: shipped
+            for bag_id, shipped in of_robot.known.items()
+            if bag_id in ids or shipped.file in own
+        }
         if of_robot.receipts is not None:
-            names = {relative(file, root) for file in files}
-            of_robot.receipts = {
-                name: each for name, each in of_robot.receipts.items() if name in names
-            }
-
-    @staticmethod
-    def _is_moment(robot: RobotBags, bag: BagFile) -> bool:
-        return relative(bag.file, str(robot.bag_dir)).startswith(f"{MOMENTS_FOLDER}/")
+            receipts = of_robot.receipts.items()
+            of_robot.receipts = {name: receipt for name, receipt in receipts if name in own}
 
     def _look(self, robot: RobotBags, bag: BagFile) -> _Seen:
         """Returns a state of a bag, which is read once."""
         state, known = (bag.size, bag.mtime_ns, bag.sidecar_ns), self._of[robot.name].seen
         seen = known.get(bag.file)
         if seen is None or seen.state != state:
-            seen = _Seen(state, bag_id_of(robot.name, bag, robot.first_in(bag.path)))
+            summary = robot.reader.summarize(bag.path)
+            if summary.empty:
+                raise BagError(bag.file, "it holds no message")
+            seen = _Seen(state, bag_id_of(robot.name, bag, summary.start))
             known[bag.file] = seen
         return seen
-
-    def _made(
-        self,
-        robot: RobotBags,
-        bag: BagFile,
-        now: ShippedBag,
-        before: ShippedBag | None,
-        other: ShippedBag | None,
-    ) -> _Ready:
-        """Returns a bag with its rows; `other` was known under its path."""
-        rows = rows_of(robot.memory, bag, now, self._messages)
-        older = [] if before is None else [before]
-        if other is not None and other is not before and _holds(other, now):
-            older.append(other)
-        return _Ready(robot, now, rows, tuple(older))
 
     def _is_forgotten(self, robot: RobotBags, bag: BagFile, seen: _Seen, done: Shipped) -> bool:
         """Returns, and reports, whether a bag has a message that was forgotten."""
         if seen.is_forgotten is None:
             reader = robot.memory.reader
             seen.is_forgotten = any(
-                each.forbids(reader, robot.name, bag, seen.bag_id) for each in self._tombstones
+                tombstone.forbids(reader, robot.name, bag, seen.bag_id)
+                for tombstone in self._tombstones
             )
         if seen.is_forgotten:
             done.problems.append(
@@ -341,58 +347,19 @@ class Shipper:
         self, robot: RobotBags, bag: BagFile, bag_id: str, before: ShippedBag | None
     ) -> ShippedBag:
         """Returns what a bag would be known as."""
-        made = made_of(robot.memory, bag, robot.config, self._messages)
-        same = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
-        sha256 = before.sha256 if before is not None and same else sha256_of(bag.path)
-        file = relative(bag.file, str(robot.bag_dir))
+        is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         return ShippedBag(
-            robot.name,
-            bag_id,
-            day_of(bag.start),
-            file,
-            bag.size,
-            sha256,
-            bag.mtime_ns,
-            made,
-            bag.start,
-            bag.end,
+            robot=robot.name,
+            bag_id=bag_id,
+            day=day_of(bag.start),
+            file=robot.name_of(bag),
+            size=bag.size,
+            sha256=before.sha256 if before is not None and is_read else sha256_of(bag.path),
+            mtime_ns=bag.mtime_ns,
+            made_of=made_of(robot.memory, bag, robot.config, self._messages),
+            start_ns=bag.start,
+            end_ns=bag.end,
         )
-
-    def _known_of(self, robot: str, bags: Sequence[BagFile]) -> dict[str, ShippedBag]:
-        """Returns what the lake has of the days of some bags; of each day it is asked once.
-
-        And of the days beside them: another first message of a bag that counts moves its begin.
-        """
-        of_robot = self._of[robot]
-        own = {day for bag in bags for day in (day_of(bag.start), day_of(bag.end))}
-        days = frozenset(day + timedelta(beside) for day in own for beside in (-1, 0, 1))
-        if missing := days - of_robot.days:
-            found = {each.bag_id: each for each in self._read_known(robot, missing)}
-            of_robot.known = {**found, **of_robot.known}
-        if days != of_robot.days:
-            of_robot.known = {
-                bag_id: each
-                for bag_id, each in of_robot.known.items()
-                if any(each.day <= day <= day_of(each.end_ns) for day in days)
-            }
-            of_robot.days = days
-        return of_robot.known
-
-    def _read_known(self, robot: str, days: Iterable[date]) -> Iterator[ShippedBag]:
-        """Yields the bags of a robot in the lake that have something of some days.
-
-        Raises:
-            LakeError: the lake cannot be read.
-        """
-        spans = united(
-            (end_of(day - timedelta(1)) + 1, min(end_of(day) + 1, MAX_NS)) for day in days
-        )
-        reaching = any_of([overlapping(robot, TABLES["bags"].span, *span) for span in spans])
-        with self._location.translated("reading the lake's bags"):
-            bags = self._tables["bags"].refresh()
-            found = bags.scan(reaching, selected_fields=ShippedBag._fields).to_arrow()
-        for row in found.to_pylist():
-            yield ShippedBag(**row)
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
         """Commits a batch.
@@ -403,56 +370,47 @@ class Shipper:
         self._pause()
         # Few files have to be looked at for it.
         condition = of_bags(
-            (one.robot, one.day, one.bag_id)
-            for each in batch
-            for one in (each.known, *each.replaced)
+            (bag.robot, bag.day, bag.bag_id)
+            for ready in batch
+            for bag in (ready.bag, *ready.replaced)
         )
         rows = 0
         try:
             for name, table in TABLES.items():
-                filled = table.filled([row for each in batch for row in each.rows[name]])
+                filled = table.filled([row for ready in batch for row in ready.rows[name]])
                 rows += filled.num_rows
-                self._overwrite(name, filled, condition)
+                self._lake.replace(name, condition, filled)
         except LakeError:
             self._look_again()
             raise
-        for each in batch:
-            known = self._of[each.robot.name].known
-            for old in each.replaced:
+        for ready in batch:
+            known = self._of[ready.robot.name].known
+            for old in ready.replaced:
                 known.pop(old.bag_id, None)
-            known[each.known.bag_id] = each.known
+            known[ready.bag.bag_id] = ready.bag
         done.bags += len(batch)
         done.rows += rows
         log.info("bags_shipped", bags=len(batch), rows=rows)
         for robot in self._robots:
-            self._confirm(robot, [each.known for each in batch if each.robot is robot], done)
-
-    def _overwrite(self, name: str, rows: pa.Table, condition: BooleanExpression) -> None:
-        """Replaces the rows of some bags in one table, in one transaction.
-
-        Raises:
-            LakeError: the lake cannot be written.
-        """
-        with self._location.translated(f"writing the lake's {name}"), quiet_deletes():
-            self._tables[name].refresh().overwrite(rows, overwrite_filter=condition)
+            self._confirm(robot, [ready.bag for ready in batch if ready.robot is robot], done)
 
     def _confirm(self, robot: RobotBags, bags: Iterable[ShippedBag], done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
         if not has_recorded(robot.bag_dir):
             return
         try:
-            of_robot, lake = self._of[robot.name], self.lake_id
+            of_robot, lake = self._of[robot.name], self._lake.lake_id
             if of_robot.receipts is None:
                 of_robot.receipts = read_receipts(robot.bag_dir)
             known = of_robot.receipts
             missing = [
-                Receipt(each.file, each.bag_id, each.size, each.sha256, lake, self._clock.now())
-                for each in bags
-                if not (is_shipped(known, each.file, each.size) and known[each.file].lake == lake)
+                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self._clock.now())
+                for bag in bags
+                if not (is_shipped(known, bag.file, bag.size) and known[bag.file].lake == lake)
             ]
             if missing:
                 append_receipts(robot.bag_dir, missing)
-                known.update((each.bag, each) for each in missing)
+                known.update((receipt.bag, receipt) for receipt in missing)
             self._refused.discard(robot.name)
         except OSError as error:
             problem = (

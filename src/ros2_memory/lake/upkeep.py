@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.lake.conditions import of_robots
-from ros2_memory.lake.partitions import Partitions
+from ros2_memory.lake.files import Partitions
 from ros2_memory.lake.tables import TABLES, day_of
-from ros2_memory.lake.warehouse import quiet_deletes
-from ros2_memory.lake.written_files import delete_unreferenced
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Iterator
     from datetime import date
 
     from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.lake.warehouse import LakeTables
 
 log = get_logger(__name__)
 
@@ -31,12 +30,7 @@ _MOST_ROBOTS: Final = 200
 """In one condition: with more names Iceberg rules no file out by them."""
 
 
-def compact(
-    location: LakeLocation,
-    tables: Mapping[str, IcebergTable],
-    now: Ns,
-    alive: Callable[[], object] = lambda: None,
-) -> int:
+def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: None) -> int:
     """Puts each closed day of each robot into one file; returns how many were.
 
     A day is closed a day after its end. The rows stay the same. One transaction replaces the files
@@ -47,70 +41,47 @@ def compact(
     """
     closed = day_of(now - _DAY_NS)
     done = 0
-    for name, table in tables.items():
-        with location.translated(f"putting together the lake's {name}"):
-            order = [(each, "ascending") for each in TABLES[name].order]
-            for day, robots in _to_compact(table.refresh(), closed):
-                alive()
-                condition = of_robots(robots, day)
-                whole = table.refresh().scan(row_filter=condition).to_arrow()
-                with quiet_deletes():
-                    table.overwrite(whole.sort_by(order), overwrite_filter=condition)
-                done += len(robots)
+    for name, table in TABLES.items():
+        for day, robots in _to_compact(lake.current(name), closed):
+            alive()
+            condition = of_robots(robots, day)
+            lake.replace(name, condition, table.sorted(lake.rows(name, condition)))
+            done += len(robots)
     if done:
         log.info("days_compacted", days=done)
     return done
 
 
-def _to_compact(table: IcebergTable, closed: date) -> list[tuple[date, list[str]]]:
-    """Returns what to put together of the days before `closed`: a day, and some of its robots."""
-    parts = {
-        (day, robot): files
+def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[str]]]:
+    """Yields what to put together of the days before `closed`: a day, and some of its robots."""
+    sizes = sorted(
+        (day, robot, sum(file.size for file in files))
         for robot, days in Partitions().look(table).items()
         for day, files in days.items()
-        if day < closed
-    }
-    found: list[tuple[date, list[str]]] = []
-    room = 0
-    for day, robot in sorted(parts):
-        size = sum(each.size for each in parts[day, robot])
-        if len(parts[day, robot]) <= FEW_FILES or size > _MOST_BYTES:
-            continue
-        room -= size
-        if not found or found[-1][0] != day or room < 0 or len(found[-1][1]) == _MOST_ROBOTS:
-            found.append((day, []))
-            room = _MOST_BYTES - size
-        found[-1][1].append(robot)
-    return found
+        if day < closed and len(files) > FEW_FILES
+    )
+    for day, group in groupby(sizes, key=lambda part: part[0]):
+        robots: list[str] = []
+        room = _MOST_BYTES
+        for _, robot, size in group:
+            if size > _MOST_BYTES:
+                continue
+            if robots and (size > room or len(robots) == _MOST_ROBOTS):
+                yield day, robots
+                robots, room = [], _MOST_BYTES
+            robots.append(robot)
+            room -= size
+        if robots:
+            yield day, robots
 
 
-def expire(location: LakeLocation, tables: Mapping[str, IcebergTable], now: Ns, grace: Ns) -> int:
-    """Drops versions that are older than `grace`, and deletes the files that are left without one.
-
-    Without grace all of them, whatever the clock says.
-
-    The newest version stays, and those that a branch or a tag names.
-
-    Returns:
-        How many files were deleted.
+def expire(lake: LakeTables, until: Ns) -> int:
+    """Drops versions of up to a time, and deletes their files; returns how many of these.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    until = now - grace if grace else MAX_NS
-    with location.translated("deleting old files of the lake"):
-        for table in tables.values():
-            metadata = table.refresh().metadata
-            kept = {each.snapshot_id for each in metadata.refs.values()}
-            old = [
-                each.snapshot_id
-                for each in metadata.snapshots
-                if each.snapshot_id not in kept and each.timestamp_ms * NS_PER_MS <= until
-            ]
-            if old:
-                table.maintenance.expire_snapshots().by_ids(old).commit()
-            table.refresh()
-        files = delete_unreferenced(location.state_dir, tables.values(), until)
+    files = lake.expire(until)
     if files:
         log.info("old_files_deleted", files=files)
     return files

@@ -1,4 +1,4 @@
-"""Opens a lake: its Iceberg catalogue, its files and its tables.
+"""Opens a lake: its Iceberg catalogue, its files, and its tables to be written.
 
 The catalogue is an SQLite file in the state directory, or a REST service. Whatever goes wrong there
 becomes a `LakeError`, in whose sentence no secret is.
@@ -18,13 +18,15 @@ from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_MS
-from ros2_memory.lake.tables import NAMESPACE, open_tables
-from ros2_memory.lake.written_files import file_properties
+from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
+from ros2_memory.lake.written_files import delete_unreferenced, file_properties
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Iterator, Mapping
 
+    import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
+    from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.core.timebase import Ns
@@ -72,14 +74,10 @@ class LakeLocation:
         except LakeError:
             raise
         except Exception as error:  # noqa: BLE001 - each store raises errors of its own
-            raise LakeError(f"{what} failed: {self.redacted(error)}") from None
-
-    def redacted(self, error: Exception) -> str:
-        """Returns an error's sentence, shortened, without secrets."""
-        text = f"{type(error).__name__}: {error}"
-        for secret in sorted(filter(None, self.secrets.values()), key=len, reverse=True):
-            text = text.replace(secret, _MASK)
-        return text[:_MOST_CHARS]
+            text = f"{type(error).__name__}: {error}"
+            for secret in sorted(filter(None, self.secrets.values()), key=len, reverse=True):
+                text = text.replace(secret, _MASK)
+            raise LakeError(f"{what} failed: {text[:_MOST_CHARS]}") from None
 
     @contextmanager
     def opened(self) -> Iterator[IcebergCatalog]:
@@ -106,6 +104,18 @@ class LakeLocation:
         with closing(catalog):
             yield catalog
 
+    @contextmanager
+    def writable(self) -> Iterator[LakeTables]:
+        """Opens the tables, which are made where they are missing.
+
+        Raises:
+            LakeError: they cannot be opened.
+        """
+        with self.opened() as catalog:
+            with self.translated("opening the lake's tables"):
+                tables = open_tables(catalog, TABLES, self.namespace)
+            yield LakeTables(self, tables)
+
     def last_commit(self) -> Ns | None:
         """Returns when a bag was last committed; None where none was. Makes nothing.
 
@@ -121,14 +131,85 @@ class LakeLocation:
             newest = catalog.load_table(name).current_snapshot()
             return None if newest is None else newest.timestamp_ms * NS_PER_MS
 
-    def tables(self, catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
-        """Returns tables by name, made where they are missing.
+
+class LakeTables:
+    """The tables of an open lake. Each call takes their newest versions.
+
+    A commit is pyiceberg's: it compares and swaps, and what it replaces is one transaction.
+
+    Args:
+        location: of the lake.
+        tables: all of `TABLES`.
+    """
+
+    def __init__(self, location: LakeLocation, tables: Mapping[str, IcebergTable]) -> None:
+        self.location = location
+        self._tables = tables
+
+    @property
+    def lake_id(self) -> str:
+        """The id of the lake: another one where its tables were created again."""
+        return str(self._tables["bags"].metadata.table_uuid)
+
+    def current(self, name: str) -> IcebergTable:
+        """Returns a table as it is now.
 
         Raises:
-            LakeError: they cannot be opened.
+            LakeError: the lake cannot be read; so do all others.
         """
-        with self.translated("opening the lake's tables"):
-            return open_tables(catalog, names, self.namespace)
+        with self.location.translated(f"reading the lake's {name}"):
+            return self._tables[name].refresh()
+
+    def rows(
+        self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
+    ) -> pa.Table:
+        """Returns the rows of which a condition is true."""
+        table = self.current(name)
+        with self.location.translated(f"reading the lake's {name}"):
+            return table.scan(condition, selected_fields=columns).to_arrow()
+
+    def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
+        """Replaces rows by others, in one transaction."""
+        table = self.current(name)
+        with self.location.translated(f"writing the lake's {name}"), quiet_deletes():
+            table.overwrite(rows, overwrite_filter=condition)
+
+    def delete(self, name: str, condition: BooleanExpression) -> None:
+        """Deletes rows from the newest version; `expire` deletes those before."""
+        table = self.current(name)
+        with self.location.translated(f"deleting from the lake's {name}"), quiet_deletes():
+            table.delete(condition)
+            # The list of what a version deleted has the bounds of its columns, which are texts of
+            # rows; the next version does not refer to it.
+            table.append(table.schema().as_arrow().empty_table())
+
+    def expire(self, until: Ns) -> int:
+        """Drops the versions of up to a time, and deletes the files that are left without one.
+
+        The newest version stays, and those that a branch or a tag names. Returns how many files.
+        """
+        with self.location.translated("deleting old files of the lake"):
+            for table in self._tables.values():
+                metadata = table.refresh().metadata
+                kept = {ref.snapshot_id for ref in metadata.refs.values()}
+                old = [
+                    version.snapshot_id
+                    for version in metadata.snapshots
+                    if version.snapshot_id not in kept and version.timestamp_ms * NS_PER_MS <= until
+                ]
+                if old:
+                    table.maintenance.expire_snapshots().by_ids(old).commit()
+                table.refresh()
+            return delete_unreferenced(self.location.state_dir, self._tables.values(), until)
+
+    def older_versions(self) -> tuple[str, ...]:
+        """Returns the branches and tags that keep older versions, each after its table."""
+        return tuple(
+            f"{name}: {ref}"
+            for name, table in self._tables.items()
+            for ref, version in table.metadata.refs.items()
+            if version.snapshot_id != table.metadata.current_snapshot_id
+        )
 
 
 @contextmanager

@@ -1,8 +1,10 @@
 """The files that this program wrote into a lake, and which of them nothing refers to any more.
 
-pyiceberg rewrites tables and drops old versions from their metadata, but deletes no file. So each
-file is recorded before it is written, in the state directory, and only recorded ones are deleted:
-those below the table's own location to which no version, branch or tag of the table refers.
+pyiceberg rewrites tables and drops old versions from their metadata, but deletes no file, and a
+process that is killed leaves files that no version ever had. A list of what lies in a store would
+have files of other programs, too, also those that they are about to commit. So each file is
+recorded before it is written, in the state directory, and only recorded ones are deleted: those
+below the table's own location to which no version, branch or tag of the table refers.
 """
 
 from __future__ import annotations
@@ -66,19 +68,21 @@ def file_properties(state_dir: Path) -> dict[str, str]:
     }
 
 
-def referenced_files(table: IcebergTable) -> set[str]:
+def _referenced(table: IcebergTable) -> set[str]:
     """Returns the files that some version, branch or tag of a table refers to."""
     found = {table.metadata_location}
-    found.update(each.statistics_path for each in table.metadata.statistics)
+    found.update(statistics.statistics_path for statistics in table.metadata.statistics)
     for snapshot in table.metadata.snapshots:
         found.add(snapshot.manifest_list)
         for manifest in snapshot.manifests(table.io):
             if manifest.manifest_path in found:
                 continue
             found.add(manifest.manifest_path)
-            for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=False):
-                if entry.status is not ManifestEntryStatus.DELETED:
-                    found.add(entry.data_file.file_path)
+            found.update(
+                entry.data_file.file_path
+                for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=False)
+                if entry.status is not ManifestEntryStatus.DELETED
+            )
     return found
 
 
@@ -91,23 +95,20 @@ def delete_unreferenced(state_dir: Path, tables: Iterable[IcebergTable], written
     Raises:
         OSError: a file cannot be deleted; those that were deleted before are gone.
     """
-    recorded = {each.file: each for each in WRITTEN.rows(state_dir)}
+    recorded = WRITTEN.rows(state_dir)
+    old = {written.file for written in recorded if written.at < written_before}
     gone: set[str] = set()
     try:
         for table in tables:
             below = f"{table.location().rstrip('/')}/"
-            old = {
-                file
-                for file, each in recorded.items()
-                if file.startswith(below) and ".." not in file and each.at < written_before
-            }
-            for file in sorted(old - referenced_files(table)) if old else ():
+            own = {file for file in old if file.startswith(below) and ".." not in file}
+            for file in sorted(own - _referenced(table)) if own else ():
                 with suppress(FileNotFoundError):  # as after a kill
                     table.io.delete(file)
                 gone.add(file)
     finally:
         if gone:
             WRITTEN.replace(
-                state_dir, [each for each in recorded.values() if each.file not in gone]
+                state_dir, [written for written in recorded if written.file not in gone]
             )
     return len(gone)

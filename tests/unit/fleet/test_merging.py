@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import TYPE_CHECKING, Any
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.core.errors import EpisodicError, QueryTimeoutError, RefusedError
 from ros2_memory.fleet.merging import RobotReply, merged
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ NAMES = st.lists(
 
 
 def reply_of(tool: str, replies: Sequence[RobotReply], **how: Any) -> dict[str, Any]:
-    failures: Mapping[str, str] = how.pop("failures", {})
+    failures: Mapping[str, EpisodicError] = how.pop("failures", {})
     found = merged(tool, replies, failures, max_chars=how.pop("max_chars", MANY), **how)
     assert json.loads(json.dumps(found)) == found
     return found
@@ -70,15 +70,6 @@ def test_rows_are_the_newest_of_all_robots_each_with_its_name(
     assert found.get("more", False) is hides
 
 
-@given(sighting_replies())
-def test_of_one_robot_the_rows_are_its_own_in_its_own_order(replies: list[RobotReply]) -> None:
-    one = replies[0]
-    found = reply_of("find_matches", [one])
-    value: Any = one.value
-    expected = [{"robot_name": one.name, **row} for row in value["sightings"]]
-    assert found["sightings"] == expected
-
-
 def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> None:
     replies = [
         RobotReply("red", {"sightings": [], "total": 7}, latest=100),
@@ -87,15 +78,6 @@ def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> Non
     reply = reply_of("find_matches", replies, limit=5)
     assert reply["at_least"] == 12
     assert "total" not in reply
-
-
-def test_oldest_first_stays_so() -> None:
-    replies = [
-        RobotReply("r1", {"sightings": [{"last_seen": 1.0}, {"last_seen": 5.0}], "total": 2}),
-        RobotReply("r2", {"sightings": [{"last_seen": 3.0}], "total": 1}),
-    ]
-    found = reply_of("find_matches", replies, limit=2, oldest_first=True)
-    assert [row["robot_name"] for row in found["sightings"]] == ["r1", "r2"]
 
 
 def test_a_robot_that_never_did_is_named_and_one_that_could_not_read_all_is_not() -> None:
@@ -163,37 +145,6 @@ def test_a_topic_has_one_row_with_the_robots_that_record_it() -> None:
     ]
 
 
-def test_counts_become_one_table_whose_first_column_is_the_robot() -> None:
-    def of(name: str, columns: list[Any], rows: list[Any]) -> RobotReply:
-        return RobotReply(name, {"topic": "/a", "columns": columns, "rows": rows, "all": [3]})
-
-    found = reply_of(
-        "find_matches",
-        [of("r1", ["day", "count"], [["Mon", 3]]), of("r2", ["day", "count"], [["Tue", 3]])],
-    )
-    assert found == {
-        "columns": ["robot_name", "day", "count"],
-        "rows": [["r1", "Mon", 3], ["r2", "Tue", 3]],
-        "all": {"r1": [3], "r2": [3]},
-        "topic": "/a",
-    }
-
-
-@pytest.mark.parametrize("tool", ["compare", "recap", "memory_status", "data_time_range"])
-def test_where_a_reply_is_about_a_robot_it_becomes_a_row_the_newest_first(tool: str) -> None:
-    replies = [
-        RobotReply(name, {"latest": at, "doubts": "x", "notes": ["n"]}, latest=at)
-        for name, at in (("r1", 3), ("r2", 8), ("r3", 5))
-    ]
-    found = reply_of(tool, replies)
-    assert found == {
-        "robots": [
-            {"robot_name": name, "latest": at, "doubts": "x", "notes": ["n"]}
-            for name, at in (("r2", 8), ("r3", 5), ("r1", 3))
-        ]
-    }
-
-
 def test_rows_that_are_too_long_together_are_given_shortly() -> None:
     replies = [
         RobotReply(f"r{number}", {"doubts": "all", "silences": ["x" * 100]}) for number in range(9)
@@ -204,9 +155,14 @@ def test_rows_that_are_too_long_together_are_given_shortly() -> None:
 
 
 def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
-    failures = {"r1": "the disk is gone", "r2": "too slow", "r3": "the disk is gone"}
+    failures = {
+        "r1": RefusedError("the disk is gone"),
+        "r2": QueryTimeoutError("too slow"),
+        "r3": RefusedError("the disk is gone"),
+    }
     found = reply_of("find_things", [RobotReply("r4", {"things": []})], failures=failures)
     assert found["notes"] == [
         "no answer of r1, r3: the disk is gone",
         "no answer of r2: too slow",
     ]
+    assert found["robots_failed"] == {"r1": "refused", "r2": "timeout", "r3": "refused"}

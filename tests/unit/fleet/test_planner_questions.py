@@ -6,7 +6,6 @@ ahead, and the disk of one hangs. The judges are those of a server that has the 
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import threading
@@ -16,17 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.fleet.tools import fleet_tools
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
-from tests.support.fleets import START_S, seeded, write_robot
+from tests.support.fleets import START_S, reply_of, seeded, tools_of, write_robot
 from tests.support.memories import memory_of, with_store
 from tests.support.planner_judges import STARTED_S
 from tests.support.planner_questions import QUESTIONS, Planned
@@ -44,7 +39,6 @@ WELL = "flat"
 IN_TROUBLE = ("ahead", "damaged", "gone", "offline", "slow")
 YEAR_S = 365 * 86_400
 EARLIER_S = STARTED_S - 7200 - START_S
-MOST_CHARS = 10**6
 MUG = {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "mug"}
 BY_WORDS = {question.words: question for question in QUESTIONS}
 
@@ -70,19 +64,7 @@ class Six:
     before: Any
 
     def reply(self, tool: str, given: Mapping[str, Any], call: Call | None = None) -> Any:
-        return reply(self.tools[tool], given, call)
-
-
-def reply(tool: Tool, given: Mapping[str, Any], call: Call | None = None) -> Any:
-    """The JSON of a reply, be it an error."""
-    replies = Replies(Path("nowhere"), MOST_CHARS)
-    # The memory is that of no robot.
-    none: Any = None
-    try:
-        answer = replies.answer(tool.question(given)(none, call or Call()))
-    except EpisodicError as error:
-        answer = replies.error(error)
-    return json.loads(answer.text)
+        return reply_of(self.tools[tool], {**given}, call)
 
 
 @pytest.fixture(scope="module")
@@ -108,11 +90,10 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Six]:
             return Robot(name, folder / name, build)
 
         fleet = Fleet(map(robot, (WELL, *IN_TROUBLE)), clock, shared_map=True)
-        declared = fleet_tools(build_tools(QuerySettings()), fleet, MOST_CHARS)
-        tools = {each.name: each for each in declared}
-        first = reply(tools["list_frames"], {"robot": "slow"}, Call(Deadline.after(0.2)))
+        tools = tools_of(fleet)
+        first = reply_of(tools["list_frames"], {"robot": "slow"}, Call(Deadline.after(0.2)))
         assert first["error"] == "timeout"
-        before = reply(tools["find_matches"], MUG)
+        before = reply_of(tools["find_matches"], {**MUG})
         shutil.rmtree(folder / "gone")
         yield Six(tools, world.asked, before)
         released.set()

@@ -18,7 +18,6 @@ import pytest
 
 from ros2_memory.core.errors import (
     BusyError,
-    EpisodicError,
     InvalidArgumentsError,
     QueryTimeoutError,
 )
@@ -28,7 +27,6 @@ from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
@@ -39,7 +37,10 @@ from tests.support.fleets import (
     START_S,
     fleet_memory,
     fleet_over,
+    reply,
+    reply_of,
     seeded,
+    tools_of,
     write_robot,
 )
 from tests.support.memories import asked
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
 
 NAMES = ("r1", "r2", "r3")
-MOST_CHARS = 10**6
 LAST: dict[str, object] = {"topic": "/vision/*", "condition_type": "contains", "value": "mug"}
 CALLS: dict[str, dict[str, object]] = {
     "list_recorded_topics": {},
@@ -91,21 +91,6 @@ def test_metres_by_day_are_one_table_of_all_robots(folder: Path) -> None:
         for name in NAMES
     }
     assert {row[0]: row[at] for row in table["rows"]} == alone
-
-
-def reply(fleet: Fleet, name: str, given: dict[str, object], **call: Any) -> Any:
-    """The JSON of a fleet's reply, be it an error."""
-    replies = Replies(Path("nowhere"), MOST_CHARS)
-    # One after another: what the first answer decides what the others need not.
-    tools = fleet_tools(build_tools(QuerySettings(), writing=True), fleet, MOST_CHARS, at_once=1)
-    (tool,) = (each for each in tools if each.name == name)
-    try:
-        # The memory is that of no robot.
-        none: Any = None
-        answer = replies.answer(tool.question(given)(none, Call(**call)))
-    except EpisodicError as error:
-        answer = replies.error(error)
-    return json.loads(answer.text)
 
 
 def alone(folder: Path, robot: str, name: str, given: dict[str, object]) -> Any:
@@ -155,11 +140,9 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
         assert {name: rest[name]["now"] for name in NAMES} == nows, tool
     for row in reply(fleet, "find_last_match", LAST)["matches"]:
         assert row["now"] - row["age_s"] == pytest.approx(row["timestamp"])
-    tools = fleet_tools(build_tools(limits), fleet, max_chars=300)
+    short = tools_of(fleet, max_chars=300)
     for tool, given in (("recap", last), ("memory_status", {})):
-        (short,) = (each for each in tools if each.name == tool)
-        answer: Any = short.question(given)(None, Call())  # type: ignore[arg-type]
-        for value in (answer.value, reply(fleet, tool, given)):
+        for value in (reply_of(short[tool], given), reply(fleet, tool, given)):
             assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
 
 
@@ -274,6 +257,16 @@ class TestWhichRobot:
         found = reply(fleet_over(folder, ("r3",)), "list_frames", {})
         assert found["robot_name"] == "r3"
 
+    def test_several_that_are_named_answer_as_all_do(self, folder: Path) -> None:
+        fleet = fleet_over(folder, NAMES)
+        some: dict[str, object] = {"robot": "r3, r1"}
+        found = reply(fleet, "find_matches", {**LAST, **some})
+        assert found == reply(fleet_over(folder, ("r1", "r3")), "find_matches", LAST)
+        rows = reply(fleet, "memory_status", some)["robots"]
+        assert {row["robot_name"] for row in rows} == {"r1", "r3"}
+        for robot, said in (("r1, r9", "no robot"), ("r1, r2", "which robot?")):
+            assert said in reply(fleet, "list_frames", {"robot": robot})["detail"]
+
     @pytest.mark.parametrize("robot", ["../r1", "r4", "", "/", 7, ["r1"], {"r1": 1}])
     def test_a_name_that_is_none_is_refused_whatever_it_is(
         self, folder: Path, robot: object
@@ -283,8 +276,7 @@ class TestWhichRobot:
         assert "there is no robot" in found["detail"]
 
     def test_wrong_arguments_are_refused_before_a_robot_is_asked(self, folder: Path) -> None:
-        tools = fleet_tools(build_tools(QuerySettings()), fleet_over(folder, NAMES), MOST_CHARS)
-        (tool,) = (each for each in tools if each.name == "find_last_match")
+        tool = tools_of(fleet_over(folder, NAMES))["find_last_match"]
         with pytest.raises(InvalidArgumentsError, match="condition_type"):
             tool.question(LAST | {"condition_type": "like"})
 
@@ -292,15 +284,15 @@ class TestWhichRobot:
 class TestWhoMayAsk:
     def test_others_robots_are_neither_asked_nor_named(self, folder: Path) -> None:
         fleet, only = fleet_over(folder, NAMES), frozenset({"r1", "r3"})
-        found = reply(fleet, "data_time_range", {}, robots=only)
+        found = reply(fleet, "data_time_range", {}, Call(robots=only))
         assert {row["robot_name"] for row in found["robots"]} == only
-        refused = reply(fleet, "memory_status", {"robot": "r2"}, robots=only)
-        unknown = reply(fleet, "memory_status", {"robot": "r9"}, robots=only)
+        refused = reply(fleet, "memory_status", {"robot": "r2"}, Call(robots=only))
+        unknown = reply(fleet, "memory_status", {"robot": "r9"}, Call(robots=only))
         assert refused["detail"].replace("r2", "r9") == unknown["detail"]
-        assert "r2" not in reply(fleet, "list_frames", {}, robots=only)["detail"]
+        assert "r2" not in reply(fleet, "list_frames", {}, Call(robots=only))["detail"]
 
     def test_who_may_ask_about_none_is_told_so(self, folder: Path) -> None:
-        found = reply(fleet_over(folder, NAMES), "memory_status", {}, robots=frozenset())
+        found = reply(fleet_over(folder, NAMES), "memory_status", {}, Call(robots=frozenset()))
         assert found["error"] == "refused"
 
 
@@ -418,6 +410,7 @@ class TestTrouble:
         assert found["never"] == ["r1"]
         missing = "the bag directory does not exist (yet): check .../away, from fleet.robots"
         assert found["notes"] == [f"no answer of away: {missing}"]
+        assert found["robots_failed"] == {"away": "refused"}
         assert str(tmp_path) not in json.dumps(found)
         status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
         assert "from fleet.robots" in status["doubts"]
@@ -430,9 +423,7 @@ class TestTrouble:
             return fleet_memory(folder / "r1")
 
         fleet = Fleet([Robot("r1", folder / "r1", hangs)], FixedClock(NOW))
-        tools = fleet_tools(build_tools(QuerySettings()), fleet, MOST_CHARS)
-        (tool,) = (each for each in tools if each.name == "list_frames")
-        asked: Any = tool.question({"robot": "r1"})
+        asked: Any = tools_of(fleet)["list_frames"].question({"robot": "r1"})
         with pytest.raises(QueryTimeoutError):
             asked(None, Call(Deadline.after(0.2)))
         for _ in range(3):

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
@@ -14,11 +13,7 @@ from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.fleet.tools import fleet_tools
-from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
-from tests.support.fleets import LENGTH_S, seeded, write_robot
+from tests.support.fleets import LENGTH_S, reply, seeded, write_robot
 from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
@@ -54,13 +49,12 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
         ],
         WallClock(),
     )
-    declared = fleet_tools(build_tools(QuerySettings()), fleet, 10**6)
-    [tool] = [each for each in declared if each.name == "find_last_match"]
-    # The memory is that of no robot.
-    none: Any = None
-    given = {"topic": "/vision/*", "condition_type": "contains", "value": label}
-    answer = tool.question(given)(none, Call())
-    found = json.loads(Replies(folder, 10**6).answer(answer).text)
+    given: dict[str, object] = {
+        "topic": "/vision/*",
+        "condition_type": "contains",
+        "value": label,
+    }
+    found = reply(fleet, "find_last_match", given)
     expected = set()
     for robot in map(seeded, NAMES):
         times = [at - robot.start_s for at, what in robot.seen if what == label]

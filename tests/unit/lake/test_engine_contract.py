@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from datetime import date, timedelta
-from itertools import islice
 from pathlib import Path
 
 import pyarrow as pa
@@ -15,15 +13,12 @@ import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.core.model import JsonValue
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.tables import NAMESPACE, TABLES, Row, open_tables
-from ros2_memory.lake.typed_values import taken_apart
 
 DAY = date(2026, 11, 20)
 ROBOTS = ("attic", "hall", "it's")
-MAPS = ("flags", "integers", "numbers", "texts")
 ODD = ("it's", 'a "cup"', "back\\slash", "$label", "%_", "x'; SELECT 1 --", "ß 茶")
 
 
@@ -144,30 +139,3 @@ def test_threads_ask_at_once(select: Select) -> None:
 
     with ThreadPoolExecutor(4) as pool:
         assert [*pool.map(count, ODD * 2)] == [[6]] * len(ODD) * 2
-
-
-def test_rows_of_before_a_column_came_are_read_beside_those_that_have_it(
-    engine: LakeEngine, tmp_path: Path
-) -> None:
-    uri = f"sqlite:///{tmp_path}/lake.sqlite"
-    catalog = SqlCatalog("lake", uri=uri, warehouse=tmp_path.as_uri())
-    now = TABLES["messages"]
-    before = replace(now, columns=dict(islice(now.columns.items(), len(now.columns) - len(MAPS))))
-    catalog.create_namespace(NAMESPACE)
-    table = catalog.create_table(
-        f"{NAMESPACE}.messages", before.schema(), partition_spec=before.partition()
-    )
-    old = {"robot": "hall", "bag_id": "one", "day": DAY, "topic": "/a", "time_ns": 1}
-    table.append(before.filled([{**old, "value": '{"x":1,"on":null}'}]))
-    value: JsonValue = {"x": 2, "on": True, "y": 0.5, "name": "ß", "list": [1]}
-    apart = taken_apart(value)
-    new = {**old, "bag_id": "two", **apart}
-    open_tables(catalog, ["messages"])["messages"].append(now.filled([new]))
-    columns = ", ".join(("type", "time_ns", "publish_ns", "value", *MAPS))
-    sql = f"SELECT {columns} FROM messages ORDER BY bag_id"  # noqa: S608 - of constants
-    lake = Lake(catalog, engine)
-    files = lake.days("messages", "hall")[DAY]
-    rows = lake.select(sql, "messages", files).to_pylist()
-    assert [row["value"] for row in rows] == ['{"x":1,"on":null}', apart["value"]]
-    for name in MAPS:
-        assert [row[name] for row in rows] == [None, apart[name]]

@@ -17,17 +17,19 @@ from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.forgetting import Forgotten, forget_in_lake
+from ros2_memory.lake.forgetting import (
+    TOMBSTONES_FILE,
+    Forgotten,
+    Tombstone,
+    append_tombstone,
+    forget_in_lake,
+    read_tombstones,
+)
 from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.shipper import Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.tombstones import (
-    TOMBSTONES_FILE,
-    Tombstone,
-    append_tombstone,
-    read_tombstones,
-)
 from ros2_memory.lake.upkeep import compact, expire
+from ros2_memory.lake.warehouse import LakeTables
 from ros2_memory.lake.written_files import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
@@ -40,6 +42,7 @@ from tests.support.lakes import (
     location,
     robot_bags,
     ship,
+    ship_from,
     write_bag,
 )
 from tests.support.log_lines import with_checks
@@ -64,16 +67,14 @@ def tombstone(number: int = 7) -> Tombstone:
 def forget(lake: Path, what: Tombstone) -> Forgotten:
     where = location(lake)
     append_tombstone(where.state_dir, what, done=False)
-    with where.opened() as catalog:
-        return forget_in_lake(where, where.tables(catalog, TABLES), what, LATER)
+    with where.writable() as tables:
+        return forget_in_lake(tables, what)
 
 
 def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
     where = location(lake)
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
+    with where.writable() as tables:
         return Shipper(
-            where,
             tables,
             [robot_bags("hall", bag_dir)],
             FixedClock(LATER),
@@ -108,7 +109,7 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
     write_bag(bag_dir, 0)
     kept = secret_bag(bag_dir)
     late = shutil.copy(kept, tmp_path / "late.mcap")
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     suffixes = {path.suffix for path in files_with(lake, MARKER)}
     assert suffixes == {".parquet", ".avro"}  # so the scan finds it where it is
     kept.unlink()
@@ -139,7 +140,7 @@ def shipped_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path
     own_all(bag_dir)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     assert files_with(lake, MARKER)
     return bag_dir, lake, late
 
@@ -155,7 +156,7 @@ def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
     bag_dir, lake, late = shipped_robot
     assert forget_on_robot() == 0
     assert "next pass of ros2-memory ship" in capsys.readouterr().out
-    done = ship(lake, [robot_bags("hall", bag_dir)])
+    done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 0, [])
     assert files_with(lake, MARKER) == []
     assert len(lake_column(lake, "bags", "bag_id")) == 2
@@ -175,7 +176,7 @@ def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_
     bag_dir, lake, late = shipped_robot
     topics = sorted({str(each) for each in lake_column(lake, "sightings", "topic")})
     assert forget_on_robot("--topic", "/chatter", "--topic", topics[0]) == 0
-    done = ship(lake, [robot_bags("hall", bag_dir)])
+    done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 1, [])
     assert len(lake_column(lake, "bags", "bag_id")) == 3
     assert files_with(lake, MARKER) == []
@@ -189,7 +190,7 @@ def test_topics_are_forgotten_only_in_bags_that_hold_them(tmp_path: Path) -> Non
     secret_bag(bag_dir)
     start = (START_S + 70) * NS_PER_S
     write_mcap(bag_dir / "other" / "other_0.mcap", [text(start, "kept")])
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     seen = str(lake_column(lake, "sightings", "topic")[0])
     assert forget(lake, Tombstone("hall", start, start + NS_PER_S, (seen,))).bags == 1
     assert files_with(lake, MARKER) == []
@@ -230,7 +231,7 @@ def test_killed_while_forgetting_it_is_finished_later(
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     secret_bag(bag_dir)
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     commit, calls = SqlCatalog.commit_table, 0
 
     def failing(*given: object) -> object:
@@ -255,31 +256,30 @@ def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
 ) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     secret_bag(bag_dir)
-    overwrite = Shipper._overwrite
+    replace = LakeTables.replace
 
-    def killed(self: Shipper, name: str, *given: object) -> None:
+    def killed(self: LakeTables, name: str, *given: object) -> None:
         if name == "bags":
             raise LakeError("killed")
-        overwrite(self, name, *given)  # type: ignore[arg-type]
+        replace(self, name, *given)  # type: ignore[arg-type]
 
     with monkeypatch.context() as patched:
-        patched.setattr(Shipper, "_overwrite", killed)
+        patched.setattr(LakeTables, "replace", killed)
         with pytest.raises(LakeError):
-            ship(lake, [robot_bags("hall", bag_dir)])
+            ship_from(tmp_path)
     assert files_with(lake, MARKER)
-    assert forget(lake, tombstone()).bags == 0
+    assert forget(lake, tombstone()).bags == 1
     assert files_with(lake, MARKER) == []
 
 
 def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     secret_bag(bag_dir)
-    ship(lake, [robot_bags("hall", bag_dir)])
-    where = location(lake)
-    with where.opened() as catalog:
-        table = where.tables(catalog, ["messages"])["messages"]
+    ship_from(tmp_path)
+    with location(lake).writable() as tables:
+        table = tables.current("messages")
         snapshot = table.current_snapshot()
         assert snapshot is not None
         table.manage_snapshots().create_tag(snapshot.snapshot_id, "audit").commit()
@@ -290,19 +290,18 @@ def test_a_tag_keeps_what_is_forgotten_and_is_named(tmp_path: Path) -> None:
 def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
     write_bag(bag_dir, 0)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     foreign = next(lake.rglob("messages/data/*/*/*.parquet")).with_name("foreign.parquet")
     foreign.write_bytes(b"of another program")
     write_bag(bag_dir, 0, most=2)
-    ship(lake, [robot_bags("hall", bag_dir)])
+    ship_from(tmp_path)
     where = location(lake)
     files = {path for path in lake.rglob("*") if path.is_file()}
     now = max(each.at for each in WRITTEN.rows(where.state_dir)) + NS_PER_S
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
-        assert expire(where, tables, now, DAY_NS) == 0
+    with where.writable() as tables:
+        assert expire(tables, now - DAY_NS) == 0
         assert {path for path in lake.rglob("*") if path.is_file()} == files
-        assert expire(where, tables, now + DAY_NS, DAY_NS) > 10
+        assert expire(tables, now) > 10
     assert foreign.exists()
     assert len(lake_column(lake, "messages", "texts")) == 2
 
@@ -318,18 +317,16 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) ->
         ship(lake, [robot_bags(robot, tmp_path / robot) for robot in robots])
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
     values = lake_column(lake, "messages", "texts")
-    where = location(lake)
-    with where.opened() as catalog:
-        tables = where.tables(catalog, TABLES)
-        messages = tables["messages"].refresh()
+    with location(lake).writable() as tables:
+        messages = tables.current("messages")
         versions = len(messages.snapshots())
-        assert compact(where, tables, (START_S + 3600) * NS_PER_S) == 0
-        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
+        assert compact(tables, (START_S + 3600) * NS_PER_S) == 0
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
         files = Counter(task.file.partition[0] for task in messages.refresh().scan().plan_files())
         assert files == {"hall": 1, "roof": 1, "yard": 1}
         # What was deleted, and what was written instead.
         assert len(messages.snapshots()) == versions + 2
-        assert compact(where, tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values
 

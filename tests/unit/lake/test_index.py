@@ -12,10 +12,10 @@ import pytest
 from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Memory
 from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
-from ros2_memory.lake.memory.index import MOST_BAGS
-from ros2_memory.lake.memory.robot import LakeRobot
+from ros2_memory.lake.index import MOST_BAGS
 from ros2_memory.lake.tables import day_of
 from tests.support.bags import detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S
@@ -64,7 +64,7 @@ class Shipping:
             write_mcap(bags / "rec" / f"{name or f'rec_{start_s}'}.mcap", messages)
         fill(self._catalog, {"hall": with_store(memory_of(bags), bags)}, ["/chatter"])
 
-    def robot(self, days: int = 31, most_bags: int = MOST_BAGS) -> LakeRobot:
+    def robot(self, days: int = 31, most_bags: int = MOST_BAGS) -> Memory:
         robots = lake_robots(self._catalog, self.engine, ["hall"], days=days, most_bags=most_bags)
         return robots["hall"]
 
@@ -74,8 +74,8 @@ def shipping(tmp_path: Path, engine: LakeEngine) -> Shipping:
     return Shipping(tmp_path, engine)
 
 
-def starts(robot: LakeRobot) -> list[int]:
-    return [bag.start // NS_PER_S for bag in robot.memory.index.refresh().bags]
+def starts(robot: Memory) -> list[int]:
+    return [bag.start // NS_PER_S for bag in robot.index.refresh().bags]
 
 
 def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
@@ -107,9 +107,9 @@ def test_segments_without_a_new_bag_stay(shipping: Shipping) -> None:
     """What was computed of them is kept by segment."""
     shipping.ship(range(START_S, START_S + SEGMENT_BAGS + 8))
     robot = shipping.robot()
-    before = robot.memory.index.refresh().timeline.segments
+    before = robot.index.refresh().timeline.segments
     shipping.ship([START_S + 2 * SEGMENT_BAGS])
-    after = robot.memory.index.refresh().timeline.segments
+    after = robot.index.refresh().timeline.segments
     assert len(before) > 1
     assert [*map(id, after[: len(before) - 1])] == [*map(id, before[:-1])]
 
@@ -118,12 +118,12 @@ def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shippin
     """A question that is under way reads the bag that it found."""
     shipping.ship([START_S])
     robot = shipping.robot()
-    [bag] = robot.memory.index.refresh().bags
+    [bag] = robot.index.refresh().bags
     shipping.ship([START_S - 60], label="fork")
-    late, same = robot.memory.index.refresh().bags
+    late, same = robot.index.refresh().bags
     assert same is bag
     assert late.file != bag.file
-    [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
+    [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(bag.start, bag.end + 1))
     assert b"cup" in record.payload
 
 
@@ -133,7 +133,7 @@ def test_the_newest_days_move_on_and_older_ones_are_still_found(shipping: Shippi
     assert starts(robot) == [START_S - DAY_S]
     shipping.ship([START_S])
     assert starts(robot) == [START_S]
-    older = robot.memory.index.snapshot((START_S - DAY_S) * NS_PER_S)
+    older = robot.index.snapshot((START_S - DAY_S) * NS_PER_S)
     assert older.bags[0].start == (START_S - DAY_S) * NS_PER_S
 
 
@@ -143,7 +143,7 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     older = START_S - DAY_S
     shipping.ship([older, START_S])
     robot = shipping.robot(days=1, most_bags=1)
-    index = robot.memory.index
+    index = robot.index
     assert starts(robot) == [START_S]
     bag, *_ = index.snapshot(older * NS_PER_S).bags
     shipping.ship([older + 60], label="fork")
@@ -152,7 +152,7 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     select = shipping.engine.select
 
     def selected(sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
-        found.append(robot.memory.reader.summarize(bag.path))
+        found.append(robot.reader.summarize(bag.path))
         return select(sql, tables, parameters)
 
     monkeypatch.setattr(shipping.engine, "select", selected)
@@ -165,7 +165,7 @@ def test_bags_that_are_shipped_late_show_nothing_about_the_robots_clock(shipping
     robot = shipping.robot()
     assert starts(robot) == [START_S]
     shipping.ship([START_S - 2 * DAY_S, START_S - 2 * DAY_S + 60], label="fork")
-    found = robot.memory.index.refresh()
+    found = robot.index.refresh()
     assert len(found.bags) == 3
     assert found.dating.faults == ()
     assert found.earliest == found.bags[0].start
@@ -178,7 +178,7 @@ def test_older_days_that_are_looked_at_show_nothing_about_the_robots_clock(
     shipping.ship([before, last, START_S])
     robot = shipping.robot(days=2, most_bags=1)
     assert starts(robot) == [last, START_S]
-    older = robot.memory.index.snapshot(before * NS_PER_S)
+    older = robot.index.snapshot(before * NS_PER_S)
     assert [bag.start // NS_PER_S for bag in older.bags] == [before, last]
     assert older.dating.faults == ()
 
@@ -193,7 +193,7 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
     on_robot = with_store(memory_of(bags), bags)
     catalog = lake_in(tmp_path)
     fill(catalog, {"hall": on_robot}, ["/chatter"])
-    in_lake = lake_robots(catalog, engine, ["hall"])["hall"].memory
+    in_lake = lake_robots(catalog, engine, ["hall"])["hall"]
     pause = (START_S + 24) * NS_PER_S, (START_S + 30) * NS_PER_S
     assert [*on_robot.index.snapshot().gaps] == [pause]
     assert [*in_lake.index.refresh().gaps] == [pause]
@@ -204,10 +204,10 @@ def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
     robot = shipping.robot()
     shipping.ship([START_S - 2 * DAY_S], name="rec_0")
     shipping.ship([START_S], name="rec_0")
-    assert len({bag.file for bag in robot.memory.index.refresh().bags}) == 2
+    assert len({bag.file for bag in robot.index.refresh().bags}) == 2
     shipping.ship([START_S - DAY_S], name="rec_0")
-    bags = robot.memory.index.refresh().bags
+    bags = robot.index.refresh().bags
     assert len({bag.file for bag in bags}) == 3
     for bag in bags:
-        [record] = robot.memory.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
+        [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
         assert record.log_time == bag.start

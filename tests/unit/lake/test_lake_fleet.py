@@ -24,9 +24,8 @@ from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
-from tests.support.fleets import SEEN
-from tests.support.lakes import START_S, robot_bags, ship, write_bag
-from tests.unit.lake.test_questions import reply
+from tests.support.fleets import SEEN, reply
+from tests.support.lakes import START_S, ship_from, write_bag
 
 CUP: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
 
@@ -41,13 +40,19 @@ def overrides(folder: Path, engine: str) -> list[str]:
     ]
 
 
+def served(folder: Path) -> Fleet:
+    """The fleet of a server with a lake."""
+    fleet = build_fleet(load_settings(overrides(folder, "duckdb"), {}))
+    assert fleet is not None
+    return fleet
+
+
 def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -> None:
     for name in ("hall", "attic"):
         write_bag(tmp_path / name, 0)
-    ship(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in ("hall", "attic")])
+    ship_from(tmp_path, "hall", "attic")
     shutil.rmtree(tmp_path / "hall")
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    fleet = served(tmp_path)
     found = reply(fleet, "find_last_match", CUP)
     assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
     assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
@@ -60,11 +65,10 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
     tmp_path: Path, left: int
 ) -> None:
     bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     for bag in bags[: 2 - left]:
         bag.unlink()
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    fleet = served(tmp_path)
     asked = {"robot": "hall", "topic": "/chatter"}
     old = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 1})
     assert old["value"] == {"value": "n1"}
@@ -81,10 +85,9 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
 
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
     bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     bags[0].unlink()
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    fleet = served(tmp_path)
     for file in (tmp_path / "lake").rglob("*.parquet"):
         file.unlink()
     asked = {"robot": "hall", "topic": "/chatter"}
@@ -101,11 +104,10 @@ def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path:
         text((START_S + nth) * NS_PER_S, draw.randbytes(2000).hex(), "/camera") for nth in range(30)
     ]
     write_mcap(tmp_path / "hall" / "rec" / "rec_1.mcap", long)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     for bag in (tmp_path / "hall").rglob("*.mcap"):
         bag.unlink()
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    fleet = served(tmp_path)
     asked = {"robot": "hall", "topic": "/camera", "timestamp": START_S + 5}
     assert reply(fleet, "get_topic_at_time", asked)["error"] == "not_in_lake"
     asked = {"robot": "hall", "topic": "/camera", "condition_type": "contains", "value": "x"}
@@ -115,9 +117,8 @@ def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path:
 def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_path: Path) -> None:
     for name in ("hall", "attic"):
         write_bag(tmp_path / name, 0)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    ship_from(tmp_path)
+    fleet = served(tmp_path)
     found = reply(fleet, "find_last_match", CUP)
     assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
     [note] = found["notes"]
@@ -130,11 +131,11 @@ def test_a_lake_without_a_bag_is_reported(tmp_path: Path) -> None:
     """As one is that was given by a wrong path."""
     write_bag(tmp_path / "hall", 0)
     with structlog.testing.capture_logs() as logs:
-        build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+        served(tmp_path)
     assert [each["warehouse"] for each in logs if each["event"] == "lake_empty"] == [
         str(tmp_path / "lake")
     ]
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     with structlog.testing.capture_logs() as logs:
         build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
     assert "lake_empty" not in {each["event"] for each in logs}
@@ -145,7 +146,7 @@ def test_the_command_line_asks_a_lake(
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     write_bag(tmp_path / "hall", 0)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     shutil.rmtree(tmp_path / "hall")
     settings = [*overrides(tmp_path, "duckdb"), "+lake.properties={x.y: z}"]
     question = [f"{key}={value}" for key, value in CUP.items()]
@@ -161,9 +162,8 @@ def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(
     names = ("attic", "cellar", "hall")
     for name in names:
         write_bag(tmp_path / name, 0)
-    ship(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in names])
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    ship_from(tmp_path, *names)
+    fleet = served(tmp_path)
     assert [*fleet.robots] == ["hall", "attic", "cellar"]
     found = reply(fleet, "find_last_match", CUP)
     assert {row["robot_name"] for row in found["matches"]} == set(names)
@@ -178,11 +178,10 @@ def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(
 async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: Path) -> None:
     for name in ("hall", "attic"):
         write_bag(tmp_path / name, 0)
-    ship(tmp_path / "lake", [robot_bags(name, tmp_path / name) for name in ("hall", "attic")])
-    fleet = build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
-    assert fleet is not None
+    ship_from(tmp_path, "hall", "attic")
+    fleet = served(tmp_path)
     robots = [*fleet.robots.values()]
-    indexes = [each.lake_memory.index for each in robots if each.lake_memory is not None]
+    indexes = [each.lake.index for each in robots if each.lake is not None]
     assert [each.published for each in indexes] == [None, None]
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
@@ -229,10 +228,9 @@ def _with_a_later_robot(folder: Path) -> Fleet:
     """The fleet of a server that was started before a robot was shipped for the first time."""
     for name in ("hall", "attic", "cellar"):
         write_bag(folder / name, 0)
-    ship(folder / "lake", [robot_bags(name, folder / name) for name in ("hall", "attic")])
-    fleet = build_fleet(load_settings(overrides(folder, "duckdb"), {}))
-    ship(folder / "lake", [robot_bags("cellar", folder / "cellar")])
-    assert fleet is not None
+    ship_from(folder, "hall", "attic")
+    fleet = served(folder)
+    ship_from(folder, "cellar")
     return fleet
 
 

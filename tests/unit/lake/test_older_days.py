@@ -14,22 +14,20 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.queries import find_last_match, value_when
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.fleets import NOW, SEEN, START_S
+from tests.support.fleets import NOW, SEEN, START_S, reply
 from tests.support.lake_rows import fill, lake_in, lake_robots
 from tests.support.memories import memory_of, with_store
-from tests.unit.lake.test_questions import reply
 
 DAY_S = 86_400
 DAYS = 7
 """Days ago that the first bag is of; from then on there are two of a day, and none of the third."""
 
 
-def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> LakeRobot:
+def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.
@@ -48,8 +46,8 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> L
     return lake_robots(catalog, engine, ["hall"], days=1, most_bags=1)["hall"]
 
 
-def asked(robot: LakeRobot, label: str, topic: str = SEEN, **more: object) -> dict[str, Any]:
-    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot.memory, lake=robot)], FixedClock(NOW))
+def asked(robot: Memory, label: str, topic: str = SEEN, **more: object) -> dict[str, Any]:
+    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot, lake=robot)], FixedClock(NOW))
     given = {"topic": topic, "condition_type": "contains", "value": label, **more}
     found: dict[str, Any] = reply(fleet, "find_last_match", given)
     return found
@@ -80,7 +78,7 @@ def test_days_before_are_named_only_where_the_answer_is_of_them(
     tmp_path: Path, engine: LakeEngine, more: dict[str, object], *, is_noted: bool
 ) -> None:
     robot = old_robot(engine, tmp_path)
-    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot.memory, lake=robot)], FixedClock(NOW))
+    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot, lake=robot)], FixedClock(NOW))
     given = {"topic": SEEN, "condition_type": "contains", "value": "cup", **more}
     for robot_name in ({}, {"robot": "hall"}):
         found = reply(fleet, "find_matches", {**given, **robot_name})
@@ -101,7 +99,7 @@ def test_a_topic_of_old_days_alone_is_searched(tmp_path: Path, engine: LakeEngin
 
 def test_a_value_at_a_match_of_old_days_is_found(tmp_path: Path, engine: LakeEngine) -> None:
     robot = old_robot(engine, tmp_path, ["/chatter"])
-    ask = partial(value_when, robot.memory, Call(), "/chatter", SEEN, condition_type="contains")
+    ask = partial(value_when, robot, Call(), "/chatter", SEEN, condition_type="contains")
     found = ask(value="fork")
     assert found.matched is not None
     assert found.matched.sample.time == (START_S - 6 * DAY_S) * NS_PER_S
@@ -113,12 +111,17 @@ def test_where_the_time_is_short_it_says_how_far_it_looked(
     robot = old_robot(engine, tmp_path)
     monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
     call = Call(Deadline.after(60))
-    found = find_last_match(robot.memory, call, SEEN, "contains", "mug")
+
+    def ask(memory: Memory, call: Call) -> Match:
+        return find_last_match(memory, call, SEEN, "contains", "mug")
+
+    found, lake = Robot("hall", Path("/hall"), lambda: robot, lake=robot).asked(
+        ask, call, lake_first=True
+    )
     assert found.found is None
-    [note] = robot.notes()
+    assert lake is not None
+    [note] = lake.notes
     assert note.startswith("the lake has days before ")
-    # What is not asked for any more is not reported of the next answer.
-    assert [*robot.notes()] == []
 
 
 def test_what_fails_says_which_days_it_is_of(
@@ -127,10 +130,9 @@ def test_what_fails_says_which_days_it_is_of(
     robot = old_robot(engine, tmp_path)
     monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
 
-    def ask(memory: Memory) -> Match:
-        return find_last_match(memory, Call(Deadline.after(60)), "/none", "contains", "mug")
+    def ask(memory: Memory, call: Call) -> Match:
+        return find_last_match(memory, call, "/none", "contains", "mug")
 
-    of_lake = Robot("hall", Path("/hall"), lambda: robot.memory, lake=robot)
+    of_lake = Robot("hall", Path("/hall"), lambda: robot, lake=robot)
     with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
-        of_lake.asked(ask, lake=True)
-    assert [*robot.notes()] == []
+        of_lake.asked(ask, Call(Deadline.after(60)), lake_first=True)

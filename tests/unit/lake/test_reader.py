@@ -13,17 +13,15 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.memory.robot import LakeRobot
 from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
 from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import TABLES, open_tables
 from ros2_memory.lake.warehouse import quiet_deletes
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, text, write_mcap
-from tests.support.fleets import SEEN, START_S
+from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots, store_columns
 from tests.support.memories import memory_of, with_store
-from tests.unit.lake.test_questions import reply
 
 AT = START_S * NS_PER_S
 EVERYTHING = TimeWindow.everything()
@@ -48,14 +46,14 @@ def bags(tmp_path: Path) -> Memory:
 
 
 @pytest.fixture
-def robot(bags: Memory, engine: LakeEngine, tmp_path: Path) -> LakeRobot:
+def robot(bags: Memory, engine: LakeEngine, tmp_path: Path) -> Memory:
     catalog = lake_in(tmp_path)
     fill(catalog, {"hall": bags})
     return lake_robots(catalog, engine, ["hall"], stores=tmp_path / "cache")["hall"]
 
 
-def test_bags_and_their_messages_are_those_of_the_robot(bags: Memory, robot: LakeRobot) -> None:
-    theirs, own = bags.index.snapshot().bags, robot.memory.index.snapshot().bags
+def test_bags_and_their_messages_are_those_of_the_robot(bags: Memory, robot: Memory) -> None:
+    theirs, own = bags.index.snapshot().bags, robot.index.snapshot().bags
     folder = str(bags.index.bag_dir)
     assert [bag.file for bag in own] == [bag.file.replace(folder, "/hall") for bag in theirs]
     for bag, other in zip(theirs, own, strict=True):
@@ -63,21 +61,19 @@ def test_bags_and_their_messages_are_those_of_the_robot(bags: Memory, robot: Lak
         topics = ["/chatter", "/even", "/nothing"]
         for window in (EVERYTHING, TimeWindow(bag.start + 2 * NS_PER_S, bag.end)):
             for newest_first in (False, True):
-                found = robot.memory.reader.records(
-                    other.path, topics, window, newest_first=newest_first
-                )
+                found = robot.reader.records(other.path, topics, window, newest_first=newest_first)
                 expected = bags.reader.records(bag.path, topics, window, newest_first=newest_first)
                 assert [*found] == [*expected]
             for topic in (*topics, "/camera"):
-                times = robot.memory.reader.log_times(other.path, topic, window)
+                times = robot.reader.log_times(other.path, topic, window)
                 assert [*times] == [*bags.reader.log_times(bag.path, topic, window)]
-        assert {*robot.memory.reader.channels(other.path)} == {*bags.reader.channels(bag.path)}
+        assert {*robot.reader.channels(other.path)} == {*bags.reader.channels(bag.path)}
 
 
 def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
-    bags: Memory, robot: LakeRobot
+    bags: Memory, robot: Memory
 ) -> None:
-    over_lake, over_bags = fleet_of({"hall": robot.memory}), fleet_of({"hall": bags})
+    over_lake, over_bags = fleet_of({"hall": robot}), fleet_of({"hall": bags})
     at: dict[str, object] = {"topic": "/camera", "timestamp": START_S + 5, "tolerance_s": 9}
     refused = reply(over_lake, "get_topic_at_time", at)
     assert refused["error"] == NotInLakeError.code == "not_in_lake"
@@ -121,25 +117,25 @@ def test_copies_among_images_are_told_by_their_publish_times(
             }
             expected = reply(fleet_of({"hall": bags}), "get_topic_in_range", given)
             assert expected["rows"][0][2] == 30
-            assert reply(fleet_of({"hall": robot.memory}), "get_topic_in_range", given) == expected
+            assert reply(fleet_of({"hall": robot}), "get_topic_in_range", given) == expected
 
 
 def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
-    bags: Memory, robot: LakeRobot, tmp_path: Path
+    bags: Memory, robot: Memory, tmp_path: Path
 ) -> None:
     filling = store_columns(robot)
     assert filling.store.paths() == ["r0/one_0.mcap", "r1/one_0.mcap"]
     given: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
-    over_lake, over_bags = fleet_of({"hall": robot.memory}), fleet_of({"hall": bags})
+    over_lake, over_bags = fleet_of({"hall": robot}), fleet_of({"hall": bags})
     assert reply(over_lake, "find_matches", given) == reply(over_bags, "find_matches", given)
-    first, second = robot.memory.index.snapshot().bags
+    first, second = robot.index.snapshot().bags
     for table in open_tables(lake_in(tmp_path), TABLES).values():
         with quiet_deletes():
             table.delete(f"bag_id = '{bag_id_of('hall', first, first.start)}'")
-    assert robot.memory.index.refresh().bags == (second,)
+    assert robot.index.refresh().bags == (second,)
     with pytest.raises(BagVanishedError):
-        [*robot.memory.reader.records(first.path, ["/even"], EVERYTHING)]
-    filling.prune(robot.memory.index.refresh().timeline)
+        [*robot.reader.records(first.path, ["/even"], EVERYTHING)]
+    filling.prune(robot.index.refresh().timeline)
     assert filling.store.paths() == ["r1/one_0.mcap"]
 
 

@@ -9,18 +9,16 @@ from random import Random
 
 import pytest
 
-from ros2_memory.core.bag_summary import BagSummary, SummarySchema
-from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
-from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.rows import bag_id_of, made_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, topic_key
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.fleets import LENGTH_S, NOW, SEEN, SeededRobot, seeded, write_robot
+from tests.support.fleets import NOW, SEEN, SeededRobot, seeded, write_robot
 from tests.support.lake_rows import shipped
 from tests.support.memories import memory_of, with_store
 
@@ -83,39 +81,6 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(both: list[dict[st
         x, y = float(str(row["x"])), float(str(row["y"]))
         apart = math.dist((x, y), (math.sin(second / 10) * 3, 0.1 * second))
         assert apart <= float(str(row["error_m"])) + 1e-9
-
-
-def test_channels_have_every_message_of_the_bag(
-    memory: Memory, both: list[dict[str, Table]]
-) -> None:
-    everything = TimeWindow.everything()
-    for bag, rows in zip(memory.index.snapshot().bags, both, strict=True):
-        topics = [each.topic for each in bag.summary.topics]
-        expected = [*memory.reader.records(bag.path, topics, everything)]
-        channels = {each.channel.topic: each.channel for each in expected}
-        found = []
-        for row in rows["channels"]:
-            packed = row["packed"]
-            assert isinstance(packed, bytes)
-            batch = unpacked_messages(packed, channels[str(row["topic"])])
-            found += [batch.record(nth) for nth in range(len(batch.log_times))]
-        assert sorted(found, key=repr) == sorted(expected, key=repr)
-        assert {row["has_payloads"] for row in rows["channels"]} == {True}
-    counts = Counter[str]()
-    for row in joined(both, "channels"):
-        counts[str(row["topic"])] += int(str(row["messages"]))
-    assert counts["/odom"] == LENGTH_S
-
-
-def test_the_summary_of_a_bag_is_the_one_of_the_index(
-    memory: Memory, both: list[dict[str, Table]]
-) -> None:
-    for bag, rows in zip(memory.index.snapshot().bags, both, strict=True):
-        [row] = rows["bags"]
-        packed = row["counts"]
-        assert isinstance(packed, bytes)
-        schema = SummarySchema.from_json(str(row["summary"]))
-        assert BagSummary.decoded(schema, packed) == bag.summary
 
 
 def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(

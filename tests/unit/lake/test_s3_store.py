@@ -12,9 +12,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from ros2_memory.lake.forgetting import forget_in_lake
-from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.tombstones import Tombstone
+from ros2_memory.lake.forgetting import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
 from tests.support.lakes import LATER, ship_and_ask
 
@@ -40,10 +38,8 @@ def test_bags_are_shipped_once_into_a_bucket_and_asked(tmp_path: Path) -> None:
         endpoint = where.properties["s3.endpoint"]
         urlopen(Request(f"{endpoint}/robots", method="PUT")).close()  # noqa: S310 - of this host
         ship_and_ask(where, tmp_path / "hall")
-        with where.opened() as catalog:
-            tables = where.tables(catalog, TABLES)
-            everything = Tombstone("hall", 0, LATER)
-            assert forget_in_lake(where, tables, everything, LATER).bags == 2
+        with where.writable() as tables:
+            assert forget_in_lake(tables, Tombstone("hall", 0, LATER)).bags == 2
         with urlopen(f"{endpoint}/robots?list-type=2") as listing:  # noqa: S310 - of this host
             objects = listing.read().decode()
         assert ".metadata.json" in objects

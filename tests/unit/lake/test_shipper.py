@@ -19,6 +19,7 @@ from tests.support.lakes import (
     location,
     robot_bags,
     ship,
+    ship_from,
     shipping,
     write_bag,
 )
@@ -71,11 +72,8 @@ def test_every_message_is_in_the_lake_once_and_again_after_a_second_pass(
 
 
 def _snapshots(folder: Path) -> dict[str, int]:
-    where = location(folder)
-    with where.opened() as catalog:
-        return {
-            name: len(table.snapshots()) for name, table in where.tables(catalog, TABLES).items()
-        }
+    with location(folder).writable() as lake:
+        return {name: len(lake.current(name).snapshots()) for name in TABLES}
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
@@ -97,20 +95,20 @@ def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
 def test_a_bag_of_which_messages_were_deleted_replaces_its_rows(tmp_path: Path) -> None:
     write_bag(tmp_path / "hall", 0)
     write_bag(tmp_path / "hall", 1)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     # Its first messages are gone, so that it has another id.
     write_bag(tmp_path / "hall", 1, at_s=START_S + 11, most=2)
     write_bag(tmp_path / "hall", 0, most=1)
-    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 2
+    assert ship_from(tmp_path).bags == 2
     assert values(tmp_path / "lake") == ["n0", "n100", "n101"]
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 2
 
 
 def test_another_bag_under_the_name_of_a_deleted_one_leaves_its_rows(tmp_path: Path) -> None:
     write_bag(tmp_path / "hall", 0)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     write_bag(tmp_path / "hall", 0, at_s=START_S + 5_000)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     assert len(values(tmp_path / "lake")) == 6
 
 
@@ -119,22 +117,22 @@ def test_a_saved_copy_of_a_bag_is_shipped_only_where_the_bag_is_not(tmp_path: Pa
     moment = tmp_path / "hall" / "moments" / "20261120T043012Z-cup"
     shutil.copytree(tmp_path / "hall" / "rec", moment / "rec")
     write_bag(moment, 1)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     assert len(values(tmp_path / "lake")) == 6
     shutil.rmtree(tmp_path / "hall" / "rec")
-    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 0
+    assert ship_from(tmp_path).bags == 0
     assert len(values(tmp_path / "lake")) == 6
 
 
 def test_days_of_which_a_robot_has_no_bag_any_more_are_not_read(tmp_path: Path) -> None:
     old = write_bag(tmp_path / "hall", 0, at_s=START_S - 30 * DAY_S)
     write_bag(tmp_path / "hall", 1)
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    ship_from(tmp_path)
     old.unlink()
     own = tmp_path / "lake" / "ros2_memory" / "bags" / "data" / "robot=hall"
     shutil.rmtree(min(own.iterdir()))
     write_bag(tmp_path / "hall", 2)
-    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 1
+    assert ship_from(tmp_path).bags == 1
 
 
 def test_a_bag_across_midnight_that_lost_its_first_day_replaces_its_rows(tmp_path: Path) -> None:
@@ -168,7 +166,7 @@ def test_read_only_bags_are_shipped_and_reported(
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr(shipper_module, "append_receipts", refused)
-    done = ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")])
+    done = ship_from(tmp_path)
     assert done.bags == 1
     [problem] = done.problems
     assert "Read-only file system" in problem
@@ -178,7 +176,7 @@ def test_read_only_bags_are_shipped_and_reported(
 def test_nothing_is_written_beside_bags_of_others(tmp_path: Path) -> None:
     write_bag(tmp_path / "hall", 0)
     (tmp_path / "hall" / ".episodic" / "recordings.jsonl").unlink()
-    assert ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")]).bags == 1
+    assert ship_from(tmp_path).bags == 1
     assert not (tmp_path / "hall" / ".episodic" / "shipped.jsonl").exists()
 
 

@@ -1,6 +1,6 @@
 """A message's value in columns: what has one, and what stays JSON."""
 
-from ros2_memory.lake.typed_values import taken_apart
+from ros2_memory.lake.rows import taken_apart
 
 
 def test_scalars_have_columns_by_their_kind_and_their_paths() -> None:

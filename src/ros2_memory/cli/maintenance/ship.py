@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 import typer
 
 from ros2_memory.bootstrap import shared_parts
-from ros2_memory.bootstrap_lake import build_robots, lake_location
+from ros2_memory.bootstrap_fleet import build_robots
+from ros2_memory.bootstrap_lake import lake_location
 from ros2_memory.cli.options import (
     EXIT_NEGATIVE,
     AsJson,
@@ -146,22 +147,23 @@ def _forget(
         InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is done.
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
-    from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
-    from ros2_memory.lake.partitions import Partitions  # noqa: PLC0415
-    from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
-    from ros2_memory.lake.tombstones import Tombstone, append_tombstone  # noqa: PLC0415
+    from ros2_memory.lake.files import Partitions  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.forgetting import (  # noqa: PLC0415
+        Tombstone,
+        append_tombstone,
+        forget_in_lake,
+    )
 
     tombstone = Tombstone(robot, window.start, window.stop)
-    with location.opened() as catalog:
-        tables = location.tables(catalog, TABLES)
-        known = {*Partitions().look(tables["bags"]), *(each.name for each in robots)}
+    with location.writable() as lake:
+        known = {*Partitions().look(lake.current("bags")), *(one.name for one in robots)}
         if robot not in known:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
                 f"{listed(sorted(known))}"
             )
         append_tombstone(location.state_dir, tombstone, done=False)
-        gone = forget_in_lake(location, tables, tombstone, WallClock().now())
+        gone = forget_in_lake(lake, tombstone)
     if as_json:
         kept_by = [*gone.kept_by]
         print_line(json.dumps({"bags": gone.bags, "files": gone.files, "kept_by": kept_by}))
@@ -212,10 +214,8 @@ def _shipper(
     pace: _Pace,
     lease: "WarehouseLease",
 ) -> "Iterator[Shipper]":
-    from ros2_memory.lake.forgetting import forget_in_lake  # noqa: PLC0415 - as in `ship`
+    from ros2_memory.lake.forgetting import forget_in_lake, read_tombstones  # noqa: PLC0415
     from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
-    from ros2_memory.lake.tables import TABLES  # noqa: PLC0415
-    from ros2_memory.lake.tombstones import read_tombstones  # noqa: PLC0415
 
     def alive() -> None:
         notify(WATCHDOG)
@@ -225,15 +225,13 @@ def _shipper(
         pace()
         lease.confirm()
 
-    with location.opened() as catalog:
-        tables = location.tables(catalog, TABLES)
+    with location.writable() as lake:
         tombstones = read_tombstones(location.state_dir)
-        for each, is_done in tombstones.items():
+        for tombstone, is_done in tombstones.items():
             if not is_done:
-                forget_in_lake(location, tables, each, WallClock().now())
+                forget_in_lake(lake, tombstone)
         yield Shipper(
-            location,
-            tables,
+            lake,
             robots,
             WallClock(),
             messages=settings.lake.messages,

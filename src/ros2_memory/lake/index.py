@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from bisect import bisect_right
 from dataclasses import dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
@@ -16,7 +17,6 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.partitions import newest
 from ros2_memory.lake.tables import day_of, end_of
 
 if TYPE_CHECKING:
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.partitions import Days, LakeFile
+    from ros2_memory.lake.files import Days, Lake, LakeFile
     from ros2_memory.retention.foreign import Foreign
 
 MOST_BAGS: Final = 45_000
@@ -101,18 +100,34 @@ class _Window:
     """Consecutive days of a robot, and what the lake has of them.
 
     Attributes:
-        since: its first day, where there are older ones; None otherwise.
-        older: the end of the newest day before that, as a log time.
+        older: the end of the newest day before them, as a log time; None where there is none.
         days: what is known of each.
         timeline: the bags of all.
         files: these by their paths, and what they are in the lake.
     """
 
-    since: date | None = None
     older: Ns | None = None
     days: Mapping[date, _Day] = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     files: Mapping[str, tuple[LakeBag, BagFile]] = field(default_factory=dict)
+
+
+def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
+    """Returns the newest days with rows up to one, and the one before them, if there is one.
+
+    They are those of `fewest` days, and more while all have at most `rows` rows.
+    """
+    order = [*days]
+    begin = end = bisect_right(order, until)
+    total = 0
+    while begin:
+        day = order[begin - 1]
+        total += sum(file.rows for file in days[day])
+        if total > rows and day <= order[end - 1] - timedelta(days=fewest):
+            break
+        begin -= 1
+    found = {day: days[day] for day in order[begin:end]}
+    return found, order[begin - 1] if begin else None
 
 
 class LakeIndex:
@@ -155,7 +170,6 @@ class LakeIndex:
         self._newest = _Window()
         self._older: dict[date, _Window] = {}
         self._snapshot: Snapshot | None = None
-        self._asked = threading.local()
 
     @property
     def published(self) -> Snapshot | None:
@@ -173,20 +187,16 @@ class LakeIndex:
         known = self._snapshot
         if known is None or self._clock.now() - known.scanned_at > self._refresh_s * 1e9:
             known = self.refresh()
-        window = self._newest
-        if reach is not None and window.since is not None and day_of(reach) < window.since:
+        if reach is not None and known.older is not None and reach <= known.older:
             window = self._window_before(day_of(reach))
             known = replace(known, timeline=window.timeline, older=window.older)
-        self._note(window)
         return known
 
     def refresh(self) -> Snapshot:
         """Looks into the lake now; what was just seen there for another robot is not old."""
         with self._lock:
             self._lake.refresh(self._refresh_s / _LOOKS)
-            days = self._lake.days("bags", self._robot)
-            own, before = newest(days, date.max, self._most_bags, self._fewest_days)
-            self._newest = self._window(own, before, self._newest)
+            self._newest = self._window(date.max, self._fewest_days, self._newest)
             timeline = self._newest.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
@@ -196,15 +206,6 @@ class LakeIndex:
                 older=self._newest.older,
             )
             return self._snapshot
-
-    def unseen_before(self) -> date | None:
-        """Returns before which day the lake has days that this thread was not shown since it asked.
-
-        None where it was shown all.
-        """
-        found: date = getattr(self._asked, "since", date.min)
-        self._asked.since = date.max
-        return found if date.min < found < date.max else None
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
@@ -227,54 +228,36 @@ class LakeIndex:
                 return found
         raise BagVanishedError(str(path), "it is not in the lake any more")
 
-    def _note(self, window: _Window) -> None:
-        known: date = getattr(self._asked, "since", date.max)
-        self._asked.since = min(known, window.since or date.min)
-
     def _window_before(self, day: date) -> _Window:
         """Returns the days up to one, with the next, in which what lies across midnight goes on."""
         with self._lock:
-            days = self._lake.days("bags", self._robot)
-            after = day + timedelta(days=1)
-            own, before = newest(days, after, self._most_bags, _FEWEST_DAYS)
-            last = max(own, default=day)
-            window = self._window(own, before, self._older.get(last, _Window()))
+            known = self._older.get(day, _Window())
+            window = self._window(day + timedelta(days=1), _FEWEST_DAYS, known)
             # A new dict: other threads look for the bags of their answers in the old one.
-            others = [each for each in self._older.items() if each[0] != last]
-            self._older = dict([*others[1 - _MOST_WINDOWS :], (last, window)])
+            others = [each for each in self._older.items() if each[0] != day]
+            self._older = dict([*others[1 - _MOST_WINDOWS :], (day, window)])
             return window
 
-    def _window(self, made_of: Days, older_day: date | None, known: _Window) -> _Window:
-        """Returns what the lake has of some days; only those are read of which a file is new.
-
-        `older_day` is the newest one before them.
-        """
-        if not made_of:
-            return _Window()
-        bounds = replace(known, since=None, older=None)
-        if older_day is not None:
-            bounds = replace(known, since=min(made_of), older=end_of(older_day))
+    def _window(self, until: date, fewest: int, known: _Window) -> _Window:
+        """Returns the newest days up to one; only those are read of which a file is new."""
+        of_robot = self._lake.days("bags", self._robot)
+        made_of, day_before = newest(of_robot, until, self._most_bags, fewest)
+        older = None if day_before is None else end_of(day_before)
         days = {
             day: known.days[day]
             for day, files in made_of.items()
             if day in known.days and known.days[day].made_of == files
         }
         if days.keys() == made_of.keys() == known.days.keys():
-            return bounds
+            return replace(known, older=older)
         paths = _Paths(known.files)
-        days |= self._read({day: each for day, each in made_of.items() if day not in days}, paths)
+        days |= self._read({day: made_of[day] for day in made_of if day not in days}, paths)
         files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
         before = {file: bag for file, (_, bag) in known.files.items()}
         now = {file: bag for file, (_, bag) in files.items()}
-        return replace(
-            bounds,
-            days=days,
-            timeline=known.timeline.changed(
-                [bag for file, bag in before.items() if now.get(file) is not bag],
-                [bag for file, bag in now.items() if before.get(file) is not bag],
-            ),
-            files=files,
-        )
+        gone = [bag for file, bag in before.items() if now.get(file) is not bag]
+        new = [bag for file, bag in now.items() if before.get(file) is not bag]
+        return _Window(older, days, known.timeline.changed(gone, new), files)
 
     def _read(self, made_of: Days, paths: _Paths) -> dict[date, _Day]:
         """Returns what the lake has of some days; known bags stay."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import heapq
 import json
-import threading
-from collections import Counter
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -16,7 +14,7 @@ from ros2_memory.core.errors import BagError, NotInLakeError
 from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.tables import topic_key
 from ros2_memory.storage.base import BagReader, Channel, Closing, Schema
-from ros2_memory.storage.cache import ByteLru
+from ros2_memory.storage.cache import ByteLru, shared
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
@@ -29,13 +27,9 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.memory.index import LakeBag, LakeIndex
+    from ros2_memory.lake.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Batch, Definition, Record
 
-_MOST_ALONE: Final = 2
-"""Bags that are read alone; who goes on reads those beside them, too."""
-_MOST_COUNTED: Final = 10_000
-_MOST_CHANNELS: Final = 10_000
 _HEAD_BYTES: Final = 200
 _HEADS_BYTES: Final = 8 << 20
 _HEADS: Final = (
@@ -80,9 +74,6 @@ class LakeReader(BagReader):
         self._index = index
         self._decoder = decoder
         self._heads: ByteLru[Sequence[_Head]] = ByteLru(_HEADS_BYTES)
-        self._channels: dict[Channel, Channel] = {}
-        self._asked = Counter[object]()
-        self._lock = threading.Lock()
 
     def reads(self, path: Path) -> bool:
         """Returns True: all files of the index are of the lake."""
@@ -192,7 +183,7 @@ class LakeReader(BagReader):
         ):
             more = tuple((key, value) for key, value in json.loads(metadata))
             channel = Channel(topic, encoding, Schema(*schema), latched, more)
-            found[bag_id].append(_Head(number, self._shared(channel), has_payloads))
+            found[bag_id].append(_Head(number, shared(channel), has_payloads))
         for bag_id, heads in found.items():
             size = _HEAD_BYTES * (1 + len(heads))
             self._heads.put((bag_id, bag.together[bag_id]), heads, size)
@@ -207,13 +198,12 @@ class LakeReader(BagReader):
         known = self._lake.messages.get(key)
         if known is not None:
             return known
-        with self._lock:
-            if len(self._asked) > _MOST_COUNTED:
-                self._asked.clear()
-            together = (min(bag.together), bag.day, *topics)
-            self._asked[together] += 1
-            is_alone = self._asked[together] <= _MOST_ALONE
-        bags = [bag.bag_id] if is_alone else [*bag.together]
+        # Who has read one bag and goes on, reads those beside it, too.
+        is_second = any(
+            self._lake.messages.get((bag_id, state, head.number)) is not None
+            for bag_id, state in bag.together.items()
+        )
+        bags = [*bag.together] if is_second else [bag.bag_id]
         rows = self._select(_PACKED, bag, bags, topics)
         columns = (column.to_pylist() for column in rows.columns)
         for bag_id, number, packed in zip(*columns, strict=True):
@@ -232,9 +222,3 @@ class LakeReader(BagReader):
         keys = [*map(topic_key, topics)]
         asked = {"bags": bags, "first": first, "last": last, "topics": topics, "keys": keys}
         return self._lake.select(sql, "channels", files, asked)
-
-    def _shared(self, channel: Channel) -> Channel:
-        """Returns the first channel that was equal: bags of one robot declare the same."""
-        if len(self._channels) > _MOST_CHANNELS:
-            self._channels.clear()
-        return self._channels.setdefault(channel, channel)

@@ -1,1 +1,0 @@
-"""A robot's memory over the bags that a lake has of it."""

@@ -1,0 +1,175 @@
+"""A lake answers as the bags do about robots that have little in common; and so does SQL."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import duckdb
+import pytest
+
+from ros2_memory.core.timebase import iso_local
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.shipper import Shipped, Shipper
+from ros2_memory.lake.tables import TABLES
+from tests.support.clocks import FixedClock
+from tests.support.fleets import reply, tools_of
+from tests.support.lake_questions import Question, every_question
+from tests.support.lake_rows import fleet_of, lake_robots, store_columns
+from tests.support.lakes import LATER, location, robot_bags
+from tests.support.memories import ROOT, memory_of, with_store
+from tests.support.moving_map import BEGIN, S
+from tests.support.unlike_robots import DAMAGED, LENGTH_S, ROBOTS, SEEN, YEAR_NS
+
+NOW = BEGIN + 600 * S
+MESSAGES = ("/battery_state", "/speech")
+
+
+OF_DIRECTORIES = {"memory_status"}
+"""Tools that are about a bag directory, and its recorder."""
+
+
+class World(NamedTuple):
+    """The robots over their bags, and over a lake; what was shipped, and the folder of the lake."""
+
+    mounted: Fleet
+    lake: Fleet
+    shipped: Shipped
+    folder: Path
+
+    def both(self, *, is_mounted: bool = True) -> Fleet:
+        """The fleet of a server with a lake, and with or without the robots' own memories."""
+        robots = [
+            Robot(name, Path("/") / name, robot.memory, lake=of_lake, is_mounted=is_mounted)
+            for name, robot in self.mounted.robots.items()
+            for of_lake in [self.lake.robots[name].memory()]
+        ]
+        return Fleet(robots, self.mounted.clock, shared_map=True)
+
+
+@pytest.fixture(scope="module")
+def world(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
+    of_robots = [robot_bags(name, write(folder / name)) for name, write in ROBOTS.items()]
+    with location(lake).writable() as tables:
+        shipped = Shipper(tables, of_robots, FixedClock(LATER), messages=MESSAGES).run()
+    for number in DAMAGED:
+        (folder / "damaged" / "rec" / f"rec_{number}.mcap").unlink()
+    memories = {
+        name: with_store(memory_of(folder / name, clock=FixedClock(NOW)), folder / name)
+        for name in ROBOTS
+    }
+    with location(lake).opened() as catalog:
+        of_lake = lake_robots(
+            catalog, engine, [*ROBOTS], stores=tmp_path_factory.mktemp("cache"), now=NOW
+        )
+        for name in ("damaged", "twin"):
+            store_columns(of_lake[name])
+        mounted, shipped_ones = (
+            fleet_of(some, shared_map=True, now=NOW) for some in (memories, of_lake)
+        )
+        yield World(mounted, shipped_ones, shipped, lake)
+
+
+def test_bags_that_are_damaged_or_left_open_are_counted_named_and_not_shipped(world: World) -> None:
+    shipped = world.shipped
+    assert (shipped.bags, shipped.waiting, len(shipped.problems)) == (23, 1, len(DAMAGED))
+    for number in DAMAGED:
+        [problem] = [each for each in shipped.problems if f"rec_{number}.mcap" in each]
+        assert problem.startswith("damaged: ")
+
+
+def _begin_s(name: str) -> float:
+    return (BEGIN - (YEAR_NS if name == "behind" else 0)) / S
+
+
+def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: World) -> None:
+    """Eight at once, and twice in one process."""
+    asked: list[Question] = []
+    for name in ROBOTS:
+        rows = reply(world.mounted, "list_recorded_topics", {"robot": name})
+        topics, begin_s = sorted({row["topic"] for row in rows}), _begin_s(name)
+        some = every_question(topics, begin_s, begin_s + LENGTH_S, SEEN[name], "/vision/*/*")
+        for tool, given in some:
+            asked += [
+                (tool, {**given, "robot": name}),
+                *([(tool, given)] if name == "twin" else []),
+            ]
+    expected = [reply(world.mounted, *question) for question in asked]
+    answered = {tool for (tool, _), own in zip(asked, expected, strict=True) if "error" not in own}
+    assert answered == tools_of(world.mounted).keys() - OF_DIRECTORIES
+    for _ in range(2):
+        with ThreadPoolExecutor(8) as threads:
+            found = threads.map(lambda question: reply(world.lake, *question), asked)
+        refused = set()
+        for question, own, answer in zip(asked, expected, found, strict=True):
+            if "error" in answer and answer["error"] == "not_in_lake":
+                refused.add((question[1].get("robot"), question[1]["topic"]))
+            else:
+                assert answer == own, question
+        assert refused == {("twin", "/left/image"), ("twin", "/right/image")}
+
+
+def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
+    asked: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
+    *_, note = reply(world.both(), "find_last_match", asked)["notes"]
+    latest = {
+        name: robot.memory().index.snapshot().latest for name, robot in world.lake.robots.items()
+    }
+    times = [f"{name} up to {iso_local(latest[name] or 0)}" for name in sorted(latest, key=str)]
+    assert note.startswith("from the lake, which has what was shipped: behind up to ")
+    assert sorted(note.partition(": ")[2].split(", ")) == times
+
+
+def test_what_a_robot_does_now_is_not_asked_of_a_lake(world: World) -> None:
+    status = reply(world.mounted, "memory_status", {})
+    assert reply(world.both(), "memory_status", {}) == status
+
+
+def test_of_which_topics_a_lake_has_the_times_alone_is_a_doubt(world: World) -> None:
+    doubts = {
+        name: reply(world.lake, "memory_status", {"robot": name})["doubts"]
+        for name in ("twin", "lost")
+    }
+    assert "of 2 topics there are only the times here: /left/image, /right/image" in doubts["twin"]
+    assert "times" not in doubts["lost"]
+
+
+def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
+    page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
+    view, *statements = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
+    database = duckdb.connect()
+    for name in TABLES:
+        database.sql(view.replace("LAKE", str(world.folder)).replace("bags", name))
+    metres, minutes, often, charge, last, where = (
+        database.sql(statement).fetchall() for statement in statements
+    )
+
+    def answer(tool: str, name: str, **given: Any) -> Any:
+        return reply(world.mounted, tool, {"robot": name, **given})
+
+    whole = {name: {"start": _begin_s(name), "end": _begin_s(name) + LENGTH_S} for name in ROBOTS}
+    driven = {name: answer("trajectory_summary", name, **whole[name]) for name in ROBOTS}
+    assert {robot: found for robot, _, found in metres} == {
+        name: pytest.approx(one["distance_m"], rel=0.03) for name, one in driven.items()
+    }
+    there = {"where": {"x": 2.0, "y": 3.0, "radius_m": 1.5}}
+    of_map = {name: answer("visits", name, **there, **whole[name]) for name in ROBOTS}
+    spent = {robot: float(found) for robot, _, found in minutes}
+    for name in ("behind", "damaged", "twin"):
+        assert spent[name] == pytest.approx(of_map[name]["minutes"], abs=0.03), name
+    assert spent.keys() == {"behind", "damaged", "twin"}
+    assert {(robot, thing) for robot, thing, *_ in often} >= set(SEEN.items())
+    percentages = [1 - step / 1000 for step in range(0, 5 * LENGTH_S, 25)]
+    of_lost = [row[2:] for row in charge if row[0] == "lost"]
+    assert of_lost == [pytest.approx((min(percentages), max(percentages)))]
+    mug: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "mug"}
+    matches = reply(world.mounted, "find_last_match", mug)["matches"]
+    assert [(row[0], round(row[1], 3)) for row in last] == [
+        (row["robot_name"], row["timestamp"]) for row in matches
+    ]
+    assert {row[0] for row in where} == {"behind", "damaged", "twin"}
