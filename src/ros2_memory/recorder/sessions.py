@@ -19,8 +19,8 @@ from ros2_memory.recorder.handover.plan import (
     HandoverPlan,
     Step,
 )
-from ros2_memory.recorder.handover.recovery import settle_handover
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
+from ros2_memory.recorder.handover.union import settle_handover
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
     WAITING_S,

@@ -10,7 +10,7 @@ what was published: `union` finds that in the other one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -65,8 +65,7 @@ class Step(Enum):
     ABANDON = auto()
 
 
-@dataclass(frozen=True, slots=True)
-class Bounds:
+class Bounds(NamedTuple):
     """The times of a complete handover: both recorders received from `both` to `ended`."""
 
     began: Ns
@@ -120,13 +119,6 @@ class HandoverPlan:
         return Bounds(self.began.wall, self._both.wall, middle, now.wall)
 
 
-class Sidecars(NamedTuple):
-    """The sidecars of the old and of the new recording."""
-
-    old: Handover
-    new: Handover
-
-
 def intended(old: Handover, new_name: str | None) -> Handover:
     """Returns the old sidecar before the new recording is started, as a crash may come any time.
 
@@ -155,8 +147,10 @@ def complete_sidecars(
     new_files: Collection[str],
     simulated: bool,
     clock: CutClock,
-) -> Sidecars:
-    """Returns both sidecars of a complete handover. The new one must be written first.
+) -> tuple[Handover, Handover]:
+    """Returns the sidecars of the old and of the new recording after a complete handover.
+
+    The new one must be written first.
 
     Args:
         old: the present sidecar of the old recording.
@@ -171,8 +165,8 @@ def complete_sidecars(
     both, last = (None, None) if simulated else (bounds.both, bounds.ended + LATE_MESSAGES_NS)
     began, ended = (None, None) if simulated else (bounds.began, bounds.ended)
     notes = (LOG_CLOCK_NOTE,) if clock is CutClock.LOG else ()
-    return Sidecars(
-        old=replace(
+    return (
+        replace(
             old,
             clock=clock,
             next=new_name,
@@ -180,7 +174,7 @@ def complete_sidecars(
             end=Overlap(both, last, tuple(sorted(old_files))),
             notes=tuple(dict.fromkeys((*old.notes, *notes))),
         ),
-        new=Handover(
+        Handover(
             clock=clock,
             previous=old_name,
             counts_from=bounds.cut,

@@ -17,13 +17,8 @@ from ros2_memory.bag_dir.handover_file import (
     write_handovers,
 )
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.plan import (
-    complete_sidecars,
-    intended,
-    pending,
-    void,
-)
-from ros2_memory.recorder.handover.recovery import cut_clock
+from ros2_memory.recorder.handover.plan import complete_sidecars, intended, pending, void
+from ros2_memory.recorder.handover.union import cut_clock
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -113,7 +108,7 @@ class HandoverTransfer:
         if self._simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
-        sidecars = complete_sidecars(
+        old, new = complete_sidecars(
             handover_to_change(self.old.splits.directory),
             self.old.name,
             self.new.name,
@@ -123,12 +118,7 @@ class HandoverTransfer:
             simulated=self._simulated,
             clock=clock,
         )
-        write_handovers(
-            {
-                self.new.splits.directory: sidecars.new,
-                self.old.splits.directory: sidecars.old,
-            }
-        )
+        write_handovers({self.new.splits.directory: new, self.old.splits.directory: old})
         return True
 
     def abandon(self) -> None:

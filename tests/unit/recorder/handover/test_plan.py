@@ -14,7 +14,6 @@ from ros2_memory.recorder.handover.plan import (
     Bounds,
     ClockReading,
     HandoverPlan,
-    Sidecars,
     Step,
     complete_sidecars,
     intended,
@@ -106,7 +105,7 @@ def test_only_a_clock_that_falls_behind_at_once_was_set_back(wall_s: float, expe
 
 
 class TestSidecars:
-    def make(self, **changes: object) -> Sidecars:
+    def make(self, **changes: object) -> tuple[Handover, Handover]:
         arguments: dict[str, object] = {
             "old_files": ["a_7.mcap", "a_6.mcap"],
             "new_files": ["b_0.mcap"],
