@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-from enum import Enum, auto
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import counted
@@ -108,71 +107,6 @@ class SilenceWatch:
         self._must_grow = for_silence or not self._has_grown
         doubled_s = min(2 * self._patience_s, self._cap_s)
         self._patience_s = doubled_s if for_silence else self._first_s
-
-
-class SpaceAction(Enum):
-    """What the free space asks for."""
-
-    NONE = auto()
-    MAKE_ROOM = auto()  # delete more than the budget asks
-    WAIT = auto()  # for room that is being made
-    PAUSE = auto()
-    STAY_PAUSED = auto()
-    RESUME = auto()
-
-
-def resume_bytes(min_free_bytes: int) -> int:
-    """Returns how much must be free for recording to resume: more than what it was paused for."""
-    return round(min_free_bytes * RESUME_FACTOR)
-
-
-def space_action(
-    free_bytes: int,
-    min_free_bytes: int,
-    *,
-    paused: bool,
-    room_requested: bool,
-    making_room: bool = False,
-) -> SpaceAction:
-    """Decides what to do about the free space.
-
-    Args:
-        free_bytes: what the file system of the bag directory has left for this user.
-        min_free_bytes: what it must have for recording to continue.
-        paused: whether recording is paused.
-        room_requested: whether deleting was requested for this shortage already.
-        making_room: whether that is still under way; it is waited for while half of
-            `min_free_bytes` is free.
-    """
-    if paused:
-        enough = free_bytes >= resume_bytes(min_free_bytes)
-        return SpaceAction.RESUME if enough else SpaceAction.STAY_PAUSED
-    if free_bytes >= min_free_bytes:
-        return SpaceAction.NONE
-    if not room_requested:
-        return SpaceAction.MAKE_ROOM
-    waits = making_room and free_bytes >= min_free_bytes // 2
-    return SpaceAction.WAIT if waits else SpaceAction.PAUSE
-
-
-def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: str) -> str:
-    """Describes what a recorder waits for that has received nothing.
-
-    `advice` is for subscriptions that receive nothing.
-    """
-    if simulated:
-        return (
-            "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
-            "before /clock arrives"
-        )
-    if not {*subscribed} - OWN_TOPICS:
-        return (
-            "nothing has been recorded of the robot: no publisher offers any of the listed topics "
-            "in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and topics.yaml with "
-            "the robot's"
-        )
-    topics = counted(len({*subscribed} - OWN_TOPICS), "topic is", "topics are")
-    return f"nothing has been recorded, although {topics} subscribed to; {advice}"
 
 
 def describe_death(status: int, last_output: str) -> str:

@@ -21,13 +21,7 @@ from ros2_memory.recorder.handover.plan import (
 )
 from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.handover.union import settle_handover
-from ros2_memory.recorder.policies import (
-    OWN_TOPICS,
-    WAITING_S,
-    describe_death,
-    describe_silent_topics,
-    describe_waiting,
-)
+from ros2_memory.recorder.policies import describe_death, describe_silent_topics
 from ros2_memory.recorder.process.child import end_all
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
@@ -81,6 +75,8 @@ class RecordingSessions:
         announce: receives the name of a recording before anything of it exists.
         reader: reads splits that are closed.
         events: where everything is reported.
+        interrupted: receives when a recording last grew that ended unexpectedly (wall time), and
+            how it ended.
         own: the list of recordings that were made here.
         reception: measures closed splits, and receives the publishers that were refused.
         topics: the list of topics to record.
@@ -90,7 +86,6 @@ class RecordingSessions:
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
-        waiting_for: why no message has arrived since recording started, as a sentence; else None.
         heard: the topics of which a closed split had a message.
         closed_s: when a split was last closed, by the monotonic clock.
         grew_s: when a recording last grew by more than its beginning, by that clock.
@@ -104,6 +99,7 @@ class RecordingSessions:
         reader: BagReader,
         events: EventLog,
         *,
+        interrupted: Callable[[Ns, Interruption], None],
         own: OwnRecordings,
         reception: Reception,
         topics: TopicsFile,
@@ -112,6 +108,7 @@ class RecordingSessions:
         self._bag_dir = orders.bag_dir
         self._start_child = start_child
         self._announce = announce
+        self._interrupted = interrupted
         self._own = own
         self._reception = reception
         self._topics = topics
@@ -126,12 +123,9 @@ class RecordingSessions:
         self._unsettled: list[tuple[Path, Path]] = []
         self._ended_bytes = 0
         self.restarts = 0
-        self.waiting_for: str | None = None
         self.heard = set[str]()
         self.closed_s = 0.0
         self.grew_s = 0.0
-        self._silent_since_s: float | None = None
-        self._interruptions: list[tuple[Ns, Interruption]] = []
 
     @property
     def bytes_written(self) -> int:
@@ -145,7 +139,6 @@ class RecordingSessions:
             RecorderError: it cannot be started.
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
-        self._silent_since_s = now.monotonic_s
         self.grew_s = max(self.grew_s, now.monotonic_s)
 
     def begin_handover(self, now: ClockReading) -> None:
@@ -164,14 +157,12 @@ class RecordingSessions:
         except RecorderError:
             HandoverTransfer.announce(old, None)
             raise
-        orders = self._orders
-        plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)
         self.handover = HandoverTransfer(
             old,
             new,
-            plan,
+            HandoverPlan(now, subscribe_timeout_s=self._orders.subscribe_timeout_s),
             self._reader,
-            simulated=orders.simulated,
+            simulated=self._orders.simulated,
             is_listed=self._topics.selection.matches,
         )
         self._events.info("rotation_begun", recording=old.name, next=name)
@@ -187,40 +178,7 @@ class RecordingSessions:
                 self._handle_vanished(session)
         if closed:
             self.settle_handovers()
-        self._check_waiting(now)
         return closed
-
-    def _check_waiting(self, now: ClockReading) -> None:
-        """Checks whether any message has arrived since recording started.
-
-        What was heard once is silent later, and not waited for.
-        """
-        if any(map(self._hears, self.running)):
-            self._silent_since_s = None
-        since_s, current = self._silent_since_s, self.current
-        patience_s = max(WAITING_S, self._orders.split_duration_s)
-        if current is not None and current.splits.bytes_written:
-            # What it has is known when its first split is closed.
-            patience_s += self._orders.split_duration_s
-        if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
-            self.waiting_for = None
-            self._events.resolve("recording_waits", "")
-            return
-        self.waiting_for = describe_waiting(
-            current.subscribed, simulated=self._orders.simulated, advice=self._orders.advice()
-        )
-        self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
-
-    def _hears(self, session: RecordingSession) -> bool:
-        """Returns whether a session has recorded something that may be of the robot."""
-        splits = session.splits
-        if splits.received - OWN_TOPICS:
-            return True
-        # Other bytes may come from nodes of the recorder's own user, as those of /rosout do.
-        others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
-        if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
-            return False
-        return bool(splits.messages or splits.bytes_written)
 
     def advance_handover(self, now: ClockReading) -> Step:
         """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
@@ -231,7 +189,7 @@ class RecordingSessions:
         with self._reported(handover.old):
             due = handover.advance(now)
             if due is Step.COMPLETE:
-                self._complete(handover, now)
+                self._take_over(handover, now)
             step = due
         if step is Step.ABANDON:
             self._abandon(handover)
@@ -256,14 +214,6 @@ class RecordingSessions:
             self._replace_current()
         return deaths
 
-    def take_interruptions(self) -> list[tuple[Ns, Interruption]]:
-        """Returns the recordings that ended unexpectedly since the last call.
-
-        When each last grew (wall time), and how it ended.
-        """
-        taken, self._interruptions = self._interruptions, []
-        return taken
-
     def end_unready(self, now: ClockReading) -> bool:
         """Ends the current session if it does not begin to record; returns whether it did."""
         current = self.current
@@ -286,7 +236,13 @@ class RecordingSessions:
         ]
         for session in ended:
             if session.has_recorded and session.child.exit_status() == -signal.SIGKILL:
-                self._report_hang(session)
+                sentence = (
+                    f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
+                    "to, and was killed (SIGKILL); what it had not written yet is lost"
+                )
+                self._events.fail("recorder_hung", sentence, recording=session.name)
+                self.restarts += 1
+                self._interrupted(session.grew_at, "hung")
             self._finalize(session, now)
         if ended:
             self.settle_handovers()
@@ -295,13 +251,11 @@ class RecordingSessions:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
         handover = self.handover
         if handover is not None:
-            completed = False
             with self._reported(handover.old):
-                completed = handover.complete(now)
+                # Else the old one counts up to its end, and the new one from there.
+                if handover.complete(now):
+                    self._completed[handover.old.name] = handover
             self._unsettled.append(handover.directories)
-            if completed:
-                self._completed[handover.old.name] = handover
-            # Else the old one counts up to its end, and the new one from there.
         for session in self.running:
             session.end()
         self.current, self.handover = None, None
@@ -377,7 +331,7 @@ class RecordingSessions:
         for fault in flush_bags(directory, names):
             self._events.warn("not_flushed", fault, recording=session.name)
 
-    def _complete(self, handover: HandoverTransfer, now: ClockReading) -> None:
+    def _take_over(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
             missing = ", ".join(sorted(handover.missing))
             self._events.remark(
@@ -415,17 +369,13 @@ class RecordingSessions:
 
         What fails is tried again when the next split is closed.
         """
-        running = {each.name for each in self.running}
-        left = []
-        for old, new in self._unsettled:
-            settled = False
+        running = {session.name for session in self.running}
+        for old, new in [*self._unsettled]:
             try:
-                settled = settle_handover(old, new, self._reader, running)
+                if settle_handover(old, new, self._reader, running):
+                    self._unsettled.remove((old, new))
             except RecorderError as error:
                 self._events.fail("rotation_failed", str(error), recording=old.name)
-            if not settled:
-                left.append((old, new))
-        self._unsettled = left
 
     def _handle_vanished(self, session: RecordingSession) -> None:
         sentence = f"the directory of recording {session.name} is missing; a new recording starts"
@@ -443,16 +393,7 @@ class RecordingSessions:
         sentence = describe_death(session.child.exit_status() or 0, session.last_output)
         self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
-        self._interruptions.append((session.grew_at, "died"))
-
-    def _report_hang(self, session: RecordingSession) -> None:
-        sentence = (
-            f"the ros2 bag record of {session.name} hung: it did not end when it was asked to, and "
-            "was killed (SIGKILL); what it had not written yet is lost"
-        )
-        self._events.fail("recorder_hung", sentence, recording=session.name)
-        self.restarts += 1
-        self._interruptions.append((session.grew_at, "hung"))
+        self._interrupted(session.grew_at, "died")
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""

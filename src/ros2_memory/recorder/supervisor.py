@@ -12,35 +12,32 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
 from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
+    RESUME_FACTOR,
     SET_BACK_NS,
-    WAITING_S,
     Backoff,
     SilenceWatch,
-    SpaceAction,
-    resume_bytes,
-    space_action,
 )
 from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
-from ros2_memory.recorder.shortfall import Required, Seen, Shortfall, TopicWatch
+from ros2_memory.recorder.shortfall import TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.bag_dir.state_files import Interruption
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.process.child import Child
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.sessions import Orders
+    from ros2_memory.recorder.shortfall import Required
     from ros2_memory.storage.base import BagReader
 
 OBSERVE_S: Final = 0.5
@@ -60,10 +57,6 @@ LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
 """How often topics are looked for that are not recorded as they should be."""
-IDLE_SPLITS: Final = 2
-"""Recordings that have not grown for longer than so many splits are idle."""
-TYPES_S: Final = 15.0
-"""By then a recording has subscribed to all topics of known types that are offered."""
 
 
 class Supervisor:
@@ -112,35 +105,35 @@ class Supervisor:
         self._housekeeper = housekeeper
         self._events = EventLog(clock)
         self._reception = reception or Reception(reader)
-        self._heartbeat = HeartbeatWriter(
-            orders.bag_dir,
-            HEARTBEAT_S,
-            clock,
-            self._events,
-            house=housekeeper.status,
-            topics=topics,
-            reception=self._reception,
-            advice=orders.advice,
-        )
         self._sessions = RecordingSessions(
             orders,
             start_child,
             self._announce,
             reader,
             self._events,
+            interrupted=self._note_restart,
             own=own or OwnRecordings(orders.bag_dir),
             reception=self._reception,
             topics=topics,
         )
         self._topics = topics
-        self._topic_watch = TopicWatch(required)
+        self._topic_watch = TopicWatch(orders, topics, required, self._reception, self._events)
+        self._heartbeat = HeartbeatWriter(
+            orders,
+            HEARTBEAT_S,
+            clock,
+            self._events,
+            house=housekeeper.status,
+            topics=topics,
+            reception=self._reception,
+            sessions=self._sessions,
+            watch=self._topic_watch,
+        )
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
-        self._unknown = frozenset[str]()
-        self._not_offered = frozenset[str]()
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
@@ -189,7 +182,7 @@ class Supervisor:
         if self._is_due("beat", HEARTBEAT_S, now):
             self._write_heartbeat()
         elif not self._disk.away:
-            self._heartbeat.write_if_changed(self._state, self._sessions)
+            self._heartbeat.write(self._state, only_changes=True)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -217,8 +210,6 @@ class Supervisor:
             "list": self._check_list,
             "rotation": self._check_rotation,
             "restart": self._check_restart,
-            "types": self._check_types,
-            "offers": self._check_offers,
             "topics": self._check_topics,
             "reap": self._sessions.collect_ended,
             "recorded": self._note_recorded,
@@ -263,8 +254,6 @@ class Supervisor:
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
         deaths = self._sessions.handle_exits(now)
-        for first, how in self._sessions.take_interruptions():
-            self._housekeeper.note_restart(first, how)
         for _ in range(deaths):
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             self._postpone("restart", self._backoff.failed(), now)
@@ -278,49 +267,35 @@ class Supervisor:
         """Deletes more, pauses and resumes, by what the disk has left."""
         if self._disk.away or not self._is_due("space", SPACE_S, now):
             return
-        free = self._free_bytes()
+        free, least = self._free_bytes(), self._orders.min_free_bytes
+        # More than what it was paused for.
+        enough = round(least * RESUME_FACTOR)
         if free is None:
             return
-        action = self._space_action(free)
-        if action is SpaceAction.MAKE_ROOM:
-            self._room_requested = True
-            self._make_room()
-            free = self._free_bytes() or 0
-            action = self._space_action(free)
-        if action is SpaceAction.STAY_PAUSED and self._is_due("room", QUIET_RETENTION_S, now):
-            # Bags that were being written when recording was paused may be deleted by now.
-            self._make_room()
-        if action is SpaceAction.PAUSE:
-            self._pause(now, free)
-        elif action is SpaceAction.RESUME:
+        if self._paused and free >= enough:
             self._paused = False
             self._postpone("restart", 0.0, now)
             self._events.info("recording_resumed", free_bytes=free)
-        elif action is SpaceAction.NONE:
-            self._room_requested = False
-
-    def _space_action(self, free: int) -> SpaceAction:
-        return space_action(
-            free,
-            self._orders.min_free_bytes,
-            paused=self._paused,
-            room_requested=self._room_requested,
-            making_room=self._housekeeper.is_making_room(),
-        )
-
-    def _make_room(self) -> None:
-        self._housekeeper.make_room(resume_bytes(self._orders.min_free_bytes))
-
-    def _pause(self, now: ClockReading, free: int) -> None:
-        self._paused = True
-        self._sessions.end_all(now)
-        self._events.fail(
-            "recording_paused",
-            f"recording is paused: {free} bytes are free on the disk, and "
-            f"{self._orders.min_free_bytes} are required (retention.min_free_gb); it resumes "
-            f"by itself at {resume_bytes(self._orders.min_free_bytes)}",
-        )
-        self._write_heartbeat()
+        elif self._paused:
+            if self._is_due("room", QUIET_RETENTION_S, now):
+                # Bags that were being written when recording was paused may be deleted by now.
+                self._housekeeper.make_room(enough)
+        else:
+            if free < least and not self._room_requested:
+                self._housekeeper.make_room(enough)
+                free = self._free_bytes() or 0
+            self._room_requested = free < least
+            # Room that is being made is waited for while half of it is free.
+            waits = self._housekeeper.is_making_room() and free >= least // 2
+            if free < least and not waits:
+                self._paused = True
+                self._sessions.end_all(now)
+                self._events.fail(
+                    "recording_paused",
+                    f"recording is paused: {free} bytes are free on the disk, and {least} are "
+                    f"required (retention.min_free_gb); it resumes by itself at {enough}",
+                )
+                self._write_heartbeat()
 
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
@@ -366,8 +341,15 @@ class Supervisor:
         self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
-            report = self._events.warn if resubscribe.is_fault else self._events.note
-            report(resubscribe.event, resubscribe.sentence, recording=current.name)
+            event, sentence, is_fault = (
+                resubscribe.event,
+                resubscribe.sentence,
+                resubscribe.is_fault,
+            )
+            if is_fault:
+                self._events.warn(event, sentence, recording=current.name)
+            else:
+                self._events.info(event, reason=sentence, recording=current.name)
 
     def _check_list(self, now: ClockReading) -> None:
         """Has a new recording begin where the list of topics was changed."""
@@ -398,97 +380,15 @@ class Supervisor:
             self._events.fail("recorder_not_started", str(error))
             self._postpone("restart", self._backoff.failed(), now)
 
-    def _check_types(self, now: ClockReading) -> None:
-        """Names every topic that is not recorded, where some are of a type that is not known.
-
-        `ros2 bag record` names the first topic of each unknown type, and no other.
-        """
-        current, selection = self._sessions.current, self._topics.selection
-        if current is None or current.age_s(now) < TYPES_S:
-            return
-        # The list may have changed since the child was started.
-        unknown = frozenset(filter(selection.matches, current.of_unknown_type))
-        if not unknown <= self._unknown:
-            self._unknown = unknown
-            others = sorted({*selection.exact} - unknown - current.subscribed)
-            listed_too = f", nor these, if anybody offers them: {', '.join(others)}"
-            self._events.warn(
-                "topics_not_recorded",
-                f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
-                "type: name the workspace that defines it in recorder.setup_files. It names one "
-                "topic of each type: of those that a glob selects, others of the same type are "
-                f"not recorded either{listed_too if others else ''}",
-                recording=current.name,
-            )
-
-    def _check_offers(self, now: ClockReading) -> None:
-        """Names topics that no publisher offers: none did since the start, or none does any more.
-
-        Each is named once; one that comes back may be named again.
-        """
-        current = self._sessions.current
-        if current is None or current.age_s(now) < WAITING_S or self._sessions.handover is not None:
-            return
-        missing = frozenset(self._heartbeat.missing(self._sessions))
-        if new := missing - self._not_offered:
-            self._events.remark(
-                "topic_not_offered",
-                f"no publisher offers {', '.join(sorted(new))}: recorded as soon as one does; "
-                "compare topics.yaml with the robot's topics",
-                topics=sorted(new),
-            )
-        self._not_offered |= missing
-        offered = self._heartbeat.offered - current.subscribed - OWN_TOPICS
-        gone = frozenset(filter(self._topics.selection.matches, offered))
-        if new := gone - self._heartbeat.gone:
-            self._events.remark(
-                "topic_silent",
-                f"no publisher offers {', '.join(sorted(new))} any more",
-                topics=sorted(new),
-            )
-        self._heartbeat.gone = gone
-
     def _check_topics(self, now: ClockReading) -> None:
-        """Looks for topics that are offered and not recorded, and for required ones."""
-        current = self._sessions.current
-        if current is None or not self._is_due("topics", TOPICS_S, now):
-            return
-        running, sessions = self._sessions.running, self._sessions
-        split_s = self._orders.split_duration_s
-        # What comes slowly is written when its split is closed.
-        idle_s = max(0.0, now.monotonic_s - sessions.grew_s - IDLE_SPLITS * split_s)
-        known_s = sessions.closed_s if current.splits.bytes_written else now.monotonic_s - split_s
-        silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
-        found = self._topic_watch.look(
-            Seen(
-                now_s=now.monotonic_s,
-                offered=frozenset[str]().union(*(each.subscribed for each in running)),
-                heard=sessions.heard,
-                unknown=frozenset[str]().union(*(each.of_unknown_type for each in running)),
-                known_s=known_s,
-                silent=silent,
-                rates_hz=rates_hz,
-                settled=len(running) == 1 and current.age_s(now) >= TYPES_S,
-            )
-        )
-        self._report_shortfall(self._heartbeat.shortfall, found)
-        self._heartbeat.shortfall = found
-
-    def _report_shortfall(self, before: Shortfall, found: Shortfall) -> None:
-        if new := sorted({*found.unheard} - {*before.unheard}):
-            sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
-            self._events.remark("topics_unheard", sentence, topics=new)
-        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
-            sentence = f"regular until now, and silent: {listed(new)}"
-            self._events.remark("topics_stopped", sentence, topics=new)
-        if found.required_missing and not before.required_missing:
-            sentence = f"required, and not recorded: {listed(found.required_missing)}"
-            self._events.remark("required_missing", sentence)
+        if self._is_due("topics", TOPICS_S, now):
+            self._topic_watch.look(now, self._sessions)
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
         self._reception.skip_latched(())
         self._sessions.begin(now)
+        self._topic_watch.began(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
 
     def _note_recorded(self, now: ClockReading) -> None:
@@ -522,12 +422,17 @@ class Supervisor:
         """
         self._housekeeper.announce(name)
         if not self._disk.away:
-            self._heartbeat.write(self._state, self._sessions, announced=name)
+            self._heartbeat.write(self._state, announced=name)
+
+    def _note_restart(self, first: Ns, how: Interruption) -> None:
+        # What hangs when everything is ended is followed by no other recording.
+        if not self.stopped:
+            self._housekeeper.note_restart(first, how)
 
     def _write_heartbeat(self, state: RecorderState | None = None) -> None:
         # While the bags' own disk is unmounted nothing is written to the disk below it.
         if not self._disk.away:
-            self._heartbeat.write(state or self._state, self._sessions)
+            self._heartbeat.write(state or self._state)
 
     @property
     def _state(self) -> RecorderState:
@@ -535,7 +440,7 @@ class Supervisor:
             return RecorderState.PAUSED
         if not self.is_recording:
             return RecorderState.STARTING
-        waits = self._sessions.waiting_for is not None
+        waits = self._topic_watch.waiting_for is not None
         return RecorderState.WAITING if waits else RecorderState.RECORDING
 
     def _free_bytes(self) -> int | None:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
-from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
 from ros2_memory.bag_dir.state_files import (
     TRIGGERS,
@@ -104,16 +104,6 @@ class Triggers:
         """Records that the recording ended unexpectedly and restarted between two wall times."""
         with self._lock:
             self._restarts.append((first, at))
-
-    def note_unclean_end(self) -> None:
-        """Records, by the last heartbeat, that the recorder ended without a shutdown.
-
-        Call it before anything is recorded.
-        """
-        last = read_heartbeat(self._bag_dir).heartbeat
-        if last is not None and last.state is not RecorderState.STOPPED:
-            now = self._clock.now()
-            self.note_restart(min(last.updated, now), now)
 
     @property
     def has_restarts(self) -> bool:

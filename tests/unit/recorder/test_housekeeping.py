@@ -17,8 +17,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.recorder.base import Housekeeper
-from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
@@ -26,6 +24,7 @@ from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import (
     PLENTY,
+    background_keeper_of,
     files_in,
     keeper_of,
     later,
@@ -157,7 +156,6 @@ class TestRetention:
             assert lost["reason"] == keeper.status().unshipped
             assert "2 bags were deleted unshipped" in lost["reason"]
         assert all(each.exists() for each in new)
-        assert BackgroundHousekeeper(keeper).status().unshipped == keeper.status().unshipped
 
     def test_what_was_recorded_longer_ago_than_the_limit_goes_by_the_monotonic_clock(
         self, tmp_path: Path
@@ -368,7 +366,6 @@ class TestDeletionsThatFail:
         assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
         status = keeper.status()
         assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
-        assert BackgroundHousekeeper(keeper).status() == status
 
 
 @contextmanager
@@ -431,7 +428,7 @@ class TestMakingRoom:
 class TestInTheBackground:
     def test_limits_are_applied_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
-        keeper = BackgroundHousekeeper(keeper_of(tmp_path, max_bytes=1))
+        keeper = background_keeper_of(tmp_path, max_bytes=1)
         keeper.apply()
         keeper.apply()
         keeper.wait()
@@ -439,7 +436,7 @@ class TestInTheBackground:
 
     def test_repair_is_waited_for(self, tmp_path: Path) -> None:
         open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-        keeper = BackgroundHousekeeper(keeper_of(tmp_path))
+        keeper = background_keeper_of(tmp_path)
         keeper.repair()
         assert McapReader().summarize(open_one).complete
 
@@ -451,7 +448,7 @@ class TestInTheBackground:
             asked.append(held.wait(30))
             return 0
 
-        keeper = BackgroundHousekeeper(keeper_of(tmp_path, measure_free=measured))
+        keeper = background_keeper_of(tmp_path, measure_free=measured)
         keeper.make_room(1)
         keeper.make_room(1)
         assert keeper.is_making_room()
@@ -470,20 +467,15 @@ class TestInTheBackground:
         ],
         ids=["of the disk", "of this program"],
     )
-    def test_a_failure_is_reported(self, tmp_path: Path, error: Exception, reported: str) -> None:
-        class Failing(Housekeeper):
-            mended = False
-
-            def apply(self) -> None:
-                if not self.mended:
-                    raise error
-
-        failing = Failing()
-        keeper = BackgroundHousekeeper(failing)
-        keeper.apply()
-        keeper.wait()
+    def test_a_failure_is_reported(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, reported: str
+    ) -> None:
+        keeper = background_keeper_of(tmp_path)
+        with monkeypatch.context() as patch:
+            patch.setattr(IndexManager, "apply_retention", Mock(side_effect=error))
+            keeper.apply()
+            keeper.wait()
         assert keeper.faults() == {"apply": reported}
-        failing.mended = True
         keeper.apply()
         keeper.wait()
         assert keeper.faults() == {}
