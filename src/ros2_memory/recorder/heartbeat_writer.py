@@ -1,120 +1,77 @@
-"""Writes the heartbeat of a running recorder: what it is doing, every few seconds."""
+"""What the heartbeat of a running recorder says, every few seconds."""
 
 from __future__ import annotations
 
 import os
-from dataclasses import asdict, replace
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.base import HouseStatus
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.reception.reception import Reception
-    from ros2_memory.recorder.sessions import Orders, RecordingSessions
+    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.sessions import RecordingSessions
     from ros2_memory.recorder.shortfall import TopicWatch
 
+HEARTBEAT_S: Final = 5.0
+"""How often it is written."""
 
-class HeartbeatWriter:
-    """Writes `recorder.json`.
+
+def heartbeat_of(
+    orders: Orders,
+    events: EventLog,
+    house: HouseStatus,
+    sessions: RecordingSessions,
+    watch: TopicWatch,
+    *,
+    now: Ns,
+    state: RecorderState,
+    since: Ns,
+    announced: str | None,
+) -> Heartbeat:
+    """Returns what `recorder.json` is to say now.
 
     Args:
-        orders: what is recorded, and where.
-        interval_s: how often it is written, in seconds.
-        clock: the wall clock.
-        events: where a heartbeat that cannot be written is reported.
-        house: gives what the heartbeat shows of the housekeeper.
-        topics: the list of topics to record.
-        reception: knows what was lost.
+        orders: what is recorded.
+        events: what was reported.
+        house: what it shows of the housekeeper.
         sessions: the recordings.
         watch: knows which topics are not recorded as they should be.
+        now: the wall clock.
+        state: what the recorder does.
+        since: since when it does that.
+        announced: a recording that is about to be begun.
     """
-
-    def __init__(
-        self,
-        orders: Orders,
-        interval_s: float,
-        clock: Clock,
-        events: EventLog,
-        *,
-        house: Callable[[], HouseStatus],
-        topics: TopicsFile,
-        reception: Reception,
-        sessions: RecordingSessions,
-        watch: TopicWatch,
-    ) -> None:
-        self._orders = orders
-        self._interval_s = interval_s
-        self._clock = clock
-        self._events = events
-        self._house = house
-        self._topics = topics
-        self._reception = reception
-        self._sessions = sessions
-        self._watch = watch
-        self._state = RecorderState.STOPPED
-        self._since = clock.now()
-        self._shown: Heartbeat | None = None
-
-    def write(
-        self, state: RecorderState, announced: str | None = None, *, only_changes: bool = False
-    ) -> None:
-        """Writes a heartbeat; one that cannot be written is reported and stops nothing.
-
-        Args:
-            state: what the recorder does.
-            announced: a recording that is about to be begun.
-            only_changes: write nothing unless more than times and amounts changed.
-        """
-        heartbeat = self._heartbeat(state, announced)
-        shown = replace(heartbeat, updated=0, bytes_written=0, counted_bytes=None, state_bytes=0)
-        if only_changes and shown == self._shown:
-            return
-        self._shown = shown
-        try:
-            write_heartbeat(self._orders.bag_dir, heartbeat)
-        except RecorderError as error:
-            self._events.fail_once("heartbeat_not_written", "", str(error))
-        else:
-            self._events.resolve("heartbeat_not_written", "")
-
-    def _heartbeat(self, state: RecorderState, announced: str | None) -> Heartbeat:
-        now, sessions, watch = self._clock.now(), self._sessions, self._watch
-        if state is not self._state:
-            self._state, self._since = state, now
-        names = [session.name for session in sessions.running]
-        if announced is not None and announced not in names:
-            names.append(announced)
-        subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
-        silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
-        return Heartbeat(
-            pid=os.getpid(),
-            updated=now,
-            state=state,
-            recordings=tuple(names),
-            since=self._since,
-            bytes_written=sessions.bytes_written,
-            subscribed=tuple(sorted(subscribed)),
-            silent=tuple(sorted(silent | watch.gone)),
-            last_error=self._events.last_error,
-            last_error_at=self._events.last_error_at,
-            recovered=self._events.recovered,
-            interval_s=self._interval_s,
-            restarts=sessions.restarts,
-            missing=watch.missing(sessions),
-            lost=self._reception.lost_in_last_hour(now),
-            waiting_for=watch.waiting_for if state is RecorderState.WAITING else None,
-            cut_short=tuple(sorted(self._reception.cut_short)),
-            listed=self._topics.selection.listed,
-            list_refused=self._topics.refused,
-            process=process_of(os.getpid()),
-            advice=self._orders.advice() if watch.shortfall.unheard else None,
-            **asdict(self._house()),
-            **asdict(watch.shortfall),
-        )
+    names = [session.name for session in sessions.running]
+    if announced is not None and announced not in names:
+        names.append(announced)
+    subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
+    silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
+    return Heartbeat(
+        pid=os.getpid(),
+        updated=now,
+        state=state,
+        recordings=tuple(names),
+        since=since,
+        bytes_written=sessions.bytes_written,
+        subscribed=tuple(sorted(subscribed)),
+        silent=tuple(sorted(silent | watch.gone)),
+        last_error=events.last_error,
+        last_error_at=events.last_error_at,
+        recovered=events.recovered,
+        interval_s=HEARTBEAT_S,
+        restarts=sessions.restarts,
+        missing=watch.missing(sessions),
+        lost=orders.reception.lost_in_last_hour(now),
+        waiting_for=watch.waiting_for if state is RecorderState.WAITING else None,
+        cut_short=tuple(sorted(orders.reception.cut_short)),
+        listed=orders.topics.selection.listed,
+        list_refused=orders.topics.refused,
+        process=process_of(os.getpid()),
+        advice=orders.advice() if watch.shortfall.unheard else None,
+        **asdict(house),
+        **asdict(watch.shortfall),
+    )

@@ -3,15 +3,10 @@
 from __future__ import annotations
 
 import signal
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple
 
-from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.recorder.process.command import MESSAGES_LOST
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 60.0
@@ -31,6 +26,26 @@ SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
 A split is closed by the time of a message that comes long enough after its first. A smaller step is
 waited out.
 """
+
+STEP_NS: Final[Ns] = 100 * NS_PER_MS
+"""A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
+
+
+class ClockReading(NamedTuple):
+    """Both clocks, read at the same time: seconds that never step, and the wall clock."""
+
+    monotonic_s: float
+    wall: Ns
+
+
+def set_back(earlier: ClockReading, later: ClockReading, by_ns: Ns = STEP_NS) -> bool:
+    """Whether the wall clock was set back by more than `by_ns` between two readings close together.
+
+    A clock that is set forward does no harm: messages published before and after the step are still
+    on either side of one cut.
+    """
+    passed = round((later.monotonic_s - earlier.monotonic_s) * NS_PER_S)
+    return passed - (later.wall - earlier.wall) > by_ns
 
 
 class Backoff:
@@ -121,18 +136,3 @@ def describe_death(status: int, last_output: str) -> str:
         ended = f"was killed ({known.get(-status, f'signal {-status}')})"
     said = f"; last it said: {last_output}" if last_output else ""
     return f"ros2 bag record {ended}{said}"
-
-
-def describe_silent_topics(
-    subscribed: Collection[str], received: Collection[str], advice: str
-) -> str | None:
-    """Describes the topics that sent nothing in a whole recording; None if all did."""
-    silent = sorted(set(subscribed) - set(received))
-    if not silent:
-        return None
-    if not received:
-        return (
-            f"subscribed to {counted(len(silent), 'topic')} and received nothing from any of them; "
-            f"{advice}"
-        )
-    return f"subscribed, and no message in the whole recording: {', '.join(silent)}"

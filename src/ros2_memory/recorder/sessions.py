@@ -7,21 +7,20 @@ from __future__ import annotations
 
 import signal
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.plan import (
+from ros2_memory.core.text import counted
+from ros2_memory.recorder.handover.transfer import (
     READY_TIMEOUT_S,
-    SUBSCRIBE_TIMEOUT_S,
     HandoverPlan,
+    HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.transfer import HandoverTransfer
 from ros2_memory.recorder.handover.union import settle_handover
-from ros2_memory.recorder.policies import describe_death, describe_silent_topics
+from ros2_memory.recorder.policies import describe_death
 from ros2_memory.recorder.process.child import end_all
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
@@ -31,16 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.handover.plan import ClockReading
-    from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.reception.reception import Reception
+    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.session import SplitChanges
-    from ros2_memory.storage.base import BagReader
 
 SETTLE_S: Final = 5.0
 """A recording this young writes its headers and latched messages, which do not end a silence."""
@@ -48,38 +43,15 @@ WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less is too short to report topics without messages."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Orders:
-    """What to record and for how long. Durations are in seconds.
-
-    `simulated`: log times come from a simulated clock. `advice` says what to do where publishers
-    are subscribed to and not heard. `subscribe_timeout_s` is how long a handover
-    waits for the new recorder (see `handover.plan`).
-    """
-
-    bag_dir: Path
-    split_duration_s: float
-    session_duration_s: float
-    min_free_bytes: int
-    simulated: bool = False
-    advice: Callable[[], str] = str
-    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
-
-
 class RecordingSessions:
     """The sessions of one bag directory.
 
     Args:
         orders: what to record.
-        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
         announce: receives the name of a recording before anything of it exists.
-        reader: reads splits that are closed.
-        events: where everything is reported.
         interrupted: receives when a recording last grew that ended unexpectedly (wall time), and
             how it ended.
-        own: the list of recordings that were made here.
-        reception: measures closed splits, and receives the publishers that were refused.
-        topics: the list of topics to record.
+        events: where everything is reported.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
@@ -94,25 +66,14 @@ class RecordingSessions:
     def __init__(
         self,
         orders: Orders,
-        start_child: Callable[[str, Path], Child],
         announce: Callable[[str], None],
-        reader: BagReader,
-        events: EventLog,
-        *,
         interrupted: Callable[[Ns, Interruption], None],
-        own: OwnRecordings,
-        reception: Reception,
-        topics: TopicsFile,
+        events: EventLog,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
-        self._start_child = start_child
         self._announce = announce
         self._interrupted = interrupted
-        self._own = own
-        self._reception = reception
-        self._topics = topics
-        self._reader = reader
         self._events = events
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
@@ -161,9 +122,9 @@ class RecordingSessions:
             old,
             new,
             HandoverPlan(now, subscribe_timeout_s=self._orders.subscribe_timeout_s),
-            self._reader,
+            self._orders.reader,
             simulated=self._orders.simulated,
-            is_listed=self._topics.selection.matches,
+            is_listed=self._orders.topics.selection.matches,
         )
         self._events.info("rotation_begun", recording=old.name, next=name)
 
@@ -175,7 +136,11 @@ class RecordingSessions:
             self._list_own(session)
             closed = closed or bool(changes.closed)
             if changes.gone and session.state is not SessionState.ENDING:
-                self._handle_vanished(session)
+                name = session.name
+                sentence = f"the directory of recording {name} is missing; a new recording starts"
+                self._events.fail("recording_vanished", sentence, recording=name)
+                self.restarts += 1
+                self._lose(session)
         if closed:
             self.settle_handovers()
         return closed
@@ -201,17 +166,14 @@ class RecordingSessions:
         If the current one died during a handover, the new one becomes the current one.
         """
         deaths = 0
-        handover = self.handover
-        if handover is not None and handover.new.child.exit_status() is not None:
-            deaths += 1
-            self._report_death(handover.new, now)
-            self._abandon(handover)
-        current = self.current
-        if current is not None and current.child.exit_status() is not None:
-            deaths += 1
-            self._report_death(current, now)
-            self._finalize(current, now)
-            self._replace_current()
+        new = None if self.handover is None else self.handover.new
+        for session in (new, self.current):
+            if session is not None and session.child.exit_status() is not None:
+                deaths += 1
+                self._report_death(session, now)
+                if session is self.current:
+                    self._finalize(session, now)
+                self._lose(session)
         return deaths
 
     def end_unready(self, now: ClockReading) -> bool:
@@ -269,26 +231,26 @@ class RecordingSessions:
         self.running = ()
 
     def _launch(self, name: str, now: ClockReading) -> RecordingSession:
-        self._own.begin(name)
+        self._orders.own.begin(name)
         self._announce(name)
         directory = self._bag_dir / name
         try:
-            child = self._start_child(name, directory)
+            child = self._orders.start_child(name, directory)
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
         self._events.info("recorder_started", recording=name, pid=child.pid)
-        session = RecordingSession(name, child, Splits(directory, self._reader), now)
+        session = RecordingSession(name, child, Splits(directory, self._orders.reader), now)
         self.running += (session,)
         return session
 
     def _list_own(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, and its splits; a fault is retried."""
         try:
-            session.is_listed = session.is_listed or self._own.complete(session.name)
+            session.is_listed = session.is_listed or self._orders.own.complete(session.name)
             # Else another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
-                self._own.note(session.name, session.splits.seen, ended=has_ended)
+                self._orders.own.note(session.name, session.splits.seen, ended=has_ended)
         except RecorderError as error:
             self._events.fail_once("recording_not_listed", session.name, str(error))
         else:
@@ -305,7 +267,7 @@ class RecordingSessions:
                 self.grew_s = now.monotonic_s
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)
-            self._reception.learn(session.name, session.splits.directory / name)
+            self._orders.reception.learn(session.name, session.splits.directory / name)
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
@@ -323,9 +285,9 @@ class RecordingSessions:
         self._events.report_output(session.name, lines)
         for line in lines:
             if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
-                self._reception.refused(session.name, line.topic)
+                self._orders.reception.refused(session.name, line.topic)
             elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                self._reception.lost(session.name, line.topic, line.count or 0)
+                self._orders.reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
         for fault in flush_bags(directory, names):
@@ -355,14 +317,18 @@ class RecordingSessions:
         self._unsettled.append(handover.directories)
         handover.new.end()
 
-    def _replace_current(self) -> None:
-        """Makes the session that was to take over the current one, if there is one."""
+    def _lose(self, session: RecordingSession) -> None:
+        """Goes on without a session: with the other one of a handover, if there is one."""
         handover = self.handover
-        self.current, self.handover = None, None
-        if handover is not None:
-            self.current = handover.new
-            self._unsettled.append(handover.directories)
-            self.settle_handovers()
+        if handover is not None and session is handover.new:
+            self._abandon(handover)
+        elif session is self.current:
+            session.end()
+            self.current, self.handover = None, None
+            if handover is not None:
+                self.current = handover.new
+                self._unsettled.append(handover.directories)
+                self.settle_handovers()
 
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
@@ -372,20 +338,10 @@ class RecordingSessions:
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
             try:
-                if settle_handover(old, new, self._reader, running):
+                if settle_handover(old, new, self._orders.reader, running):
                     self._unsettled.remove((old, new))
             except RecorderError as error:
                 self._events.fail("rotation_failed", str(error), recording=old.name)
-
-    def _handle_vanished(self, session: RecordingSession) -> None:
-        sentence = f"the directory of recording {session.name} is missing; a new recording starts"
-        self._events.fail("recording_vanished", sentence, recording=session.name)
-        self.restarts += 1
-        if self.handover is not None and session is self.handover.new:
-            self._abandon(self.handover)
-        elif session is self.current:
-            session.end()
-            self._replace_current()
 
     def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)
@@ -412,10 +368,14 @@ class RecordingSessions:
         self._flush(session, splits.directory, (METADATA_FILE,))
         self._flush(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        silent = describe_silent_topics(session.subscribed, splits.received, self._orders.advice())
-        lived_s = session.age_s(now)
-        if silent is not None and lived_s >= WHOLE_RECORDING_S:
-            self._events.warn("topics_silent", silent, recording=session.name)
+        silent, lived_s = sorted(session.subscribed - splits.received), session.age_s(now)
+        if silent and lived_s >= WHOLE_RECORDING_S:
+            sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
+            if not splits.received:
+                topics = counted(len(silent), "topic")
+                sentence = f"subscribed to {topics} and received nothing from any of them; "
+                sentence += self._orders.advice()
+            self._events.warn("topics_silent", sentence, recording=session.name)
         self._events.info(
             "recording_ended",
             recording=session.name,

@@ -11,14 +11,13 @@ from ros2_memory.recorder.policies import OWN_TOPICS, WAITING_S
 from ros2_memory.recorder.process.topics import TopicSelection
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping
 
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.handover.plan import ClockReading
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.reception.reception import Reception
+    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.session import RecordingSession
-    from ros2_memory.recorder.sessions import Orders, RecordingSessions
+    from ros2_memory.recorder.sessions import RecordingSessions
 
 UNHEARD_S: Final = 30.0
 """A topic that is offered for so long, and of which nothing came, is not recorded."""
@@ -26,14 +25,6 @@ TYPES_S: Final = 15.0
 """By then a recording has subscribed to all topics of known types that are offered."""
 IDLE_SPLITS: Final = 2
 """Recordings that have not grown for longer than so many splits are idle."""
-
-
-@dataclass(frozen=True, slots=True)
-class Required:
-    """An entry of `recording.required`: a name or a glob, and the least messages a second."""
-
-    topic: str
-    min_hz: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +42,6 @@ class TopicWatch:
 
     Args:
         orders: what to record.
-        topics: the list of topics to record.
-        required: the topics without which recording counts as failed.
-        reception: knows which topics have stopped, and how often they come.
         events: where faults are named.
 
     Attributes:
@@ -62,18 +50,9 @@ class TopicWatch:
         shortfall: the topics that are not recorded as they should be.
     """
 
-    def __init__(
-        self,
-        orders: Orders,
-        topics: TopicsFile,
-        required: Sequence[Required],
-        reception: Reception,
-        events: EventLog,
-    ) -> None:
+    def __init__(self, orders: Orders, events: EventLog) -> None:
         self._orders = orders
-        self._topics = topics
-        self._required = required
-        self._reception = reception
+        self._topics = orders.topics
         self._events = events
         self.waiting_for: str | None = None
         self.gone = frozenset[str]()
@@ -226,7 +205,7 @@ class TopicWatch:
         # What comes slowly is written when its split is closed.
         known_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
         idle_s = max(0.0, now_s - sessions.grew_s - IDLE_SPLITS * split_s)
-        silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
+        silent, rates_hz = self._orders.reception.arrivals(ns_from_unix(idle_s))
         return Shortfall(
             unknown_types=tuple(sorted(unknown)),
             unheard=tuple(
@@ -252,7 +231,7 @@ class TopicWatch:
         rates_hz: Mapping[str, float],
     ) -> Iterator[str]:
         """Yields why topics are not recorded as required, a sentence each."""
-        for required in self._required:
+        for required in self._orders.required:
             entry = TopicSelection((required.topic,))
             known = filter(entry.matches, {*self._since_s, *heard, *unknown})
             for topic in sorted({*known, *entry.exact}) or [required.topic]:

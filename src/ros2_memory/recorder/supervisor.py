@@ -7,38 +7,35 @@ wait. `policies` and `handover.plan` decide what to do, and `sessions` does it; 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
-from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
+from ros2_memory.recorder.handover.transfer import Step
+from ros2_memory.recorder.heartbeat_writer import HEARTBEAT_S, heartbeat_of
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
     RESUME_FACTOR,
     SET_BACK_NS,
     Backoff,
+    ClockReading,
     SilenceWatch,
+    set_back,
 )
-from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
 from ros2_memory.recorder.shortfall import TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.bag_dir.state_files import Interruption
-    from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.base import Housekeeper
-    from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.sessions import Orders
-    from ros2_memory.recorder.shortfall import Required
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.recorder.orders import Orders
 
 OBSERVE_S: Final = 0.5
 SPACE_S: Final = 1.0
@@ -52,7 +49,6 @@ RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
-HEARTBEAT_S: Final = 5.0
 LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
@@ -64,17 +60,10 @@ class Supervisor:
 
     Args:
         orders: what to record.
-        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
-        reader: reads splits that are closed.
         housekeeper: repairs and deletes in the background.
-        clock: the wall clock.
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
-        topics: the list of topics to record.
-        own: the list of recordings that were made here.
-        reception: plans how topics are subscribed.
-        required: the topics without which recording counts as failed.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -83,52 +72,23 @@ class Supervisor:
     def __init__(
         self,
         orders: Orders,
-        start_child: Callable[[str, Path], Child],
-        reader: BagReader,
         housekeeper: Housekeeper,
-        clock: Clock,
         *,
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
-        topics: TopicsFile,
-        own: OwnRecordings | None = None,
-        reception: Reception | None = None,
-        required: Sequence[Required] = (),
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
-        self._clock = clock
+        self._reception = orders.reception
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
-        self._events = EventLog(clock)
-        self._reception = reception or Reception(reader)
-        self._sessions = RecordingSessions(
-            orders,
-            start_child,
-            self._announce,
-            reader,
-            self._events,
-            interrupted=self._note_restart,
-            own=own or OwnRecordings(orders.bag_dir),
-            reception=self._reception,
-            topics=topics,
-        )
-        self._topics = topics
-        self._topic_watch = TopicWatch(orders, topics, required, self._reception, self._events)
-        self._heartbeat = HeartbeatWriter(
-            orders,
-            HEARTBEAT_S,
-            clock,
-            self._events,
-            house=housekeeper.status,
-            topics=topics,
-            reception=self._reception,
-            sessions=self._sessions,
-            watch=self._topic_watch,
-        )
+        self._events = EventLog(orders.clock)
+        self._sessions = RecordingSessions(orders, self._announce, self._note_restart, self._events)
+        self._topic_watch = TopicWatch(orders, self._events)
+        self._beat: Heartbeat | None = None
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
@@ -181,8 +141,8 @@ class Supervisor:
         self._run_tasks(now)
         if self._is_due("beat", HEARTBEAT_S, now):
             self._write_heartbeat()
-        elif not self._disk.away:
-            self._heartbeat.write(self._state, only_changes=True)
+        else:
+            self._write_heartbeat(only_changes=True)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -200,24 +160,27 @@ class Supervisor:
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
-        # The names are those of the documented log event.
-        tasks: dict[str, Callable[[ClockReading], object]] = {
-            "disk": self._check_disk,
-            "look": self._observe,
-            "deaths": self._check_exits,
-            "space": self._check_space,
-            "takeover": self._check_handover,
-            "list": self._check_list,
-            "rotation": self._check_rotation,
-            "restart": self._check_restart,
-            "topics": self._check_topics,
-            "reap": self._sessions.collect_ended,
-            "recorded": self._note_recorded,
-            "house": self._apply_retention,
-            "moments": self._keep_moments,
-            "screen": self._screen,
-        }
-        for name, task in tasks.items():
+        # The names are those of the documented log event. How often each is due, in seconds, and
+        # whether it needs the disk of the bag directory.
+        tasks: tuple[tuple[str, float, bool, Callable[[ClockReading], object]], ...] = (
+            ("disk", 0.0, False, self._check_disk),
+            ("look", OBSERVE_S, False, self._observe),
+            ("deaths", 0.0, False, self._check_exits),
+            ("space", SPACE_S, True, self._check_space),
+            ("takeover", 0.0, False, self._check_handover),
+            ("list", LIST_S, False, self._check_list),
+            ("rotation", 0.0, False, self._check_rotation),
+            ("restart", 0.0, True, self._check_restart),
+            ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
+            ("reap", 0.0, False, self._sessions.collect_ended),
+            ("recorded", 0.0, False, self._note_recorded),
+            ("house", 0.0, False, self._apply_retention),
+            ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
+            ("screen", SCREENING_S, True, self._screen),
+        )
+        for name, every_s, needs_disk, task in tasks:
+            if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
+                continue
             try:
                 task(now)
             except OSError as error:
@@ -226,14 +189,13 @@ class Supervisor:
                     self._events.fail("supervision_failed", str(error), task=name)
 
     def _observe(self, now: ClockReading) -> None:
-        if self._is_due("observe", OBSERVE_S, now):
-            closed = self._sessions.observe(now)
-            self._splits_closed |= closed
-            current = self._sessions.current
-            if current is not None and current.splits.messages:
-                self._backoff.succeeded()
-                if closed:
-                    self._events.recorded()
+        closed = self._sessions.observe(now)
+        self._splits_closed |= closed
+        current = self._sessions.current
+        if current is not None and current.splits.messages:
+            self._backoff.succeeded()
+            if closed:
+                self._events.recorded()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -265,8 +227,6 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        if self._disk.away or not self._is_due("space", SPACE_S, now):
-            return
         free, least = self._free_bytes(), self._orders.min_free_bytes
         # More than what it was paused for.
         enough = round(least * RESUME_FACTOR)
@@ -341,48 +301,33 @@ class Supervisor:
         self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
-            event, sentence, is_fault = (
-                resubscribe.event,
-                resubscribe.sentence,
-                resubscribe.is_fault,
-            )
-            if is_fault:
-                self._events.warn(event, sentence, recording=current.name)
-            else:
-                self._events.info(event, reason=sentence, recording=current.name)
+            report = self._events.warn if resubscribe.is_fault else self._events.note
+            report(resubscribe.event, resubscribe.sentence, recording=current.name)
 
-    def _check_list(self, now: ClockReading) -> None:
+    def _check_list(self, _: ClockReading) -> None:
         """Has a new recording begin where the list of topics was changed."""
-        if not self._is_due("list", LIST_S, now):
-            return
-        before = self._topics.selection.listed
-        if self._topics.look():
-            listed_now = self._topics.selection.listed
+        before = self._orders.topics.selection.listed
+        if self._orders.topics.look():
+            listed_now = self._orders.topics.selection.listed
             self._rotate_now |= self._sessions.current is not None
             self._events.info(
                 "topics_changed",
                 added=sorted({*listed_now} - {*before}),
                 dropped=sorted({*before} - {*listed_now}),
             )
-        if self._topics.refused is None:
+        if self._orders.topics.refused is None:
             self._events.resolve("topics_refused", "")
         else:
-            self._events.fail_once("topics_refused", "", self._topics.refused)
+            self._events.fail_once("topics_refused", "", self._orders.topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
-        if self._sessions.current is not None or self._paused or self._disk.away:
-            return
-        if not self._is_due("restart", 0.0, now):
+        if self._sessions.current is not None or self._paused:
             return
         try:
             self._begin(now)
         except RecorderError as error:
             self._events.fail("recorder_not_started", str(error))
             self._postpone("restart", self._backoff.failed(), now)
-
-    def _check_topics(self, now: ClockReading) -> None:
-        if self._is_due("topics", TOPICS_S, now):
-            self._topic_watch.look(now, self._sessions)
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
@@ -406,13 +351,8 @@ class Supervisor:
         self._splits_closed = False
         self._housekeeper.apply()
 
-    def _keep_moments(self, now: ClockReading) -> None:
-        if not self._disk.away and self._is_due("moments", MOMENTS_S, now):
-            self._housekeeper.keep_moments()
-
-    def _screen(self, now: ClockReading) -> None:
-        if not self._disk.away and self._is_due("screening", SCREENING_S, now):
-            self._housekeeper.screen([each.name for each in self._sessions.running])
+    def _screen(self, _: ClockReading) -> None:
+        self._housekeeper.screen([session.name for session in self._sessions.running])
 
     def _announce(self, name: str) -> None:
         """Names a recording before anything of it exists.
@@ -421,18 +361,51 @@ class Supervisor:
             RecorderError: it must not begin.
         """
         self._housekeeper.announce(name)
-        if not self._disk.away:
-            self._heartbeat.write(self._state, announced=name)
+        self._write_heartbeat(announced=name)
 
     def _note_restart(self, first: Ns, how: Interruption) -> None:
         # What hangs when everything is ended is followed by no other recording.
         if not self.stopped:
             self._housekeeper.note_restart(first, how)
 
-    def _write_heartbeat(self, state: RecorderState | None = None) -> None:
+    def _write_heartbeat(
+        self,
+        state: RecorderState | None = None,
+        *,
+        announced: str | None = None,
+        only_changes: bool = False,
+    ) -> None:
+        """Writes a heartbeat; one that cannot be written is reported and stops nothing.
+
+        Args:
+            state: what it says that the recorder does; None for what it does.
+            announced: a recording that is about to be begun.
+            only_changes: write nothing unless more than times and amounts changed.
+        """
         # While the bags' own disk is unmounted nothing is written to the disk below it.
-        if not self._disk.away:
-            self._heartbeat.write(state or self._state)
+        if self._disk.away:
+            return
+        last, now, state = self._beat, self._orders.clock.now(), state or self._state
+        beat = heartbeat_of(
+            self._orders,
+            self._events,
+            self._housekeeper.status(),
+            self._sessions,
+            self._topic_watch,
+            now=now,
+            state=state,
+            since=last.since if last is not None and last.state is state else now,
+            announced=announced,
+        )
+        if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
+            return
+        self._beat = beat
+        try:
+            write_heartbeat(self._bag_dir, beat)
+        except RecorderError as error:
+            self._events.fail_once("heartbeat_not_written", "", str(error))
+        else:
+            self._events.resolve("heartbeat_not_written", "")
 
     @property
     def _state(self) -> RecorderState:
@@ -464,7 +437,11 @@ class Supervisor:
         self._due_s[task] = now.monotonic_s + wait_s
 
     def _now(self) -> ClockReading:
-        return ClockReading(self._monotonic(), self._clock.now())
+        return ClockReading(self._monotonic(), self._orders.clock.now())
+
+
+def _without_amounts(beat: Heartbeat) -> Heartbeat:
+    return replace(beat, updated=0, bytes_written=0, counted_bytes=None, state_bytes=0)
 
 
 def make_bag_dir(bag_dir: Path) -> None:

@@ -1,11 +1,10 @@
-"""When a recording begins anew, what a full disk asks for, and how silent topics are described."""
+"""When a recording begins anew, and when a robot has fallen silent."""
 
 from __future__ import annotations
 
 from ros2_memory.recorder.policies import (
     Backoff,
     SilenceWatch,
-    describe_silent_topics,
 )
 
 
@@ -73,8 +72,3 @@ class TestSilence:
         watch.rotated(for_silence=True)
         watch.began(40, 5)
         assert [now for now in range(40, 400) if watch.is_silent(now, 0)] == []
-
-
-def test_nothing_is_reported_where_all_topics_were_heard() -> None:
-    assert describe_silent_topics(["/odom"], ["/odom", "/tf"], "ask") is None
-    assert describe_silent_topics([], [], "ask") is None

@@ -43,7 +43,6 @@ from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.recorder.handover.plan import intended
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -129,6 +128,14 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
 def _is_folder(path: Path) -> bool:
     """Whether it is a directory, and not a link to one elsewhere."""
     return path.is_dir() and not path.is_symlink()
+
+
+def intended(old: Handover, new_name: str | None) -> Handover:
+    """Returns the old sidecar before the new recording is started, as a crash may come any time.
+
+    None in place of its name withdraws it: the new recording did not take over.
+    """
+    return replace(old, next=new_name, counts_until=None, end=None)
 
 
 def _write_cut(old: Path, new: Path, reader: BagReader) -> None:

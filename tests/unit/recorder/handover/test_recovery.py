@@ -14,7 +14,6 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
-    CutClock,
     Handover,
     Overlap,
     read_handover,
@@ -22,8 +21,8 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat, write_heartbeat
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover.plan import intended, pending, void
-from ros2_memory.recorder.handover.union import cut_clock, recover_handovers
+from ros2_memory.recorder.handover.transfer import pending, void
+from ros2_memory.recorder.handover.union import intended, recover_handovers
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
 
@@ -171,24 +170,6 @@ def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path
         recover_handovers(tmp_path, READER)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
     assert read_handover(tmp_path / "c").handover.next is None
-
-
-class TestCutClock:
-    def test_publish_times_that_differ_from_log_times_are_what_is_cut_by(
-        self, tmp_path: Path
-    ) -> None:
-        old = recording(tmp_path, "a", 0, 3, delay=7)
-        assert cut_clock(old / "a_0.mcap", READER) is CutClock.PUBLISH
-
-    def test_where_they_are_equal_throughout_it_is_log_time(self, tmp_path: Path) -> None:
-        old = recording(tmp_path, "a", 0, 3, delay=0)
-        assert cut_clock(old / "a_0.mcap", READER) is CutClock.LOG
-
-    def test_a_bag_that_is_empty_or_unreadable_counts_as_publish_time(self, tmp_path: Path) -> None:
-        write_mcap(tmp_path / "empty.mcap", [])
-        (tmp_path / "broken.mcap").write_bytes(b"broken")
-        assert cut_clock(tmp_path / "empty.mcap", READER) is CutClock.PUBLISH
-        assert cut_clock(tmp_path / "broken.mcap", READER) is CutClock.PUBLISH
 
 
 def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: Path) -> None:
