@@ -163,24 +163,23 @@ class LossCounter:
     def _add(self, topic: str, found: Progress) -> None:
         """Puts what a split has of a topic together with what is known of it."""
         positions, series = found.positions, self._series.get(topic)
-        back = [
-            at for at, (one, other) in enumerate(pairwise(positions), 1) if one.value >= other.value
-        ]
-        if series is not None and not back:
-            first = series.positions[0]
-            lower = (position for position in positions if position.value < first.value)
-            if all(position.log_time <= first.log_time for position in lower):
-                by_value = dict(sorted((*series.positions, *positions), reverse=True))
-                merged = (Position(*item) for item in sorted(by_value.items()))
-                series.positions = [
-                    position for position in merged if position.value >= first.value
-                ]
-                series.heard = self._measured
-                return
-        # Its publisher is new, or began anew.
-        self._series[topic] = _Series(
-            found.kind, [*positions[back[-1] if back else 0 :]], self._measured
-        )
+        steps = enumerate(pairwise(positions), 1)
+        back = [at for at, (one, other) in steps if one.value >= other.value]
+        if len(back) > 1:  # several publishers
+            self.unclear([topic])
+            return
+        first, last = positions[0] if series is None else series.positions[0], positions[-1]
+        if back and last.value < positions[back[0] - 1].value:
+            # Its publisher began anew. Else what it had sent before came again, as latched.
+            series, positions = None, positions[back[0] :]
+        elif last.value < first.value and last.log_time > first.log_time:
+            series = None
+        known = [] if series is None else series.positions
+        by_value = dict(sorted((*known, *positions), reverse=True))
+        merged = [Position(*item) for item in sorted(by_value.items())]
+        if series is not None:
+            merged = [position for position in merged if position.value >= first.value]
+        self._series[topic] = _Series(found.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:
         """Returns the losses up to a log time that all recordings have reached."""

@@ -249,3 +249,16 @@ def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -
     assert [each.lost for each in counter.measured("a", counts(range(45, 100), 190))] == [5]
     assert counter.measured("a", counts(range(50), 300)) == []
     assert counter.flush() == []
+
+
+def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
+    counter = LossCounter()
+    counter.begun("old")
+    assert counter.measured("old", progress([*range(100)])) == []
+    counter.begun("new")
+    again = [Position(value, T0 + 205 * PERIOD) for value, _ in at([*range(90, 130)])]
+    new = [*at([*range(205, 210)]), *again, *at([*range(210, 300)])]
+    old = progress([tick for tick in range(100, 215) if not 180 <= tick < 190])
+    losses = counter.measured("new", {"/odom": Progress("stamps", new)})
+    losses += counter.measured("old", old)
+    assert [loss.lost for loss in [*losses, *counter.flush()]] == [10]
