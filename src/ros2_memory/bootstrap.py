@@ -224,7 +224,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
         ConfigError: their file is missing, a rule is refused, or they may take too much together.
     """
     from ros2_memory.bag_dir.moment_file import fault_of_label
-    from ros2_memory.triggers.rules import Rule, RuleKind
+    from ros2_memory.triggers.rules import Rule
 
     path = settings.recording.keep_when
     rules: list[Rule] = []
@@ -238,7 +238,6 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
         rules.append(
             Rule(
                 name=name,
-                kind=RuleKind(given.kind),
                 topic=given.topic,
                 condition=condition,
                 hold=ns_from_unix(given.for_s),

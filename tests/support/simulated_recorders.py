@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, MutableMapping
+from collections.abc import Callable, Collection, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -166,6 +166,7 @@ class World:
         self.free = 10**12
         self.device = 1
         self.refuse = ""
+        self.before_start: Callable[[Path], object] = bool
         self.recorders: list[PlayedRecorder] = []
         self.named_at_start: list[list[str]] = []
         self.defaults: dict[str, object] = {}
@@ -204,6 +205,7 @@ class World:
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:
         self.named_at_start.append(self.heartbeat()["recordings"])
+        self.before_start(directory)
         if self.refuse:
             raise RecorderError(self.refuse)
         recorder = PlayedRecorder(100 + len(self.recorders), self, directory)

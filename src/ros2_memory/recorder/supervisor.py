@@ -1,7 +1,7 @@
 """Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
 Everything happens in `tick`, which the main thread calls several times a second and which does not
-wait. `policies` and `handover.plan` decide what to do, and `sessions` does it; here the two meet.
+wait. `policies` and `handover.transfer` decide what to do, and `sessions` does it; here they meet.
 """
 
 from __future__ import annotations

@@ -15,7 +15,6 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.triggers.rules import RuleFold, RuleKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -60,7 +59,7 @@ class SplitSearch:
     ) -> None:
         self._reader = reader
         self._extractor = extractor
-        self._rules = [each for each in rules if each.kind is not RuleKind.RECORDER_RESTART]
+        self._rules = [rule for rule in rules if rule.topic is not None]
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 
@@ -75,13 +74,10 @@ class SplitSearch:
         Raises:
             BagUnreachableError: the disk fails; the state is useless then.
         """
-        folds = {
-            rule.name: RuleFold(rule, state.rules.setdefault(rule.name, RuleRecord()).runs)
-            for rule in self._rules
-        }
-        if not chain.goes_on:
-            for fold in folds.values():
-                fold.end()
+        for rule in self._rules:
+            record = state.rules.setdefault(rule.name, RuleRecord())
+            if not chain.goes_on:
+                record.runs.clear()  # the recorder did not run on
         fired: list[Firing] = []
         stopped: Ns | None = None
         previous: Ns | None = None
@@ -98,20 +94,18 @@ class SplitSearch:
                 stopped = event.time
                 break
             previous = event.time
-            fired += self._take(event, folds, state)
+            fired += self._take(event, state)
         until = max(part.window.stop for part in chain.parts)
         known = until if stopped is None else min(stopped, until)
-        for fold in folds.values():
-            fired += fold.reach(known)
+        for rule in self._rules:
+            fired += rule.reach(state.rules[rule.name].runs, known)
         return fired, stopped
 
-    def _take(
-        self, event: _Event, folds: dict[str, RuleFold], state: TriggerState
-    ) -> Iterator[Firing]:
+    def _take(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
         record, rules = event.record, self._rules_of(event.topic)
         latched = record is not None and record.channel.latched
         if record is not None and latched:
-            rules = tuple(rule for rule in rules if rule.kind is not RuleKind.SILENT)
+            rules = tuple(rule for rule in rules if rule.condition is not None)
             if _is_repeat(event, record, state):
                 return
         value: JsonValue | UndecodableError = None
@@ -124,7 +118,8 @@ class SplitSearch:
             matches: bool | None = False
             if rule.condition is not None and record is not None:
                 matches = self._test(rule, rule.condition, event.topic, value, state)
-            fired = folds[rule.name].take(event.topic, event.time, matches=matches, latched=latched)
+            runs = state.rules[rule.name].runs
+            fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
             if fired is not None:
                 yield fired
 

@@ -28,7 +28,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
-from ros2_memory.triggers.rules import GLOB_MARKS, Firing, RuleKind
+from ros2_memory.triggers.rules import GLOB_MARKS, Firing
 from ros2_memory.triggers.splits import chains_to_search
 
 if TYPE_CHECKING:
@@ -124,11 +124,11 @@ class Triggers:
             deleted, self._deleted = self._deleted, 0
         for first, at in restarts:
             for rule in self._rules.values():
-                if rule.kind is RuleKind.RECORDER_RESTART:
+                if rule.topic is None:
                     self._take(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
             self._store(name, state.rules[name], snapshot)
-            if rule.kind is not RuleKind.SILENT:
+            if rule.condition is not None:
                 _judge(name, state.rules[name])
         if deleted:
             sentence = (
