@@ -153,7 +153,7 @@ def build_housekeeper(
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
+    from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
     from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
 
@@ -164,22 +164,20 @@ def build_housekeeper(
     bags = BagDirReader(reader)
     own = own or OwnRecordings(bag_dir)
     return BackgroundHousekeeper(
-        Housekeeping(
-            bag_dir,
-            bags,
-            McapWriter(settings.reader.max_chunk_mb),
-            WallClock(),
-            retention_limits(settings),
-            is_synchronised=is_synchronised,
-            split_duration_s=settings.recording.split_duration_s,
-            own=own,
-            moments_bytes=moments_bytes,
-            rule_bytes={each.name: each.max_bytes for each in rules},
-            watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
-            screening=_screening_of(settings, bag_dir, reader),
-            static_topics=settings.data.tf_static_topics,
-            grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
-        )
+        bag_dir,
+        bags,
+        McapWriter(settings.reader.max_chunk_mb),
+        WallClock(),
+        retention_limits(settings),
+        is_synchronised=is_synchronised,
+        split_duration_s=settings.recording.split_duration_s,
+        own=own,
+        moments_bytes=moments_bytes,
+        rule_bytes={each.name: each.max_bytes for each in rules},
+        watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
+        screening=_screening_of(settings, bag_dir, reader),
+        static_topics=settings.data.tf_static_topics,
+        grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
     )
 
 
@@ -226,7 +224,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
         ConfigError: their file is missing, a rule is refused, or they may take too much together.
     """
     from ros2_memory.bag_dir.moment_file import fault_of_label
-    from ros2_memory.triggers.rules import Rule, RuleKind
+    from ros2_memory.triggers.rules import Rule
 
     path = settings.recording.keep_when
     rules: list[Rule] = []
@@ -240,7 +238,6 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
         rules.append(
             Rule(
                 name=name,
-                kind=RuleKind(given.kind),
                 topic=given.topic,
                 condition=condition,
                 hold=ns_from_unix(given.for_s),

@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover.recovery import recover_handover, recover_handovers
+from ros2_memory.recorder.handover.union import recover_handovers, settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.faults.world import write_bag
 
@@ -61,15 +61,15 @@ def test_a_handover_is_not_settled_from_what_a_failing_disk_hides(
     with monkeypatch.context() as patched:
         patched.setattr("ros2_memory.storage.file_io.os.open", fails_to_open)
         with pytest.raises(RecorderError, match="Input/output error"):
-            recover_handover(old, new, McapReader())
+            settle_handover(old, new, McapReader())
         recover_handovers(tmp_path, McapReader())
     assert read_handover(old).handover == begun
     with monkeypatch.context() as patched:
         patched.setattr(handovers, "read_small_file", fails)
         with pytest.raises(RecorderError, match="cannot be read"):
-            recover_handover(old, new, McapReader())
+            settle_handover(old, new, McapReader())
     assert read_handover(old).handover == begun
-    recover_handover(old, new, McapReader())
+    settle_handover(old, new, McapReader())
     assert read_handover(new).handover.state is Counting.COUNTS
 
 

@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.request_queue import Outcome
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening
 
@@ -57,12 +56,13 @@ def keeper_of(
     keeps_foreign: bool = False,
     require_shipped: bool = False,
     screening: Screening | None = None,
+    kind: type[Housekeeping] = Housekeeping,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
 
     Its clock is right, and an hour later unless one is given.
     """
-    return Housekeeping(
+    return kind(
         bag_dir,
         BagDirReader(reader or McapReader()),
         writer or McapWriter(),
@@ -82,6 +82,13 @@ def keeper_of(
         monotonic=monotonic,
         measure_free=measure_free,
     )
+
+
+def background_keeper_of(bag_dir: Path, **limits: Any) -> BackgroundHousekeeper:
+    """The same housekeeper, whose tasks run in threads."""
+    keeper = keeper_of(bag_dir, kind=BackgroundHousekeeper, **limits)
+    assert isinstance(keeper, BackgroundHousekeeper)
+    return keeper
 
 
 def reader_of_both() -> BagReader:

@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
-from ros2_memory.recorder.handover.union import compare_recordings
+from ros2_memory.recorder.handover.union import settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
@@ -145,7 +145,7 @@ def write_history(bag_dir: Path, draw: Random) -> Written:
                 arrived += [_shifted(each, draw.randint(10_000, 900_000)) for each in missed]
         _write_recording(bag_dir / name, arrived, draw)
         if before is not None:
-            compare_recordings(bag_dir / before[0], bag_dir / name, McapReader())
+            settle_handover(bag_dir / before[0], bag_dir / name, McapReader())
         written.moments += [each.log_time for each in arrived]
         before = (name, fresh)
         now = stop + draw.choice([0, 0, -S, 60 * S])

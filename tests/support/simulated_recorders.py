@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, MutableMapping
+from collections.abc import Callable, Collection, MutableMapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,14 +16,15 @@ import yaml
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
+from ros2_memory.recorder.orders import Orders
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception
-from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.shortfall import Required
+    from ros2_memory.recorder.orders import Required
     from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S
@@ -165,6 +166,7 @@ class World:
         self.free = 10**12
         self.device = 1
         self.refuse = ""
+        self.before_start: Callable[[Path], object] = bool
         self.recorders: list[PlayedRecorder] = []
         self.named_at_start: list[list[str]] = []
         self.defaults: dict[str, object] = {}
@@ -174,24 +176,27 @@ class World:
             "session_duration_s": 1000,
             "min_free_bytes": 1000,
         }
-        self.orders = Orders(**(plan | orders))  # type: ignore[arg-type]
         self.reader = McapReader()
         self.topics_path = bag_dir.with_name(f"{bag_dir.name}.topics.yaml")
         self.list_topics(*expected)
-        self.topics = TopicsFile(self.topics_path)
-        self.topics.load()
+        topics = TopicsFile(self.topics_path)
+        topics.load()
+        self.orders = Orders(
+            start_child=self._start,
+            reader=self.reader,
+            clock=WorldClock(self),
+            topics=topics,
+            own=OwnRecordings(bag_dir),
+            reception=Reception(self.reader, run=lambda task: task()),
+            required=required,
+            **(plan | orders),  # type: ignore[arg-type]
+        )
         self.supervisor = Supervisor(
             self.orders,
-            self._start,
-            self.reader,
             housekeeper or Housekeeper(),
-            WorldClock(self),
             monotonic=lambda: self.mono,
             free_bytes_of=lambda _directory: self.free,
             device=lambda _directory: self.device,
-            topics=self.topics,
-            required=required,
-            reception=Reception(self.reader, run=lambda task: task()),
         )
 
     def list_topics(self, *names: str) -> None:
@@ -200,6 +205,7 @@ class World:
 
     def _start(self, name: str, directory: Path) -> PlayedRecorder:
         self.named_at_start.append(self.heartbeat()["recordings"])
+        self.before_start(directory)
         if self.refuse:
             raise RecorderError(self.refuse)
         recorder = PlayedRecorder(100 + len(self.recorders), self, directory)

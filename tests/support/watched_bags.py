@@ -20,7 +20,7 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.triggers.rules import Rule, RuleKind
+from ros2_memory.triggers.rules import Rule
 from ros2_memory.triggers.search import SplitSearch
 from ros2_memory.triggers.watch import Triggers
 from tests.support.bags import Msg, boolean, write_mcap
@@ -41,13 +41,10 @@ PLENTY = 10**15
 
 def rule(name: str = "bumper", **given: Any) -> Rule:
     """A rule on `/bumper` being true, unless told otherwise."""
-    kind = given.pop("kind", RuleKind.MESSAGE)
-    condition = parse_condition("equals", True, 0.5) if kind is RuleKind.MESSAGE else None
     made: dict[str, Any] = {
         "name": name,
-        "kind": kind,
-        "topic": None if kind is RuleKind.RECORDER_RESTART else "/bumper",
-        "condition": condition,
+        "topic": "/bumper",
+        "condition": parse_condition("equals", True, 0.5),
         "before": 5 * S,
         "after": 3 * S,
         "label": name,
@@ -55,6 +52,11 @@ def rule(name: str = "bumper", **given: Any) -> Rule:
         "max_per_hour": 1000,
     }
     return Rule(**made | given)
+
+
+SILENT: dict[str, Any] = {"condition": None}
+RESTART: dict[str, Any] = {"topic": None, "condition": None}
+"""What makes a rule one over silences, or over restarts of the recorder."""
 
 
 def flag(second: float, value: bool, topic: str = "/bumper") -> Msg:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import (
@@ -42,7 +43,7 @@ from ros2_memory.core.sd_notify import (
     notify,
     watchdog_interval_s,
 )
-from ros2_memory.recorder.handover.recovery import recover_handovers, recover_unwritten
+from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
@@ -217,7 +218,7 @@ def _record_until_signal(
                     recover_at_s = now_s + RECOVER_EVERY_S
                     # The recorder reports a directory that cannot be listed.
                     with suppress(OSError):
-                        recover_unwritten(bag_dir, reader)
+                        recover_handovers(bag_dir, reader, read_heartbeat(bag_dir).recordings)
                 if interval_s is not None and now_s >= next_sign_s:
                     notify(WATCHDOG)
                     next_sign_s = now_s + interval_s / 2

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping
+    from collections.abc import Collection, Mapping
 
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
@@ -164,14 +164,6 @@ class Housekeeper:
         Called about every two seconds, from the thread that begins recordings; `live` are those
         that are being written.
         """
-        step = self.screening(live)
-        if step is not None:
-            step()
-
-    def screening(self, live: Collection[str]) -> Callable[[], None] | None:
-        """Returns what `screen` does, to be done at any time, also when `live` has changed."""
-        del live
-        return None
 
     def finish(self) -> None:
         """Releases what can be, now that nothing is recorded any more. May take some seconds."""

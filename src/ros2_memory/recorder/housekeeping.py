@@ -12,6 +12,7 @@ import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -140,11 +141,12 @@ class Housekeeping(Housekeeper):
         self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
-        self._over_budget = False
         self._out_of_reach = False
         self._collected = Collected()
         self._status = HouseStatus()
         self._unshipped = 0
+        self._threads: dict[str, threading.Thread] = {}
+        self._faults: dict[str, str] = {}
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -153,12 +155,13 @@ class Housekeeping(Housekeeper):
             OSError: the bag directory, or the list of the recorder's own recordings, cannot be
                 read.
         """
-        if self._triggers is not None:
-            self._triggers.note_unclean_end()
-        last = read_heartbeat(self._bag_dir).heartbeat
-        if last is not None and last.state is RecorderState.RECORDING:
-            now = self._clock.now()
-            self._note_interruption(min(last.updated, now), now, "unclean")
+        last, now = read_heartbeat(self._bag_dir).heartbeat, self._clock.now()
+        if last is not None and last.state is not RecorderState.STOPPED:
+            first = min(last.updated, now)
+            if self._triggers is not None:
+                self._triggers.note_restart(first, now)
+            if last.state is RecorderState.RECORDING:
+                self._note_interruption(first, now, "unclean")
         named = _named(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
@@ -197,7 +200,6 @@ class Housekeeping(Housekeeper):
     def apply(self) -> None:
         """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""
         self._apply()
-        self._report_over_budget(self._collected)
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
@@ -213,8 +215,8 @@ class Housekeeping(Housekeeper):
         if restarted or self._moments.has_work():
             with self._index.undisturbed() as snapshot:
                 self._moments.keep(snapshot)
-                if restarted:
-                    self._look(snapshot)
+                if restarted and self._triggers is not None:
+                    self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
         """Records that a recording ended unexpectedly, and another one begins."""
@@ -238,14 +240,15 @@ class Housekeeping(Housekeeper):
         if self._screening is not None:
             self._screening.announce(recording)
 
-    def screening(self, live: Collection[str]) -> Callable[[], None] | None:
-        """Returns what screens closed splits; None where nothing is to be excluded."""
-        return None if self._screening is None else self._screening.plan(live)
+    def screen(self, live: Collection[str]) -> None:
+        """Screens closed splits."""
+        if self._screening is not None:
+            self._screening.plan(live)()
 
     def finish(self) -> None:
         """Screens what is left, some splits of each recording."""
         for _ in range(_LAST_STEPS):
-            self.screen(())
+            Housekeeping.screen(self, ())
 
     def status(self) -> HouseStatus:
         """Returns what the last pass found, and what is held back at this moment."""
@@ -267,25 +270,21 @@ class Housekeeping(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
-    def _describe_held(self, held: int) -> str | None:
-        if not held:
-            return None
-        bags = counted(held, "bag is", "bags are")
-        limit = f"{self._max_age_h:g} h"
-        return (
-            f"{bags} older than {limit} (retention.max_age_h) by date, but not deleted: the clock "
-            "is not known to be right. They are deleted when it is synchronised with a time server "
-            f"(timedatectl shows that), or when {limit} have been recorded after them"
-        )
-
     def _apply(self, free_bytes_wanted: int | None = None) -> None:
         begun = time.perf_counter_ns()
         self._update_moments()
         before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
         self._collected = collected
+        limit = f"{self._max_age_h:g} h"
+        age_held = (
+            f"{counted(collected.held, 'bag is', 'bags are')} older than {limit} "
+            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
+            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
+            f"or when {limit} have been recorded after them"
+        )
         self._status = replace(
             self._status,
-            age_held=self._describe_held(collected.held),
+            age_held=age_held if collected.held else None,
             counted_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
         )
@@ -303,7 +302,12 @@ class Housekeeping(Housekeeper):
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
             **wanted,
         )
-        self._report_changes(before, collected)
+        self._report(before, collected)
+        if self._triggers is not None and collected.needed:
+            self._triggers.note_deleted(collected.needed)
+
+    def _report(self, before: Collected, collected: Collected) -> None:
+        """Reports what began or ended with a pass, and what it deleted unshipped."""
         if collected.unshipped:
             self._unshipped += len(collected.unshipped)
             bags = counted(self._unshipped, "bag was", "bags were")
@@ -319,22 +323,29 @@ class Housekeeping(Housekeeper):
                 names=[*collected.unshipped],
                 reason=sentence,
             )
-        if self._triggers is not None and collected.needed:
-            self._triggers.note_deleted(collected.needed)
-
-    def _report_changes(self, before: Collected, after: Collected) -> None:
-        """Reports what began or ended with this pass: age held back, and bags no limit counts."""
-        if after.held and not before.held:
-            _log.warning("age_held", bags=after.held, reason=self._status.age_held)
-        elif before.held and not after.held:
+        if collected.held and not before.held:
+            _log.warning("age_held", bags=collected.held, reason=self._status.age_held)
+        elif before.held and not collected.held:
             _log.info("age_no_longer_held")
-        if after.foreign_bytes and not before.foreign_bytes:
+        if collected.foreign_bytes and not before.foreign_bytes:
             _log.warning(
                 "foreign_bags_kept",
-                bytes=after.foreign_bytes,
+                bytes=collected.foreign_bytes,
                 reason="the recorder did not make them, so they are neither deleted nor counted in "
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
+            )
+        if before.fits and not collected.fits:
+            state, saved = collected.state_bytes, collected.saved_bytes
+            others = collected.total_bytes - state - saved
+            _log.error(
+                "budget_not_held",
+                total_bytes=collected.total_bytes,
+                state_bytes=state,
+                reason=f"files that are never deleted exceed {self._max_bytes / _MB:.3g} MB: "
+                f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
+                f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
+                "raise retention.max_total_gb",
             )
 
     def _update_moments(self) -> None:
@@ -347,13 +358,10 @@ class Housekeeping(Housekeeper):
                 if self._moments.has_work():
                     self._moments.keep(snapshot)
                 self._moments.update_sidecars()
-                self._look(snapshot)
+                if self._triggers is not None:
+                    self._triggers.look(snapshot)
         except (EpisodicError, OSError) as error:
             _log.error("moments_not_minded", reason=str(error))
-
-    def _look(self, snapshot: Snapshot) -> None:
-        if self._triggers is not None:
-            self._triggers.look(snapshot)
 
     def _needed(self, snapshot: Snapshot) -> frozenset[str]:
         return frozenset() if self._triggers is None else self._triggers.needed(snapshot)
@@ -451,96 +459,48 @@ class Housekeeping(Housekeeper):
             )
         return self._repairer.repair(path)
 
-    def _report_over_budget(self, collected: Collected) -> None:
-        """Reports once that the budget cannot be kept."""
-        if not collected.fits and not self._over_budget:
-            state, saved = collected.state_bytes, collected.saved_bytes
-            others = collected.total_bytes - state - saved
-            _log.error(
-                "budget_not_held",
-                total_bytes=collected.total_bytes,
-                state_bytes=state,
-                reason=f"files that are never deleted exceed {self._max_bytes / _MB:.3g} MB: "
-                f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
-                f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
-                "raise retention.max_total_gb",
-            )
-        self._over_budget = not collected.fits
 
-
-class BackgroundHousekeeper(Housekeeper):
-    """Runs the tasks of another housekeeper in threads, so that its methods return at once.
+class BackgroundHousekeeper(Housekeeping):
+    """Does what takes a while in threads, so that its methods return at once.
 
     The first scan of a week of bags takes from seconds to minutes, in which the recorder must
     continue and answer the service manager's watchdog. Only `repair` waits: nothing is recorded
-    yet.
+    yet. What is still under way is not begun again.
     """
 
-    def __init__(self, housekeeper: Housekeeper) -> None:
-        self._housekeeper = housekeeper
-        self._threads: dict[str, threading.Thread] = {}
-        self._faults: dict[str, str] = {}
-
-    def repair(self) -> None:
-        """Repairs what a crash left, and returns when that is done."""
-        self._housekeeper.repair()
-
     def make_room(self, free_bytes_wanted: int) -> None:
-        """Begins to delete until so much of the disk is free, unless that is under way."""
-        self._begin("make_room", lambda: self._housekeeper.make_room(free_bytes_wanted))
+        """Begins to delete until so much of the disk is free."""
+        self._begin("make_room", partial(super().make_room, free_bytes_wanted))
 
     def is_making_room(self) -> bool:
         """Whether room is being made."""
         return self._is_under_way("make_room")
 
     def apply(self) -> None:
-        """Begins to apply the limits, unless that is still under way."""
-        self._begin("apply", self._housekeeper.apply)
+        """Begins to apply the limits."""
+        self._begin("apply", super().apply)
 
     def keep_moments(self) -> None:
-        """Begins to save the moments that were asked for, unless that is still under way."""
-        self._begin("keep_moments", self._housekeeper.keep_moments)
-
-    def note_recorded(
-        self, recordings: Collection[str], bytes_written: int, monotonic_s: float
-    ) -> None:
-        """Counts the time for which these recordings are written."""
-        self._housekeeper.note_recorded(recordings, bytes_written, monotonic_s)
-
-    def note_restart(self, first: Ns, how: Interruption) -> None:
-        """Records that a recording ended unexpectedly, and another one begins."""
-        self._housekeeper.note_restart(first, how)
-
-    def announce(self, recording: str) -> None:
-        """Records at once that a recording is about to start."""
-        self._housekeeper.announce(recording)
+        """Begins to save the moments that were asked for."""
+        self._begin("keep_moments", super().keep_moments)
 
     def screen(self, live: Collection[str]) -> None:
-        """Begins to screen closed splits, unless that is still under way."""
-        if self._is_under_way("screen"):
+        """Begins to screen closed splits."""
+        if self._screening is None or self._is_under_way("screen"):
             return
         # What is live is known now, and not when the thread begins.
         try:
-            step = self._housekeeper.screening(live)
+            step = self._screening.plan(live)
         except (EpisodicError, OSError) as error:
             self._faults["screen"] = str(error)
             return
-        if step is not None:
-            self._begin("screen", step)
+        self._begin("screen", step)
 
     def finish(self) -> None:
         """Screens what is left, after what is under way."""
         if "screen" in self._threads:
             self._threads["screen"].join()
-        self._run("screen", self._housekeeper.finish)
-
-    def status(self) -> HouseStatus:
-        """Returns what the heartbeat shows."""
-        return self._housekeeper.status()
-
-    def excluded_latched(self) -> frozenset[str]:
-        """Returns the latched topics whose newest message is excluded whenever it is received."""
-        return self._housekeeper.excluded_latched()
+        self._run("screen", super().finish)
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""
@@ -552,13 +512,11 @@ class BackgroundHousekeeper(Housekeeper):
             thread.join()
 
     def _begin(self, task: str, do: Callable[[], None]) -> None:
-        if self._is_under_way(task):
-            return
-        thread = threading.Thread(
-            target=self._run, args=(task, do), name=f"housekeeping {task}", daemon=True
-        )
-        self._threads[task] = thread
-        thread.start()
+        if not self._is_under_way(task):
+            self._threads[task] = threading.Thread(
+                target=self._run, args=(task, do), name=f"housekeeping {task}", daemon=True
+            )
+            self._threads[task].start()
 
     def _run(self, task: str, do: Callable[[], None]) -> None:
         try:
@@ -572,8 +530,7 @@ class BackgroundHousekeeper(Housekeeper):
             self._faults.pop(task, None)
 
     def _is_under_way(self, task: str) -> bool:
-        thread = self._threads.get(task)
-        return thread is not None and thread.is_alive()
+        return task in self._threads and self._threads[task].is_alive()
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

@@ -181,37 +181,31 @@ class IndexManager:
         )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
-        # Who has the turn may wait for this scan.
-        with self._large.set_aside(), _gc_paused() if self.published is None else nullcontext():
-            return self._scan_changes(patrolling=patrolling)
-
-    def _scan_changes(self, *, patrolling: bool) -> Snapshot:
-        begun = time.perf_counter_ns()
+        begun, before = time.perf_counter_ns(), self.published
         context = self._context()
-        try:
-            change = self._table.update(context, patrolling=patrolling)
-        except BaseException:
-            # A new table: the interrupted one will not be shown again what changed.
-            self._table = self._new_table()
-            raise
-        before = self.published
-        if before is not None and not change.is_new:
-            self.published = replace(before, scanned_at=context.now)
-            return self.published
-        self.published = self._table.snapshot(context.now)
+        # Who has the turn may wait for this scan.
+        with self._large.set_aside(), _gc_paused() if before is None else nullcontext():
+            try:
+                change = self._table.update(context, patrolling=patrolling)
+            except BaseException:
+                # A new table: the interrupted one will not be shown again what changed.
+                self._table = self._new_table()
+                raise
+            if before is not None and not change.is_new:
+                self.published = replace(before, scanned_at=context.now)
+                return self.published
+            self.published = self._table.snapshot(context.now)
         self._report(before, self.published, change, begun)
         return self.published
 
     def _context(self) -> ScanContext:
-        now = self._clock.now()
-        heartbeat = self.heartbeat()
+        now, heartbeat = self._clock.now(), self.heartbeat()
         live = heartbeat is not None and heartbeat.is_live(now)
-        named = frozenset(heartbeat.recordings) if heartbeat is not None and live else None
         return ScanContext(
             self.bag_dir,
             now,
             self._three_splits,
-            named,
+            frozenset(heartbeat.recordings) if heartbeat is not None and live else None,
             self._include_active,
             self._trusts_mtime,
         )

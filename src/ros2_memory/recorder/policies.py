@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import signal
-from enum import Enum, auto
-from typing import TYPE_CHECKING, Final
+from typing import Final, NamedTuple
 
-from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.recorder.process.command import MESSAGES_LOST
-
-if TYPE_CHECKING:
-    from collections.abc import Collection
-
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 60.0
@@ -32,6 +26,26 @@ SET_BACK_NS: Final[Ns] = 120 * NS_PER_S
 A split is closed by the time of a message that comes long enough after its first. A smaller step is
 waited out.
 """
+
+STEP_NS: Final[Ns] = 100 * NS_PER_MS
+"""A clock that falls behind by so much at once was set back; a slewed one falls behind slowly."""
+
+
+class ClockReading(NamedTuple):
+    """Both clocks, read at the same time: seconds that never step, and the wall clock."""
+
+    monotonic_s: float
+    wall: Ns
+
+
+def set_back(earlier: ClockReading, later: ClockReading, by_ns: Ns = STEP_NS) -> bool:
+    """Whether the wall clock was set back by more than `by_ns` between two readings close together.
+
+    A clock that is set forward does no harm: messages published before and after the step are still
+    on either side of one cut.
+    """
+    passed = round((later.monotonic_s - earlier.monotonic_s) * NS_PER_S)
+    return passed - (later.wall - earlier.wall) > by_ns
 
 
 class Backoff:
@@ -110,71 +124,6 @@ class SilenceWatch:
         self._patience_s = doubled_s if for_silence else self._first_s
 
 
-class SpaceAction(Enum):
-    """What the free space asks for."""
-
-    NONE = auto()
-    MAKE_ROOM = auto()  # delete more than the budget asks
-    WAIT = auto()  # for room that is being made
-    PAUSE = auto()
-    STAY_PAUSED = auto()
-    RESUME = auto()
-
-
-def resume_bytes(min_free_bytes: int) -> int:
-    """Returns how much must be free for recording to resume: more than what it was paused for."""
-    return round(min_free_bytes * RESUME_FACTOR)
-
-
-def space_action(
-    free_bytes: int,
-    min_free_bytes: int,
-    *,
-    paused: bool,
-    room_requested: bool,
-    making_room: bool = False,
-) -> SpaceAction:
-    """Decides what to do about the free space.
-
-    Args:
-        free_bytes: what the file system of the bag directory has left for this user.
-        min_free_bytes: what it must have for recording to continue.
-        paused: whether recording is paused.
-        room_requested: whether deleting was requested for this shortage already.
-        making_room: whether that is still under way; it is waited for while half of
-            `min_free_bytes` is free.
-    """
-    if paused:
-        enough = free_bytes >= resume_bytes(min_free_bytes)
-        return SpaceAction.RESUME if enough else SpaceAction.STAY_PAUSED
-    if free_bytes >= min_free_bytes:
-        return SpaceAction.NONE
-    if not room_requested:
-        return SpaceAction.MAKE_ROOM
-    waits = making_room and free_bytes >= min_free_bytes // 2
-    return SpaceAction.WAIT if waits else SpaceAction.PAUSE
-
-
-def describe_waiting(subscribed: Collection[str], *, simulated: bool, advice: str) -> str:
-    """Describes what a recorder waits for that has received nothing.
-
-    `advice` is for subscriptions that receive nothing.
-    """
-    if simulated:
-        return (
-            "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
-            "before /clock arrives"
-        )
-    if not {*subscribed} - OWN_TOPICS:
-        return (
-            "nothing has been recorded of the robot: no publisher offers any of the listed topics "
-            "in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and topics.yaml with "
-            "the robot's"
-        )
-    topics = counted(len({*subscribed} - OWN_TOPICS), "topic is", "topics are")
-    return f"nothing has been recorded, although {topics} subscribed to; {advice}"
-
-
 def describe_death(status: int, last_output: str) -> str:
     """Describes a `ros2 bag record` that ended by itself.
 
@@ -187,18 +136,3 @@ def describe_death(status: int, last_output: str) -> str:
         ended = f"was killed ({known.get(-status, f'signal {-status}')})"
     said = f"; last it said: {last_output}" if last_output else ""
     return f"ros2 bag record {ended}{said}"
-
-
-def describe_silent_topics(
-    subscribed: Collection[str], received: Collection[str], advice: str
-) -> str | None:
-    """Describes the topics that sent nothing in a whole recording; None if all did."""
-    silent = sorted(set(subscribed) - set(received))
-    if not silent:
-        return None
-    if not received:
-        return (
-            f"subscribed to {counted(len(silent), 'topic')} and received nothing from any of them; "
-            f"{advice}"
-        )
-    return f"subscribed, and no message in the whole recording: {', '.join(silent)}"

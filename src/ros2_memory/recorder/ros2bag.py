@@ -18,14 +18,13 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Housekeeper, Recorder
+from ros2_memory.recorder.orders import Orders, Required
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
 from ros2_memory.recorder.process.environment import advice_on_silence
 from ros2_memory.recorder.process.installation import Installation, find_installation
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_splits
-from ros2_memory.recorder.sessions import Orders
-from ros2_memory.recorder.shortfall import Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 
@@ -122,17 +121,17 @@ class Ros2BagRecorder(Recorder):
                 split_duration_s=split_duration_s,
                 session_duration_s=session_duration_s,
                 min_free_bytes=self._min_free_bytes,
+                start_child=self._start_child,
+                reader=reader,
+                clock=WallClock(),
+                topics=self._topics,
+                own=self._own,
+                reception=self._reception,
+                required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
                 simulated=use_sim_time,
                 advice=lambda: advice_on_silence(self._ros.env),
             ),
-            self._start_child,
-            reader,
             housekeeper or Housekeeper(),
-            WallClock(),
-            topics=self._topics,
-            own=self._own,
-            reception=self._reception,
-            required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
         )
 
     def check(self) -> None:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.handover.plan import ClockReading
+    from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.process.child import Child
     from ros2_memory.recorder.process.output import Line
     from ros2_memory.storage.base import BagReader

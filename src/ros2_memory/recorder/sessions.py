@@ -7,27 +7,20 @@ from __future__ import annotations
 
 import signal
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.plan import (
+from ros2_memory.core.text import counted
+from ros2_memory.recorder.handover.transfer import (
     READY_TIMEOUT_S,
-    SUBSCRIBE_TIMEOUT_S,
     HandoverPlan,
+    HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.recovery import settle_handover
-from ros2_memory.recorder.handover.transfer import HandoverTransfer
-from ros2_memory.recorder.policies import (
-    OWN_TOPICS,
-    WAITING_S,
-    describe_death,
-    describe_silent_topics,
-    describe_waiting,
-)
+from ros2_memory.recorder.handover.union import settle_handover
+from ros2_memory.recorder.policies import describe_death
 from ros2_memory.recorder.process.child import end_all
 from ros2_memory.recorder.process.output import LineKind
 from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
@@ -37,16 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.handover.plan import ClockReading
-    from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.reception.reception import Reception
+    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.session import SplitChanges
-    from ros2_memory.storage.base import BagReader
 
 SETTLE_S: Final = 5.0
 """A recording this young writes its headers and latched messages, which do not end a silence."""
@@ -54,43 +43,21 @@ WHOLE_RECORDING_S: Final = 15.0
 """A recording that lived for less is too short to report topics without messages."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Orders:
-    """What to record and for how long. Durations are in seconds.
-
-    `simulated`: log times come from a simulated clock. `advice` says what to do where publishers
-    are subscribed to and not heard. `subscribe_timeout_s` is how long a handover
-    waits for the new recorder (see `handover.plan`).
-    """
-
-    bag_dir: Path
-    split_duration_s: float
-    session_duration_s: float
-    min_free_bytes: int
-    simulated: bool = False
-    advice: Callable[[], str] = str
-    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
-
-
 class RecordingSessions:
     """The sessions of one bag directory.
 
     Args:
         orders: what to record.
-        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
         announce: receives the name of a recording before anything of it exists.
-        reader: reads splits that are closed.
+        interrupted: receives when a recording last grew that ended unexpectedly (wall time), and
+            how it ended.
         events: where everything is reported.
-        own: the list of recordings that were made here.
-        reception: measures closed splits, and receives the publishers that were refused.
-        topics: the list of topics to record.
 
     Attributes:
         running: all sessions whose children have not ended, oldest first.
         current: the session that records; None while none does.
         handover: the handover from the current session to the next; None mostly.
         restarts: how often a recording had to be started again.
-        waiting_for: why no message has arrived since recording started, as a sentence; else None.
         heard: the topics of which a closed split had a message.
         closed_s: when a split was last closed, by the monotonic clock.
         grew_s: when a recording last grew by more than its beginning, by that clock.
@@ -99,23 +66,14 @@ class RecordingSessions:
     def __init__(
         self,
         orders: Orders,
-        start_child: Callable[[str, Path], Child],
         announce: Callable[[str], None],
-        reader: BagReader,
+        interrupted: Callable[[Ns, Interruption], None],
         events: EventLog,
-        *,
-        own: OwnRecordings,
-        reception: Reception,
-        topics: TopicsFile,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
-        self._start_child = start_child
         self._announce = announce
-        self._own = own
-        self._reception = reception
-        self._topics = topics
-        self._reader = reader
+        self._interrupted = interrupted
         self._events = events
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
@@ -126,12 +84,9 @@ class RecordingSessions:
         self._unsettled: list[tuple[Path, Path]] = []
         self._ended_bytes = 0
         self.restarts = 0
-        self.waiting_for: str | None = None
         self.heard = set[str]()
         self.closed_s = 0.0
         self.grew_s = 0.0
-        self._silent_since_s: float | None = None
-        self._interruptions: list[tuple[Ns, Interruption]] = []
 
     @property
     def bytes_written(self) -> int:
@@ -145,7 +100,6 @@ class RecordingSessions:
             RecorderError: it cannot be started.
         """
         self.current = self._launch(recording_name(now.wall, self._bag_dir), now)
-        self._silent_since_s = now.monotonic_s
         self.grew_s = max(self.grew_s, now.monotonic_s)
 
     def begin_handover(self, now: ClockReading) -> None:
@@ -164,15 +118,13 @@ class RecordingSessions:
         except RecorderError:
             HandoverTransfer.announce(old, None)
             raise
-        orders = self._orders
-        plan = HandoverPlan(now, subscribe_timeout_s=orders.subscribe_timeout_s)
         self.handover = HandoverTransfer(
             old,
             new,
-            plan,
-            self._reader,
-            simulated=orders.simulated,
-            is_listed=self._topics.selection.matches,
+            HandoverPlan(now, subscribe_timeout_s=self._orders.subscribe_timeout_s),
+            self._orders.reader,
+            simulated=self._orders.simulated,
+            is_listed=self._orders.topics.selection.matches,
         )
         self._events.info("rotation_begun", recording=old.name, next=name)
 
@@ -184,43 +136,14 @@ class RecordingSessions:
             self._list_own(session)
             closed = closed or bool(changes.closed)
             if changes.gone and session.state is not SessionState.ENDING:
-                self._handle_vanished(session)
+                name = session.name
+                sentence = f"the directory of recording {name} is missing; a new recording starts"
+                self._events.fail("recording_vanished", sentence, recording=name)
+                self.restarts += 1
+                self._lose(session)
         if closed:
             self.settle_handovers()
-        self._check_waiting(now)
         return closed
-
-    def _check_waiting(self, now: ClockReading) -> None:
-        """Checks whether any message has arrived since recording started.
-
-        What was heard once is silent later, and not waited for.
-        """
-        if any(map(self._hears, self.running)):
-            self._silent_since_s = None
-        since_s, current = self._silent_since_s, self.current
-        patience_s = max(WAITING_S, self._orders.split_duration_s)
-        if current is not None and current.splits.bytes_written:
-            # What it has is known when its first split is closed.
-            patience_s += self._orders.split_duration_s
-        if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
-            self.waiting_for = None
-            self._events.resolve("recording_waits", "")
-            return
-        self.waiting_for = describe_waiting(
-            current.subscribed, simulated=self._orders.simulated, advice=self._orders.advice()
-        )
-        self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
-
-    def _hears(self, session: RecordingSession) -> bool:
-        """Returns whether a session has recorded something that may be of the robot."""
-        splits = session.splits
-        if splits.received - OWN_TOPICS:
-            return True
-        # Other bytes may come from nodes of the recorder's own user, as those of /rosout do.
-        others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
-        if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
-            return False
-        return bool(splits.messages or splits.bytes_written)
 
     def advance_handover(self, now: ClockReading) -> Step:
         """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
@@ -231,7 +154,7 @@ class RecordingSessions:
         with self._reported(handover.old):
             due = handover.advance(now)
             if due is Step.COMPLETE:
-                self._complete(handover, now)
+                self._take_over(handover, now)
             step = due
         if step is Step.ABANDON:
             self._abandon(handover)
@@ -243,26 +166,15 @@ class RecordingSessions:
         If the current one died during a handover, the new one becomes the current one.
         """
         deaths = 0
-        handover = self.handover
-        if handover is not None and handover.new.child.exit_status() is not None:
-            deaths += 1
-            self._report_death(handover.new, now)
-            self._abandon(handover)
-        current = self.current
-        if current is not None and current.child.exit_status() is not None:
-            deaths += 1
-            self._report_death(current, now)
-            self._finalize(current, now)
-            self._replace_current()
+        new = None if self.handover is None else self.handover.new
+        for session in (new, self.current):
+            if session is not None and session.child.exit_status() is not None:
+                deaths += 1
+                self._report_death(session, now)
+                if session is self.current:
+                    self._finalize(session, now)
+                self._lose(session)
         return deaths
-
-    def take_interruptions(self) -> list[tuple[Ns, Interruption]]:
-        """Returns the recordings that ended unexpectedly since the last call.
-
-        When each last grew (wall time), and how it ended.
-        """
-        taken, self._interruptions = self._interruptions, []
-        return taken
 
     def end_unready(self, now: ClockReading) -> bool:
         """Ends the current session if it does not begin to record; returns whether it did."""
@@ -286,7 +198,13 @@ class RecordingSessions:
         ]
         for session in ended:
             if session.has_recorded and session.child.exit_status() == -signal.SIGKILL:
-                self._report_hang(session)
+                sentence = (
+                    f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
+                    "to, and was killed (SIGKILL); what it had not written yet is lost"
+                )
+                self._events.fail("recorder_hung", sentence, recording=session.name)
+                self.restarts += 1
+                self._interrupted(session.grew_at, "hung")
             self._finalize(session, now)
         if ended:
             self.settle_handovers()
@@ -295,13 +213,11 @@ class RecordingSessions:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
         handover = self.handover
         if handover is not None:
-            completed = False
             with self._reported(handover.old):
-                completed = handover.complete(now)
+                # Else the old one counts up to its end, and the new one from there.
+                if handover.complete(now):
+                    self._completed[handover.old.name] = handover
             self._unsettled.append(handover.directories)
-            if completed:
-                self._completed[handover.old.name] = handover
-            # Else the old one counts up to its end, and the new one from there.
         for session in self.running:
             session.end()
         self.current, self.handover = None, None
@@ -315,26 +231,26 @@ class RecordingSessions:
         self.running = ()
 
     def _launch(self, name: str, now: ClockReading) -> RecordingSession:
-        self._own.begin(name)
+        self._orders.own.begin(name)
         self._announce(name)
         directory = self._bag_dir / name
         try:
-            child = self._start_child(name, directory)
+            child = self._orders.start_child(name, directory)
         except OSError as error:
             raise RecorderError(f"ros2 bag record cannot be started: {error}") from error
         self._events.info("recorder_started", recording=name, pid=child.pid)
-        session = RecordingSession(name, child, Splits(directory, self._reader), now)
+        session = RecordingSession(name, child, Splits(directory, self._orders.reader), now)
         self.running += (session,)
         return session
 
     def _list_own(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, and its splits; a fault is retried."""
         try:
-            session.is_listed = session.is_listed or self._own.complete(session.name)
+            session.is_listed = session.is_listed or self._orders.own.complete(session.name)
             # Else another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
-                self._own.note(session.name, session.splits.seen, ended=has_ended)
+                self._orders.own.note(session.name, session.splits.seen, ended=has_ended)
         except RecorderError as error:
             self._events.fail_once("recording_not_listed", session.name, str(error))
         else:
@@ -351,7 +267,7 @@ class RecordingSessions:
                 self.grew_s = now.monotonic_s
         for name in changes.closed:
             self._events.info("split_closed", recording=session.name, file=name)
-            self._reception.learn(session.name, session.splits.directory / name)
+            self._orders.reception.learn(session.name, session.splits.directory / name)
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
@@ -369,15 +285,15 @@ class RecordingSessions:
         self._events.report_output(session.name, lines)
         for line in lines:
             if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
-                self._reception.refused(session.name, line.topic)
+                self._orders.reception.refused(session.name, line.topic)
             elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                self._reception.lost(session.name, line.topic, line.count or 0)
+                self._orders.reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
         for fault in flush_bags(directory, names):
             self._events.warn("not_flushed", fault, recording=session.name)
 
-    def _complete(self, handover: HandoverTransfer, now: ClockReading) -> None:
+    def _take_over(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
             missing = ", ".join(sorted(handover.missing))
             self._events.remark(
@@ -401,41 +317,31 @@ class RecordingSessions:
         self._unsettled.append(handover.directories)
         handover.new.end()
 
-    def _replace_current(self) -> None:
-        """Makes the session that was to take over the current one, if there is one."""
+    def _lose(self, session: RecordingSession) -> None:
+        """Goes on without a session: with the other one of a handover, if there is one."""
         handover = self.handover
-        self.current, self.handover = None, None
-        if handover is not None:
-            self.current = handover.new
-            self._unsettled.append(handover.directories)
-            self.settle_handovers()
+        if handover is not None and session is handover.new:
+            self._abandon(handover)
+        elif session is self.current:
+            session.end()
+            self.current, self.handover = None, None
+            if handover is not None:
+                self.current = handover.new
+                self._unsettled.append(handover.directories)
+                self.settle_handovers()
 
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
         What fails is tried again when the next split is closed.
         """
-        running = {each.name for each in self.running}
-        left = []
-        for old, new in self._unsettled:
-            settled = False
+        running = {session.name for session in self.running}
+        for old, new in [*self._unsettled]:
             try:
-                settled = settle_handover(old, new, self._reader, running)
+                if settle_handover(old, new, self._orders.reader, running):
+                    self._unsettled.remove((old, new))
             except RecorderError as error:
                 self._events.fail("rotation_failed", str(error), recording=old.name)
-            if not settled:
-                left.append((old, new))
-        self._unsettled = left
-
-    def _handle_vanished(self, session: RecordingSession) -> None:
-        sentence = f"the directory of recording {session.name} is missing; a new recording starts"
-        self._events.fail("recording_vanished", sentence, recording=session.name)
-        self.restarts += 1
-        if self.handover is not None and session is self.handover.new:
-            self._abandon(self.handover)
-        elif session is self.current:
-            session.end()
-            self._replace_current()
 
     def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)
@@ -443,16 +349,7 @@ class RecordingSessions:
         sentence = describe_death(session.child.exit_status() or 0, session.last_output)
         self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
-        self._interruptions.append((session.grew_at, "died"))
-
-    def _report_hang(self, session: RecordingSession) -> None:
-        sentence = (
-            f"the ros2 bag record of {session.name} hung: it did not end when it was asked to, and "
-            "was killed (SIGKILL); what it had not written yet is lost"
-        )
-        self._events.fail("recorder_hung", sentence, recording=session.name)
-        self.restarts += 1
-        self._interruptions.append((session.grew_at, "hung"))
+        self._interrupted(session.grew_at, "died")
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""
@@ -471,10 +368,14 @@ class RecordingSessions:
         self._flush(session, splits.directory, (METADATA_FILE,))
         self._flush(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        silent = describe_silent_topics(session.subscribed, splits.received, self._orders.advice())
-        lived_s = session.age_s(now)
-        if silent is not None and lived_s >= WHOLE_RECORDING_S:
-            self._events.warn("topics_silent", silent, recording=session.name)
+        silent, lived_s = sorted(session.subscribed - splits.received), session.age_s(now)
+        if silent and lived_s >= WHOLE_RECORDING_S:
+            sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
+            if not splits.received:
+                topics = counted(len(silent), "topic")
+                sentence = f"subscribed to {topics} and received nothing from any of them; "
+                sentence += self._orders.advice()
+            self._events.warn("topics_silent", sentence, recording=session.name)
         self._events.info(
             "recording_ended",
             recording=session.name,

@@ -1,51 +1,30 @@
-"""Which topics are offered and not recorded, and which required ones fall short of it. Pure."""
+"""What becomes of the topics that are to be recorded, and what is not recorded as it should be."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.recorder.policies import OWN_TOPICS
+from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import ns_from_unix
+from ros2_memory.recorder.policies import OWN_TOPICS, WAITING_S
 from ros2_memory.recorder.process.topics import TopicSelection
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Mapping
+
+    from ros2_memory.recorder.event_log import EventLog
+    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.policies import ClockReading
+    from ros2_memory.recorder.session import RecordingSession
+    from ros2_memory.recorder.sessions import RecordingSessions
 
 UNHEARD_S: Final = 30.0
 """A topic that is offered for so long, and of which nothing came, is not recorded."""
-
-
-@dataclass(frozen=True, slots=True)
-class Required:
-    """An entry of `recording.required`: a name or a glob, and the least messages a second."""
-
-    topic: str
-    min_hz: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Seen:
-    """What the recordings show at one time of a monotonic clock.
-
-    Attributes:
-        now_s: that time.
-        offered: the topics subscribed to, which some publisher offers.
-        heard: the topics of which any message was recorded since the start.
-        unknown: topics of an unknown type.
-        known_s: the time up to which `heard` is known.
-        silent: topics that were regular and have stopped.
-        rates_hz: messages a second of each topic.
-        settled: whether the recording has had the time to find all that is offered.
-    """
-
-    now_s: float
-    offered: Collection[str]
-    heard: Collection[str]
-    unknown: Collection[str]
-    known_s: float
-    silent: Collection[str]
-    rates_hz: Mapping[str, float]
-    settled: bool = True
+TYPES_S: Final = 15.0
+"""By then a recording has subscribed to all topics of known types that are offered."""
+IDLE_SPLITS: Final = 2
+"""Recordings that have not grown for longer than so many splits are idle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,55 +37,212 @@ class Shortfall:
     required_missing: tuple[str, ...] = ()
 
 
-@dataclass(slots=True)
 class TopicWatch:
-    """Remembers since when each topic is offered."""
+    """Watches the topics of all recordings, and names each fault once.
 
-    required: Sequence[Required] = ()
-    _since_s: dict[str, float] = field(default_factory=dict)
-    _unknown: frozenset[str] = frozenset()
-    _began_s: float | None = None
+    Args:
+        orders: what to record.
+        events: where faults are named.
 
-    def look(self, seen: Seen) -> Shortfall:
-        """Returns which topics fall short at this time."""
+    Attributes:
+        waiting_for: why no message has arrived since recording started, as a sentence; else None.
+        gone: the topics that some publisher has offered since the start, and none does any more.
+        shortfall: the topics that are not recorded as they should be.
+    """
+
+    def __init__(self, orders: Orders, events: EventLog) -> None:
+        self._orders = orders
+        self._topics = orders.topics
+        self._events = events
+        self.waiting_for: str | None = None
+        self.gone = frozenset[str]()
+        self.shortfall = Shortfall()
+        self._offered = set[str]()
+        self._named_missing = frozenset[str]()
+        self._named_unknown = frozenset[str]()
+        self._unheard_from_s: float | None = None
+        self._began_s: float | None = None
+        # Since when each topic is offered.
+        self._since_s: dict[str, float] = {}
+
+    def began(self, now: ClockReading) -> None:
+        """Notes that a recording begins while none runs."""
+        self._unheard_from_s = now.monotonic_s
+
+    def look(self, now: ClockReading, sessions: RecordingSessions) -> None:
+        """Looks at all topics, about once a second."""
+        current = sessions.current
+        self._look_for_messages(now, sessions)
+        if current is None:
+            return
+        if current.age_s(now) >= TYPES_S:
+            self._name_unknown_types(current)
+        if current.age_s(now) >= WAITING_S and sessions.handover is None:
+            self._name_absent(current, sessions)
+        before, found = self.shortfall, self._shortfall(now, current, sessions)
+        self.shortfall = found
+        if new := sorted({*found.unheard} - {*before.unheard}):
+            sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
+            self._events.remark("topics_unheard", sentence, topics=new)
+        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
+            sentence = f"regular until now, and silent: {listed(new)}"
+            self._events.remark("topics_stopped", sentence, topics=new)
+        if found.required_missing and not before.required_missing:
+            sentence = f"required, and not recorded: {listed(found.required_missing)}"
+            self._events.remark("required_missing", sentence)
+
+    def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
+        """Returns the topics that no publisher has offered; none before a recorder has looked."""
+        for session in sessions.running:
+            self._offered |= session.subscribed | session.splits.received
+        if not any(session.has_recorded for session in sessions.running):
+            return ()
+        unknown = (session.of_unknown_type for session in sessions.running)
+        known = self._offered.union(self.shortfall.unknown_types, *unknown)
+        return tuple(sorted({*self._topics.selection.exact} - known))
+
+    def _look_for_messages(self, now: ClockReading, sessions: RecordingSessions) -> None:
+        """Looks whether any message has arrived since recording started.
+
+        What was heard once is silent later, and not waited for.
+        """
+        if any(map(self._hears, sessions.running)):
+            self._unheard_from_s = None
+        since_s, current = self._unheard_from_s, sessions.current
+        patience_s = max(WAITING_S, self._orders.split_duration_s)
+        if current is not None and current.splits.bytes_written:
+            # What it has is known when its first split is closed.
+            patience_s += self._orders.split_duration_s
+        if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
+            self.waiting_for = None
+            self._events.resolve("recording_waits", "")
+            return
+        others = current.subscribed - OWN_TOPICS
+        if self._orders.simulated:
+            reason = "recording.use_sim_time is on, and nothing is written before /clock arrives"
+            self.waiting_for = f"nothing has been recorded: {reason}"
+        elif others:
+            topics = counted(len(others), "topic is", "topics are")
+            self.waiting_for = (
+                f"nothing has been recorded, although {topics} subscribed to; "
+                f"{self._orders.advice()}"
+            )
+        else:
+            self.waiting_for = (
+                "nothing has been recorded of the robot: no publisher offers any of the listed "
+                "topics in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and "
+                "topics.yaml with the robot's"
+            )
+        self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
+
+    def _hears(self, session: RecordingSession) -> bool:
+        """Whether a session has recorded something that may be of the robot."""
+        splits = session.splits
+        if splits.received - OWN_TOPICS:
+            return True
+        # Other bytes may come from nodes of the recorder's own user, as those of /rosout do.
+        others = session.subscribed.union(self._topics.selection.exact) - OWN_TOPICS
+        if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
+            return False
+        return bool(splits.messages or splits.bytes_written)
+
+    def _name_unknown_types(self, current: RecordingSession) -> None:
+        """Names every topic that is not recorded, where some are of a type that is not known.
+
+        `ros2 bag record` names the first topic of each unknown type, and no other.
+        """
+        # The list may have changed since the child was started.
+        unknown = frozenset(filter(self._topics.selection.matches, current.of_unknown_type))
+        if unknown <= self._named_unknown:
+            return
+        self._named_unknown = unknown
+        others = sorted({*self._topics.selection.exact} - unknown - current.subscribed)
+        listed_too = f", nor these, if anybody offers them: {', '.join(others)}"
+        self._events.warn(
+            "topics_not_recorded",
+            f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
+            "type: name the workspace that defines it in recorder.setup_files. It names one "
+            "topic of each type: of those that a glob selects, others of the same type are "
+            f"not recorded either{listed_too if others else ''}",
+            recording=current.name,
+        )
+
+    def _name_absent(self, current: RecordingSession, sessions: RecordingSessions) -> None:
+        """Names topics that no publisher offers: none did since the start, or none does any more.
+
+        Each is named once; one that comes back may be named again.
+        """
+        missing = frozenset(self.missing(sessions))
+        if new := sorted(missing - self._named_missing):
+            self._events.remark(
+                "topic_not_offered",
+                f"no publisher offers {', '.join(new)}: recorded as soon as one does; "
+                "compare topics.yaml with the robot's topics",
+                topics=new,
+            )
+        self._named_missing |= missing
+        offered = self._offered - current.subscribed - OWN_TOPICS
+        gone = frozenset(filter(self._topics.selection.matches, offered))
+        if new := sorted(gone - self.gone):
+            sentence = f"no publisher offers {', '.join(new)} any more"
+            self._events.remark("topic_silent", sentence, topics=new)
+        self.gone = gone
+
+    def _shortfall(
+        self, now: ClockReading, current: RecordingSession, sessions: RecordingSessions
+    ) -> Shortfall:
+        running, now_s = sessions.running, now.monotonic_s
         if self._began_s is None:
-            self._began_s = seen.now_s
-        offered = {*seen.offered} if seen.settled else {*seen.offered, *self._since_s}
-        since = {topic: self._since_s.get(topic, seen.now_s) for topic in offered}
-        self._since_s = since
-        self._unknown = frozenset(seen.unknown) | (frozenset() if seen.settled else self._unknown)
-        unheard = [
-            topic
-            for topic in {*since} - {*seen.heard} - OWN_TOPICS
-            # Services and actions speak when they are used.
-            if "/_" not in topic and seen.known_s - since[topic] >= UNHEARD_S
-        ]
-        started = seen.now_s - self._began_s >= UNHEARD_S
+            self._began_s = now_s
+        offered = set[str]().union(*(session.subscribed for session in running))
+        unknown = set[str]().union(*(session.of_unknown_type for session in running))
+        if len(running) > 1 or current.age_s(now) < TYPES_S:
+            # A recording that has not had the time to find all that is offered.
+            offered.update(self._since_s)
+            unknown.update(self.shortfall.unknown_types)
+        self._since_s = {topic: self._since_s.get(topic, now_s) for topic in offered}
+        split_s = self._orders.split_duration_s
+        # What comes slowly is written when its split is closed.
+        known_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
+        idle_s = max(0.0, now_s - sessions.grew_s - IDLE_SPLITS * split_s)
+        silent, rates_hz = self._orders.reception.arrivals(ns_from_unix(idle_s))
         return Shortfall(
-            unknown_types=tuple(sorted(self._unknown)),
-            unheard=tuple(sorted(unheard)),
-            fell_silent=tuple(sorted({*seen.silent} & {*since})),
-            required_missing=tuple(
-                sentence
-                for each in (self.required if started else ())
-                for sentence in self._missing(each, seen)
+            unknown_types=tuple(sorted(unknown)),
+            unheard=tuple(
+                topic
+                for topic in sorted({*offered} - sessions.heard - OWN_TOPICS)
+                # Services and actions speak when they are used.
+                if "/_" not in topic and known_s - self._since_s[topic] >= UNHEARD_S
+            ),
+            fell_silent=tuple(sorted(silent & offered)),
+            required_missing=(
+                tuple(self._lacks(now_s, sessions.heard, unknown, silent, rates_hz))
+                if now_s - self._began_s >= UNHEARD_S
+                else ()
             ),
         )
 
-    def _missing(self, required: Required, seen: Seen) -> Iterator[str]:
-        """Yields why topics of an entry are not recorded as required, a sentence each."""
-        entry = TopicSelection((required.topic,))
-        known = filter(entry.matches, {*self._since_s, *seen.heard, *self._unknown})
-        for topic in sorted({*known, *entry.exact}) or [required.topic]:
-            if topic in self._unknown:
-                yield f"{topic}: ros2 bag record does not know its type"
-            elif topic not in self._since_s:
-                yield f"{topic}: no publisher offers it"
-            elif topic not in seen.heard:
-                yield f"{topic}: it is offered, and nothing has come"
-            elif topic in seen.silent:
-                yield f"{topic}: it came regularly, and is silent"
-            elif seen.now_s - self._since_s[topic] >= UNHEARD_S:
-                rate = seen.rates_hz.get(topic, 0.0)
-                if rate < required.min_hz:
+    def _lacks(
+        self,
+        now_s: float,
+        heard: Collection[str],
+        unknown: Collection[str],
+        silent: Collection[str],
+        rates_hz: Mapping[str, float],
+    ) -> Iterator[str]:
+        """Yields why topics are not recorded as required, a sentence each."""
+        for required in self._orders.required:
+            entry = TopicSelection((required.topic,))
+            known = filter(entry.matches, {*self._since_s, *heard, *unknown})
+            for topic in sorted({*known, *entry.exact}) or [required.topic]:
+                rate = rates_hz.get(topic, 0.0)
+                if topic in unknown:
+                    yield f"{topic}: ros2 bag record does not know its type"
+                elif topic not in self._since_s:
+                    yield f"{topic}: no publisher offers it"
+                elif topic not in heard:
+                    yield f"{topic}: it is offered, and nothing has come"
+                elif topic in silent:
+                    yield f"{topic}: it came regularly, and is silent"
+                elif now_s - self._since_s[topic] >= UNHEARD_S and rate < required.min_hz:
                     yield f"{topic}: {rate:.3g} Hz, and {required.min_hz:g} are required"

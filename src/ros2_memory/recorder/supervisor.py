@@ -1,47 +1,41 @@
 """Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
 Everything happens in `tick`, which the main thread calls several times a second and which does not
-wait. `policies` and `handover.plan` decide what to do, and `sessions` does it; here the two meet.
+wait. `policies` and `handover.transfer` decide what to do, and `sessions` does it; here they meet.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.plan import ClockReading, Step, set_back
-from ros2_memory.recorder.heartbeat_writer import HeartbeatWriter
+from ros2_memory.recorder.handover.transfer import Step
+from ros2_memory.recorder.heartbeat_writer import HEARTBEAT_S, heartbeat_of
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
+    RESUME_FACTOR,
     SET_BACK_NS,
-    WAITING_S,
     Backoff,
+    ClockReading,
     SilenceWatch,
-    SpaceAction,
-    resume_bytes,
-    space_action,
+    set_back,
 )
-from ros2_memory.recorder.reception.reception import Reception
 from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
-from ros2_memory.recorder.shortfall import Required, Seen, Shortfall, TopicWatch
+from ros2_memory.recorder.shortfall import TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Clock
+    from ros2_memory.bag_dir.state_files import Interruption
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.base import Housekeeper
-    from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.sessions import Orders
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.recorder.orders import Orders
 
 OBSERVE_S: Final = 0.5
 SPACE_S: Final = 1.0
@@ -55,15 +49,10 @@ RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
-HEARTBEAT_S: Final = 5.0
 LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
 """How often topics are looked for that are not recorded as they should be."""
-IDLE_SPLITS: Final = 2
-"""Recordings that have not grown for longer than so many splits are idle."""
-TYPES_S: Final = 15.0
-"""By then a recording has subscribed to all topics of known types that are offered."""
 
 
 class Supervisor:
@@ -71,17 +60,10 @@ class Supervisor:
 
     Args:
         orders: what to record.
-        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
-        reader: reads splits that are closed.
         housekeeper: repairs and deletes in the background.
-        clock: the wall clock.
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
-        topics: the list of topics to record.
-        own: the list of recordings that were made here.
-        reception: plans how topics are subscribed.
-        required: the topics without which recording counts as failed.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -90,57 +72,28 @@ class Supervisor:
     def __init__(
         self,
         orders: Orders,
-        start_child: Callable[[str, Path], Child],
-        reader: BagReader,
         housekeeper: Housekeeper,
-        clock: Clock,
         *,
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
-        topics: TopicsFile,
-        own: OwnRecordings | None = None,
-        reception: Reception | None = None,
-        required: Sequence[Required] = (),
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
-        self._clock = clock
+        self._reception = orders.reception
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
-        self._events = EventLog(clock)
-        self._reception = reception or Reception(reader)
-        self._heartbeat = HeartbeatWriter(
-            orders.bag_dir,
-            HEARTBEAT_S,
-            clock,
-            self._events,
-            house=housekeeper.status,
-            topics=topics,
-            reception=self._reception,
-            advice=orders.advice,
-        )
-        self._sessions = RecordingSessions(
-            orders,
-            start_child,
-            self._announce,
-            reader,
-            self._events,
-            own=own or OwnRecordings(orders.bag_dir),
-            reception=self._reception,
-            topics=topics,
-        )
-        self._topics = topics
-        self._topic_watch = TopicWatch(required)
+        self._events = EventLog(orders.clock)
+        self._sessions = RecordingSessions(orders, self._announce, self._note_restart, self._events)
+        self._topic_watch = TopicWatch(orders, self._events)
+        self._beat: Heartbeat | None = None
         self._backoff = Backoff()
         self._rotation_backoff = Backoff()
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
-        self._unknown = frozenset[str]()
-        self._not_offered = frozenset[str]()
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
@@ -188,8 +141,8 @@ class Supervisor:
         self._run_tasks(now)
         if self._is_due("beat", HEARTBEAT_S, now):
             self._write_heartbeat()
-        elif not self._disk.away:
-            self._heartbeat.write_if_changed(self._state, self._sessions)
+        else:
+            self._write_heartbeat(only_changes=True)
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -207,26 +160,27 @@ class Supervisor:
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
-        # The names are those of the documented log event.
-        tasks: dict[str, Callable[[ClockReading], object]] = {
-            "disk": self._check_disk,
-            "look": self._observe,
-            "deaths": self._check_exits,
-            "space": self._check_space,
-            "takeover": self._check_handover,
-            "list": self._check_list,
-            "rotation": self._check_rotation,
-            "restart": self._check_restart,
-            "types": self._check_types,
-            "offers": self._check_offers,
-            "topics": self._check_topics,
-            "reap": self._sessions.collect_ended,
-            "recorded": self._note_recorded,
-            "house": self._apply_retention,
-            "moments": self._keep_moments,
-            "screen": self._screen,
-        }
-        for name, task in tasks.items():
+        # The names are those of the documented log event. How often each is due, in seconds, and
+        # whether it needs the disk of the bag directory.
+        tasks: tuple[tuple[str, float, bool, Callable[[ClockReading], object]], ...] = (
+            ("disk", 0.0, False, self._check_disk),
+            ("look", OBSERVE_S, False, self._observe),
+            ("deaths", 0.0, False, self._check_exits),
+            ("space", SPACE_S, True, self._check_space),
+            ("takeover", 0.0, False, self._check_handover),
+            ("list", LIST_S, False, self._check_list),
+            ("rotation", 0.0, False, self._check_rotation),
+            ("restart", 0.0, True, self._check_restart),
+            ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
+            ("reap", 0.0, False, self._sessions.collect_ended),
+            ("recorded", 0.0, False, self._note_recorded),
+            ("house", 0.0, False, self._apply_retention),
+            ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
+            ("screen", SCREENING_S, True, self._screen),
+        )
+        for name, every_s, needs_disk, task in tasks:
+            if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
+                continue
             try:
                 task(now)
             except OSError as error:
@@ -235,14 +189,13 @@ class Supervisor:
                     self._events.fail("supervision_failed", str(error), task=name)
 
     def _observe(self, now: ClockReading) -> None:
-        if self._is_due("observe", OBSERVE_S, now):
-            closed = self._sessions.observe(now)
-            self._splits_closed |= closed
-            current = self._sessions.current
-            if current is not None and current.splits.messages:
-                self._backoff.succeeded()
-                if closed:
-                    self._events.recorded()
+        closed = self._sessions.observe(now)
+        self._splits_closed |= closed
+        current = self._sessions.current
+        if current is not None and current.splits.messages:
+            self._backoff.succeeded()
+            if closed:
+                self._events.recorded()
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
@@ -263,8 +216,6 @@ class Supervisor:
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
         deaths = self._sessions.handle_exits(now)
-        for first, how in self._sessions.take_interruptions():
-            self._housekeeper.note_restart(first, how)
         for _ in range(deaths):
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             self._postpone("restart", self._backoff.failed(), now)
@@ -276,51 +227,35 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        if self._disk.away or not self._is_due("space", SPACE_S, now):
-            return
-        free = self._free_bytes()
+        free, least = self._free_bytes(), self._orders.min_free_bytes
+        # More than what it was paused for.
+        enough = round(least * RESUME_FACTOR)
         if free is None:
             return
-        action = self._space_action(free)
-        if action is SpaceAction.MAKE_ROOM:
-            self._room_requested = True
-            self._make_room()
-            free = self._free_bytes() or 0
-            action = self._space_action(free)
-        if action is SpaceAction.STAY_PAUSED and self._is_due("room", QUIET_RETENTION_S, now):
-            # Bags that were being written when recording was paused may be deleted by now.
-            self._make_room()
-        if action is SpaceAction.PAUSE:
-            self._pause(now, free)
-        elif action is SpaceAction.RESUME:
+        if self._paused and free >= enough:
             self._paused = False
             self._postpone("restart", 0.0, now)
             self._events.info("recording_resumed", free_bytes=free)
-        elif action is SpaceAction.NONE:
-            self._room_requested = False
-
-    def _space_action(self, free: int) -> SpaceAction:
-        return space_action(
-            free,
-            self._orders.min_free_bytes,
-            paused=self._paused,
-            room_requested=self._room_requested,
-            making_room=self._housekeeper.is_making_room(),
-        )
-
-    def _make_room(self) -> None:
-        self._housekeeper.make_room(resume_bytes(self._orders.min_free_bytes))
-
-    def _pause(self, now: ClockReading, free: int) -> None:
-        self._paused = True
-        self._sessions.end_all(now)
-        self._events.fail(
-            "recording_paused",
-            f"recording is paused: {free} bytes are free on the disk, and "
-            f"{self._orders.min_free_bytes} are required (retention.min_free_gb); it resumes "
-            f"by itself at {resume_bytes(self._orders.min_free_bytes)}",
-        )
-        self._write_heartbeat()
+        elif self._paused:
+            if self._is_due("room", QUIET_RETENTION_S, now):
+                # Bags that were being written when recording was paused may be deleted by now.
+                self._housekeeper.make_room(enough)
+        else:
+            if free < least and not self._room_requested:
+                self._housekeeper.make_room(enough)
+                free = self._free_bytes() or 0
+            self._room_requested = free < least
+            # Room that is being made is waited for while half of it is free.
+            waits = self._housekeeper.is_making_room() and free >= least // 2
+            if free < least and not waits:
+                self._paused = True
+                self._sessions.end_all(now)
+                self._events.fail(
+                    "recording_paused",
+                    f"recording is paused: {free} bytes are free on the disk, and {least} are "
+                    f"required (retention.min_free_gb); it resumes by itself at {enough}",
+                )
+                self._write_heartbeat()
 
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
@@ -369,28 +304,24 @@ class Supervisor:
             report = self._events.warn if resubscribe.is_fault else self._events.note
             report(resubscribe.event, resubscribe.sentence, recording=current.name)
 
-    def _check_list(self, now: ClockReading) -> None:
+    def _check_list(self, _: ClockReading) -> None:
         """Has a new recording begin where the list of topics was changed."""
-        if not self._is_due("list", LIST_S, now):
-            return
-        before = self._topics.selection.listed
-        if self._topics.look():
-            listed_now = self._topics.selection.listed
+        before = self._orders.topics.selection.listed
+        if self._orders.topics.look():
+            listed_now = self._orders.topics.selection.listed
             self._rotate_now |= self._sessions.current is not None
             self._events.info(
                 "topics_changed",
                 added=sorted({*listed_now} - {*before}),
                 dropped=sorted({*before} - {*listed_now}),
             )
-        if self._topics.refused is None:
+        if self._orders.topics.refused is None:
             self._events.resolve("topics_refused", "")
         else:
-            self._events.fail_once("topics_refused", "", self._topics.refused)
+            self._events.fail_once("topics_refused", "", self._orders.topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
-        if self._sessions.current is not None or self._paused or self._disk.away:
-            return
-        if not self._is_due("restart", 0.0, now):
+        if self._sessions.current is not None or self._paused:
             return
         try:
             self._begin(now)
@@ -398,97 +329,11 @@ class Supervisor:
             self._events.fail("recorder_not_started", str(error))
             self._postpone("restart", self._backoff.failed(), now)
 
-    def _check_types(self, now: ClockReading) -> None:
-        """Names every topic that is not recorded, where some are of a type that is not known.
-
-        `ros2 bag record` names the first topic of each unknown type, and no other.
-        """
-        current, selection = self._sessions.current, self._topics.selection
-        if current is None or current.age_s(now) < TYPES_S:
-            return
-        # The list may have changed since the child was started.
-        unknown = frozenset(filter(selection.matches, current.of_unknown_type))
-        if not unknown <= self._unknown:
-            self._unknown = unknown
-            others = sorted({*selection.exact} - unknown - current.subscribed)
-            listed_too = f", nor these, if anybody offers them: {', '.join(others)}"
-            self._events.warn(
-                "topics_not_recorded",
-                f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
-                "type: name the workspace that defines it in recorder.setup_files. It names one "
-                "topic of each type: of those that a glob selects, others of the same type are "
-                f"not recorded either{listed_too if others else ''}",
-                recording=current.name,
-            )
-
-    def _check_offers(self, now: ClockReading) -> None:
-        """Names topics that no publisher offers: none did since the start, or none does any more.
-
-        Each is named once; one that comes back may be named again.
-        """
-        current = self._sessions.current
-        if current is None or current.age_s(now) < WAITING_S or self._sessions.handover is not None:
-            return
-        missing = frozenset(self._heartbeat.missing(self._sessions))
-        if new := missing - self._not_offered:
-            self._events.remark(
-                "topic_not_offered",
-                f"no publisher offers {', '.join(sorted(new))}: recorded as soon as one does; "
-                "compare topics.yaml with the robot's topics",
-                topics=sorted(new),
-            )
-        self._not_offered |= missing
-        offered = self._heartbeat.offered - current.subscribed - OWN_TOPICS
-        gone = frozenset(filter(self._topics.selection.matches, offered))
-        if new := gone - self._heartbeat.gone:
-            self._events.remark(
-                "topic_silent",
-                f"no publisher offers {', '.join(sorted(new))} any more",
-                topics=sorted(new),
-            )
-        self._heartbeat.gone = gone
-
-    def _check_topics(self, now: ClockReading) -> None:
-        """Looks for topics that are offered and not recorded, and for required ones."""
-        current = self._sessions.current
-        if current is None or not self._is_due("topics", TOPICS_S, now):
-            return
-        running, sessions = self._sessions.running, self._sessions
-        split_s = self._orders.split_duration_s
-        # What comes slowly is written when its split is closed.
-        idle_s = max(0.0, now.monotonic_s - sessions.grew_s - IDLE_SPLITS * split_s)
-        known_s = sessions.closed_s if current.splits.bytes_written else now.monotonic_s - split_s
-        silent, rates_hz = self._reception.arrivals(ns_from_unix(idle_s))
-        found = self._topic_watch.look(
-            Seen(
-                now_s=now.monotonic_s,
-                offered=frozenset[str]().union(*(each.subscribed for each in running)),
-                heard=sessions.heard,
-                unknown=frozenset[str]().union(*(each.of_unknown_type for each in running)),
-                known_s=known_s,
-                silent=silent,
-                rates_hz=rates_hz,
-                settled=len(running) == 1 and current.age_s(now) >= TYPES_S,
-            )
-        )
-        self._report_shortfall(self._heartbeat.shortfall, found)
-        self._heartbeat.shortfall = found
-
-    def _report_shortfall(self, before: Shortfall, found: Shortfall) -> None:
-        if new := sorted({*found.unheard} - {*before.unheard}):
-            sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
-            self._events.remark("topics_unheard", sentence, topics=new)
-        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
-            sentence = f"regular until now, and silent: {listed(new)}"
-            self._events.remark("topics_stopped", sentence, topics=new)
-        if found.required_missing and not before.required_missing:
-            sentence = f"required, and not recorded: {listed(found.required_missing)}"
-            self._events.remark("required_missing", sentence)
-
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
         self._reception.skip_latched(())
         self._sessions.begin(now)
+        self._topic_watch.began(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
 
     def _note_recorded(self, now: ClockReading) -> None:
@@ -506,13 +351,8 @@ class Supervisor:
         self._splits_closed = False
         self._housekeeper.apply()
 
-    def _keep_moments(self, now: ClockReading) -> None:
-        if not self._disk.away and self._is_due("moments", MOMENTS_S, now):
-            self._housekeeper.keep_moments()
-
-    def _screen(self, now: ClockReading) -> None:
-        if not self._disk.away and self._is_due("screening", SCREENING_S, now):
-            self._housekeeper.screen([each.name for each in self._sessions.running])
+    def _screen(self, _: ClockReading) -> None:
+        self._housekeeper.screen([session.name for session in self._sessions.running])
 
     def _announce(self, name: str) -> None:
         """Names a recording before anything of it exists.
@@ -521,13 +361,51 @@ class Supervisor:
             RecorderError: it must not begin.
         """
         self._housekeeper.announce(name)
-        if not self._disk.away:
-            self._heartbeat.write(self._state, self._sessions, announced=name)
+        self._write_heartbeat(announced=name)
 
-    def _write_heartbeat(self, state: RecorderState | None = None) -> None:
+    def _note_restart(self, first: Ns, how: Interruption) -> None:
+        # What hangs when everything is ended is followed by no other recording.
+        if not self.stopped:
+            self._housekeeper.note_restart(first, how)
+
+    def _write_heartbeat(
+        self,
+        state: RecorderState | None = None,
+        *,
+        announced: str | None = None,
+        only_changes: bool = False,
+    ) -> None:
+        """Writes a heartbeat; one that cannot be written is reported and stops nothing.
+
+        Args:
+            state: what it says that the recorder does; None for what it does.
+            announced: a recording that is about to be begun.
+            only_changes: write nothing unless more than times and amounts changed.
+        """
         # While the bags' own disk is unmounted nothing is written to the disk below it.
-        if not self._disk.away:
-            self._heartbeat.write(state or self._state, self._sessions)
+        if self._disk.away:
+            return
+        last, now, state = self._beat, self._orders.clock.now(), state or self._state
+        beat = heartbeat_of(
+            self._orders,
+            self._events,
+            self._housekeeper.status(),
+            self._sessions,
+            self._topic_watch,
+            now=now,
+            state=state,
+            since=last.since if last is not None and last.state is state else now,
+            announced=announced,
+        )
+        if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
+            return
+        self._beat = beat
+        try:
+            write_heartbeat(self._bag_dir, beat)
+        except RecorderError as error:
+            self._events.fail_once("heartbeat_not_written", "", str(error))
+        else:
+            self._events.resolve("heartbeat_not_written", "")
 
     @property
     def _state(self) -> RecorderState:
@@ -535,7 +413,7 @@ class Supervisor:
             return RecorderState.PAUSED
         if not self.is_recording:
             return RecorderState.STARTING
-        waits = self._sessions.waiting_for is not None
+        waits = self._topic_watch.waiting_for is not None
         return RecorderState.WAITING if waits else RecorderState.RECORDING
 
     def _free_bytes(self) -> int | None:
@@ -559,7 +437,11 @@ class Supervisor:
         self._due_s[task] = now.monotonic_s + wait_s
 
     def _now(self) -> ClockReading:
-        return ClockReading(self._monotonic(), self._clock.now())
+        return ClockReading(self._monotonic(), self._orders.clock.now())
+
+
+def _without_amounts(beat: Heartbeat) -> Heartbeat:
+    return replace(beat, updated=0, bytes_written=0, counted_bytes=None, state_bytes=0)
 
 
 def make_bag_dir(bag_dir: Path) -> None:

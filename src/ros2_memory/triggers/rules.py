@@ -16,7 +16,6 @@ How the stream is cut into calls changes nothing: `reach` says only how far it i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -26,7 +25,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, MutableMapping
+    from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.timebase import Ns
@@ -36,12 +35,13 @@ GLOB_MARKS: Final = "*?["
 """What makes a topic of a rule a glob."""
 
 
-class RuleKind(StrEnum):
-    """What a rule watches."""
+class Firing(NamedTuple):
+    """A rule fired at a log time, for a match that began at `first` on a topic."""
 
-    MESSAGE = "message"
-    SILENT = "silent"
-    RECORDER_RESTART = "recorder_restart"
+    rule: str
+    topic: str
+    first: Ns
+    at: Ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,9 +50,8 @@ class Rule:
 
     Attributes:
         name: unique among the rules.
-        kind: what it watches.
         topic: the name or glob of the topics; None for a restart of the recorder.
-        condition: what a message must meet; None for the other kinds.
+        condition: what a message must meet; None for a rule over silences, and for a restart.
         hold: for how long the condition, or the silence, must hold before it fires.
         before: how much is kept of the time before the match began.
         after: how much is kept of the time after it fired.
@@ -62,7 +61,6 @@ class Rule:
     """
 
     name: str
-    kind: RuleKind = RuleKind.MESSAGE
     topic: str | None = None
     condition: Condition | None = None
     hold: Ns = 0
@@ -84,41 +82,32 @@ class Rule:
         """Returns what is kept of a match that began at `first` and made the rule fire."""
         return TimeWindow(max(first - self.before, MIN_NS + 1), min(fired + self.after, MAX_NS - 1))
 
-
-class Firing(NamedTuple):
-    """A rule fired at a log time, for a match that began at `first` on a topic."""
-
-    rule: str
-    topic: str
-    first: Ns
-    at: Ns
-
-
-class RuleFold:
-    """The state of one rule.
-
-    Args:
-        rule: a rule over messages or silences.
-        runs: the matches that go on, by topic, changed in place; for a silence, since when each
-            topic is silent.
-    """
-
-    def __init__(self, rule: Rule, runs: MutableMapping[str, RunRecord]) -> None:
-        self._rule = rule
-        self._runs = runs
-        self._silences = rule.kind is RuleKind.SILENT
-
     def take(
-        self, topic: str, time: Ns, *, matches: bool | None, latched: bool = False
+        self,
+        runs: MutableMapping[str, RunRecord],
+        topic: str,
+        time: Ns,
+        *,
+        matches: bool | None,
+        latched: bool = False,
     ) -> Firing | None:
-        """Takes the next message; `matches` is None where it cannot be decoded."""
-        run = self._runs.get(topic)
+        """Takes the next message of a topic, and changes the matches that go on.
+
+        Args:
+            runs: the matches that go on, by topic; for a rule over silences, since when each topic
+                is silent.
+            topic: the topic of the message.
+            time: its log time.
+            matches: whether it meets the condition; None where it cannot be decoded.
+            latched: whether its value holds until the next message.
+        """
+        run = runs.get(topic)
         if run is not None and time < run.last - SILENCE_NS:
             run = None  # the clock was set back
-        if self._silences:
+        if self.condition is None:
             fired = None if run is None else self._fire(topic, run, time)
             spoke = time if run is None else max(time, run.last)
-            self._runs[topic] = RunRecord(spoke, spoke)
+            runs[topic] = RunRecord(spoke, spoke)
             return fired
         fired = None
         if run is not None and run.lasts:
@@ -131,28 +120,24 @@ class RuleFold:
         elif matches and run is None:
             run = RunRecord(time, time, lasts=latched)
         if run is None:
-            self._runs.pop(topic, None)
+            runs.pop(topic, None)
             return fired
-        self._runs[topic] = run
+        runs[topic] = run
         run.last = max(run.last, time)
         if matches:
             fired = fired or self._fire(topic, run, time)
         return fired
 
-    def reach(self, until: Ns) -> Iterator[Firing]:
+    def reach(self, runs: Mapping[str, RunRecord], until: Ns) -> Iterator[Firing]:
         """Yields what fires because nothing more came before a moment."""
-        for topic, run in self._runs.items():
-            if self._silences or run.lasts:
+        for topic, run in runs.items():
+            if self.condition is None or run.lasts:
                 fired = self._fire(topic, run, until)
                 if fired is not None:
                     yield fired
 
-    def end(self) -> None:
-        """Ends what goes on: the recorder did not run on."""
-        self._runs.clear()
-
     def _fire(self, topic: str, run: RunRecord, time: Ns) -> Firing | None:
-        if run.fired or time - run.first < self._rule.hold:
+        if run.fired or time - run.first < self.hold:
             return None
         run.fired = True
-        return Firing(self._rule.name, topic, run.first, run.first + self._rule.hold)
+        return Firing(self.name, topic, run.first, run.first + self.hold)

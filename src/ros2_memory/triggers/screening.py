@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from copy import deepcopy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import structlog
 
@@ -28,7 +28,6 @@ from ros2_memory.bag_dir.layout import (
     METADATA_FILE,
     SCREENED_FILE,
     bag_kind,
-    named_start,
     split_number,
 )
 from ros2_memory.bag_dir.metadata_yaml import correct
@@ -60,7 +59,7 @@ from ros2_memory.triggers.exclusion import (
     add_message,
     excluded_intervals,
 )
-from ros2_memory.triggers.splits import LEAST_NEAR_NS
+from ros2_memory.triggers.splits import horizons
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -82,21 +81,12 @@ RETRY_S: Final = 30.0
 """How long until a split that could not be cut is tried again."""
 REMIND_S: Final = 600.0
 """How long until a rule that still cannot be evaluated is logged again."""
-_SPLITS_NEAR: Final = 3
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class _UselessRuleError(EpisodicError):
     """A rule that was never evaluated cannot be evaluated on a split either."""
-
-
-class _Ready(NamedTuple):
-    """A split that can be released: where it is, and what it holds."""
-
-    recording: str
-    path: Path
-    summary: BagSummary
 
 
 class Screening:
@@ -133,7 +123,7 @@ class Screening:
         self._reader = reader
         self._extractor = extractor
         self._writer = writer
-        self._near = max(LEAST_NEAR_NS, _SPLITS_NEAR * ns_from_unix(split_duration_s))
+        self._split = ns_from_unix(split_duration_s)
         self._margin = max((each.margin for each in rules), default=0)
         self._lock = threading.Lock()
         self._state: ScreenState | None = None
@@ -216,29 +206,27 @@ class Screening:
             if (self._bag_dir / name).exists()
         }
         self._commit(before, state, names)
-        cleared: list[tuple[_Ready, list[Excluded]]] = []
-        now_s = self._monotonic()
+        before, now_s = deepcopy(state), self._monotonic()
         ready = [
-            each
-            for each in self._ready(state, closed, live)
-            if self._retry_s.get(each.path, now_s) <= now_s
+            (path, summary)
+            for path, summary in self._ready(state, closed, live)
+            if self._retry_s.get(path, now_s) <= now_s
         ]
-        for each in ready[:MOST_AT_ONCE]:
+        stretches = self._stretches(state, live) if ready else []
+        for path, summary in ready[:MOST_AT_ONCE]:
             try:
-                cleared.append((each, self._cut(each, state, live)))
+                self._cut(path, summary, stretches, state.excluded)
             except (EpisodicError, OSError) as error:
-                self._report(each.path, error)
-                self._retry_s[each.path] = now_s + RETRY_S
-        before = deepcopy(state)
-        for split, stretches in cleared:
-            summary, screen = split.summary, state.recordings[split.recording]
-            screen.files[split.path.name] = FileStep.RELEASED
+                self._report(path, error)
+                self._retry_s[path] = now_s + RETRY_S
+                continue
+            state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
             if not summary.empty:
                 state.excluded = add_excluded(
                     state.excluded, stretches, summary.start, summary.end
                 )[-MOST_EXCLUDED:]
-            self._problems.pop(f"{split.recording}/{split.path.name}", None)
-            self._retry_s.pop(split.path, None)
+            self._problems.pop(f"{path.parent.name}/{path.name}", None)
+            self._retry_s.pop(path, None)
         for name in names:
             if name not in live:
                 self._end(name, state)
@@ -370,32 +358,17 @@ class Screening:
         state: ScreenState,
         closed: dict[str, list[tuple[Path, BagSummary]]],
         live: Collection[str],
-    ) -> list[_Ready]:
+    ) -> list[tuple[Path, BagSummary]]:
         """Returns the splits that no later message can affect."""
-        known: dict[str, Ns] = {}
-        for name in live:
-            screen = state.recordings.get(name)
-            end = None if screen is None else screen.end
-            begun = named_start(name) if end is None else end
-            if begun is not None:
-                known[name] = begun - OUT_OF_ORDER_NS
-        ready: list[_Ready] = []
-        for name, files in closed.items():
-            end = state.recordings[name].end or 0
-            horizon = min(
-                (
-                    each
-                    for other, each in known.items()
-                    if other == name or abs(each - end) <= self._near
-                ),
-                default=MAX_NS,
-            )
-            ready += (
-                _Ready(name, path, summary)
-                for path, summary in files
-                if summary.empty or summary.end + self._margin < horizon
-            )
-        return ready
+        ends = {name: state.recordings[name].end or 0 for name in closed}
+        written = {name: state.recordings[name].end for name in live if name in state.recordings}
+        until = horizons(ends, dict.fromkeys(live) | written, self._split)
+        return [
+            (path, summary)
+            for name, files in closed.items()
+            for path, summary in files
+            if summary.empty or summary.end + self._margin < until[name]
+        ]
 
     def _stretches(self, state: ScreenState, live: Collection[str]) -> list[Excluded]:
         """Returns what is excluded of the time of recordings that are not done, or were last."""
@@ -416,17 +389,21 @@ class Screening:
             found += excluded_intervals(rule, recordings)
         return found
 
-    def _cut(self, ready: _Ready, state: ScreenState, live: Collection[str]) -> list[Excluded]:
-        """Cuts the excluded data out of a split; returns the stretches that decided it.
+    def _cut(
+        self,
+        path: Path,
+        summary: BagSummary,
+        stretches: Sequence[Excluded],
+        before: Sequence[Excluded],
+    ) -> None:
+        """Cuts the excluded data out of a split; see `Cut`.
 
         Raises:
             EpisodicError: it cannot be rewritten.
             OSError: likewise, or it has gone.
         """
-        path, summary = ready.path, ready.summary
-        stretches = self._stretches(state, live)
         latched = {each.topic for each in summary.topics if each.latched}
-        cut = Cut(stretches, state.excluded, latched)
+        cut = Cut(stretches, before, latched)
         topics = {
             each.topic for each in summary.topics if cut.touches(each.topic, each.first, each.last)
         }
@@ -439,7 +416,7 @@ class Screening:
             if topic in latched:
                 shown = (published or each.log_time, cut.takes_always(each.log_time, published))
                 newest[topic] = max(shown, newest.get(topic, shown))
-        if gone and split_number(ready.recording, path.name) is None:
+        if gone and split_number(path.parent.name, path.name) is None:
             raise BagError(str(path), "it is not named as a split of its recording")
         if gone:
             with path.open("rb") as old:
@@ -456,13 +433,12 @@ class Screening:
                     pass
             _log.info(
                 "messages_excluded",
-                recording=ready.recording,
+                recording=path.parent.name,
                 file=path.name,
                 messages=gone.total(),
             )
         returning = {topic for topic, (_, is_excluded) in newest.items() if is_excluded}
         self._excluded_latched = (self._excluded_latched - newest.keys()) | returning
-        return stretches
 
     def _end(self, name: str, state: ScreenState) -> None:
         """Marks an ended recording as done once nothing of it is held back."""

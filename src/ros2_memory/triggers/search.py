@@ -1,16 +1,13 @@
 """Searches closed splits for what makes rules fire.
 
-Only bags with topics that a rule names are opened, and only messages of these are decoded. A rule
-over silences needs the times in a bag's summary alone, unless the bag is so long that a silence
-could lie within it.
+Only bags with topics that a rule names are opened, and only messages of these are decoded; a rule
+over silences needs their times alone.
 """
 
 from __future__ import annotations
 
 import hashlib
 import heapq
-from functools import partial
-from itertools import count
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.conditions import refusal_for
@@ -18,13 +15,13 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.triggers.rules import RuleFold, RuleKind
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.state_files import TriggerState
-    from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.triggers.rules import Firing, Rule
@@ -62,7 +59,7 @@ class SplitSearch:
     ) -> None:
         self._reader = reader
         self._extractor = extractor
-        self._rules = [each for each in rules if each.kind is not RuleKind.RECORDER_RESTART]
+        self._rules = [rule for rule in rules if rule.topic is not None]
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 
@@ -77,79 +74,78 @@ class SplitSearch:
         Raises:
             BagUnreachableError: the disk fails; the state is useless then.
         """
-        records = {
-            each.name: state.rules.setdefault(each.name, RuleRecord()) for each in self._rules
-        }
-        folds = {each.name: RuleFold(each, records[each.name].runs) for each in self._rules}
-        if not chain.goes_on:
-            for fold in folds.values():
-                fold.end()
+        for rule in self._rules:
+            record = state.rules.setdefault(rule.name, RuleRecord())
+            if not chain.goes_on:
+                record.runs.clear()  # the recorder did not run on
         fired: list[Firing] = []
         stopped: Ns | None = None
         previous: Ns | None = None
-        for event in _merged(self._opened(part, records) for part in chain.parts):
+        bags = (
+            self._events(bag, part, state)
+            for part in chain.parts
+            for bag in part.bags
+            if any(self._rules_of(topic.topic) for topic in bag.summary.topics)
+        )
+        for event in heapq.merge(*bags, key=lambda event: event.time):
+            if not event.topic:
+                continue
             if previous is not None and event.time > previous and is_over():
                 stopped = event.time
                 break
             previous = event.time
-            fired += self._take(event, folds, records, state)
-        until = max(each.window.stop for each in chain.parts)
+            fired += self._take(event, state)
+        until = max(part.window.stop for part in chain.parts)
         known = until if stopped is None else min(stopped, until)
-        for fold in folds.values():
-            fired += fold.reach(known)
+        for rule in self._rules:
+            fired += rule.reach(state.rules[rule.name].runs, known)
         return fired, stopped
 
-    def _take(
-        self,
-        event: _Event,
-        folds: dict[str, RuleFold],
-        records: dict[str, RuleRecord],
-        state: TriggerState,
-    ) -> Iterator[Firing]:
-        record = event.record
-        rules = self._rules_of(event.topic)
+    def _take(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
+        record, rules = event.record, self._rules_of(event.topic)
         latched = record is not None and record.channel.latched
         if record is not None and latched:
-            rules = tuple(each for each in rules if each.kind is not RuleKind.SILENT)
+            rules = tuple(rule for rule in rules if rule.condition is not None)
             if _is_repeat(event, record, state):
                 return
-        value, error = self._value(record, rules)
+        value: JsonValue | UndecodableError = None
+        if record is not None and any(rule.condition is not None for rule in rules):
+            try:
+                value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+            except UndecodableError as error:
+                value = error
         for rule in rules:
             matches: bool | None = False
             if rule.condition is not None and record is not None:
-                matches = None if error is not None else rule.condition.matches(value)
-                self._report(rule, event.topic, matches, error or value, records[rule.name])
-            fired = folds[rule.name].take(event.topic, event.time, matches=matches, latched=latched)
+                matches = self._test(rule, rule.condition, event.topic, value, state)
+            runs = state.rules[rule.name].runs
+            fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
             if fired is not None:
                 yield fired
 
-    def _value(
-        self, record: Record | None, rules: Sequence[Rule]
-    ) -> tuple[JsonValue, UndecodableError | None]:
-        """Returns what the conditions of rules are tested on, or why there is nothing."""
-        if record is None or all(each.condition is None for each in rules):
-            return None, None
-        try:
-            return self._extractor.exact(self._reader.decode(record), record.channel.type), None
-        except UndecodableError as error:
-            return None, error
-
-    def _report(
+    def _test(
         self,
         rule: Rule,
+        condition: Condition,
         topic: str,
-        matches: bool | None,
-        seen: JsonValue | UndecodableError,
-        record: RuleRecord,
-    ) -> None:
-        """Notes why messages cannot make a rule fire; whether any could, once for each topic."""
-        if isinstance(seen, UndecodableError):
-            record.problem = f"not all could be searched: {seen}"
-        elif (rule.name, topic) not in self._tested and rule.condition is not None:
+        value: JsonValue | UndecodableError,
+        state: TriggerState,
+    ) -> bool | None:
+        """Returns whether a value meets a condition; None where it could not be decoded.
+
+        Notes why messages cannot make the rule fire; whether any could, once for each topic.
+        """
+        known = state.rules[rule.name]
+        if isinstance(value, UndecodableError):
+            known.problem = f"not all could be searched: {value}"
+            return None
+        matches = condition.matches(value)
+        if (rule.name, topic) not in self._tested:
             self._tested.add((rule.name, topic))
-            if not matches and rule.condition.can_be_refused:
-                refusal = refusal_for(rule.condition, seen)
-                record.problem = None if refusal is None else f"{topic}: {refusal}"
+            if not matches and condition.can_be_refused:
+                refusal = refusal_for(condition, value)
+                known.problem = None if refusal is None else f"{topic}: {refusal}"
+        return matches
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
         known = self._watching.get(topic)
@@ -158,63 +154,39 @@ class SplitSearch:
             self._watching[topic] = known
         return known
 
-    def _opened(
-        self, part: SearchPart, records: dict[str, RuleRecord]
-    ) -> list[tuple[Ns, Callable[[], Iterator[_Event]]]]:
-        """Returns the bags of a part that matter, each with the time from which it matters."""
-        return [
-            (max(bag.start, part.window.start), partial(self._events, bag, part, records))
-            for bag in part.bags
-            if any(self._rules_of(each.topic) for each in bag.summary.topics)
-        ]
-
-    def _events(
-        self, bag: BagFile, part: SearchPart, records: dict[str, RuleRecord]
-    ) -> Iterator[_Event]:
+    def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.
 
-        What cannot be read of it is reported as a problem of the rules.
+        Before them an event without a topic, at which the bag has not been opened yet. What cannot
+        be read of it is reported as a problem of the rules.
         """
-        topics = list(dict.fromkeys(each.topic for each in bag.summary.topics))
-        latched = {each.topic for each in bag.summary.topics if each.latched}
+        yield _Event(max(bag.start, part.window.start), "", part.recording, None)
+        latched = {topic.topic for topic in bag.summary.topics if topic.latched}
+        watched = {topic.topic: self._rules_of(topic.topic) for topic in bag.summary.topics}
         read: list[str] = []
         times: list[tuple[Ns, str]] = []
-        for topic in topics:
-            rules = self._rules_of(topic)
-            if not rules:
-                continue
-            if topic not in latched and all(each.condition is None for each in rules):
-                times += ((time, topic) for time in self._times(rules, bag, topic, part.window))
-            else:
-                read.append(topic)
         try:
-            found = self._reader.records(bag.path, read, part.window) if read else iter(())
+            for topic, rules in watched.items():
+                if topic in latched or any(rule.condition is not None for rule in rules):
+                    read += [topic] if rules else []
+                elif rules:
+                    found = self._reader.log_times(bag.path, topic, part.window)
+                    times += ((time, topic) for time in found)
+            records = self._reader.records(bag.path, read, part.window) if read else ()
             yield from heapq.merge(
-                (_Event(each.log_time, each.channel.topic, part.recording, each) for each in found),
+                (
+                    _Event(each.log_time, each.channel.topic, part.recording, each)
+                    for each in records
+                ),
                 (_Event(time, topic, part.recording, None) for time, topic in sorted(times)),
                 key=lambda event: event.time,
             )
         except BagUnreachableError:
             raise
         except BagError as error:
-            for topic in topics:
-                for rule in self._rules_of(topic):
-                    records[
-                        rule.name
-                    ].problem = f"not all could be searched: {bag.path.name}: {error.reason}"
-
-    def _times(
-        self, rules: Sequence[Rule], bag: BagFile, topic: str, window: TimeWindow
-    ) -> Sequence[Ns]:
-        """Returns the times of a topic's messages, as far as they can matter to rules."""
-        spans = [(each.first, each.last) for each in bag.summary.topics if each.topic == topic]
-        first, last = min(each[0] for each in spans), max(each[1] for each in spans)
-        shortest = min(
-            (each.hold for each in rules if each.kind is RuleKind.SILENT), default=last - first + 1
-        )
-        if window.covers(first, last) and last - first < shortest:
-            return (first, last) if last > first else (first,)
-        return self._reader.log_times(bag.path, topic, window)
+            problem = f"not all could be searched: {bag.path.name}: {error.reason}"
+            for rule in {rule.name for rules in watched.values() for rule in rules}:
+                state.rules[rule].problem = problem
 
 
 def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
@@ -244,29 +216,3 @@ def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
     if not is_repeat:
         mark.payload = payload
     return is_repeat
-
-
-def _merged(
-    recordings: Iterable[list[tuple[Ns, Callable[[], Iterator[_Event]]]]],
-) -> Iterator[_Event]:
-    """Merges the events of bags in order of time; a bag is opened when its time has come."""
-    bags = sorted((each for part in recordings for each in part), key=lambda each: each[0])
-    number = count()
-    waiting: list[tuple[Ns, int, _Event, Iterator[_Event]]] = []
-    at = 0
-    while waiting or at < len(bags):
-        while at < len(bags) and (not waiting or bags[at][0] <= waiting[0][0]):
-            events = bags[at][1]()
-            at += 1
-            first = next(events, None)
-            if first is not None:
-                heapq.heappush(waiting, (first.time, next(number), first, events))
-        if not waiting:
-            return
-        _, order, event, events = waiting[0]
-        yield event
-        following = next(events, None)
-        if following is None:
-            heapq.heappop(waiting)
-        else:
-            heapq.heapreplace(waiting, (following.time, order, following, events))

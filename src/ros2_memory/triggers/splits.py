@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -59,12 +59,14 @@ def chains_to_search(
         previous: gives the recording that one took over from; None where it took over from none.
         split_ns: how long one bag is.
     """
-    limits = _limits(closed, live, split_ns)
+    ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
+    written = {name: ends[name] if closed.get(name) else None for name in live}
+    limits = horizons(ends, written, split_ns)
     chains: list[SearchChain] = []
     last: str | None = None
     for name, bags in closed.items():
         start = searched.get(name, MIN_NS)
-        window = TimeWindow(start, max(start, limits[name]))
+        window = TimeWindow(start, max(start, min(limits[name], ends[name] + 1)))
         touched = tuple(each for each in bags if window.overlaps(each.start, each.end))
         if window.empty or not touched:
             continue
@@ -79,23 +81,21 @@ def chains_to_search(
     return chains
 
 
-def _limits(
-    closed: Mapping[str, Sequence[BagFile]], live: Collection[str], split_ns: Ns
-) -> dict[str, Ns]:
-    """Returns until when each recording can be searched."""
+def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns) -> dict[str, Ns]:
+    """Returns until when nothing can come any more that affects recordings; MAX_NS for all times.
+
+    Args:
+        ends: where what is closed of each recording ends.
+        live: the same of those that are being written; None where nothing of one is closed.
+        split_ns: how long one bag is.
+    """
+    begun = {name: named_start(name) if end is None else end for name, end in live.items()}
+    known = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
     near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
-    known = {name: _known_until(name, closed.get(name, ())) for name in live}
-    ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
-    limits: dict[str, Ns] = {}
-    for name, end in ends.items():
-        own = known.get(name) if name in live else end + 1
-        others = [each for each in known.values() if each is not None and abs(each - end) <= near]
-        limits[name] = min([end + 1 if own is None else own, *others])
-    return limits
-
-
-def _known_until(recording: str, closed: Sequence[BagFile]) -> Ns | None:
-    """Returns until when a recording that is being written is complete; None if unknown."""
-    end = max((bag.end for bag in closed), default=None)
-    begun = named_start(recording) if end is None else end
-    return None if begun is None else begun - OUT_OF_ORDER_NS
+    return {
+        name: min(
+            (until for other, until in known.items() if other == name or abs(until - end) <= near),
+            default=MAX_NS,
+        )
+        for name, end in ends.items()
+    }

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
-from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
 from ros2_memory.bag_dir.state_files import (
     TRIGGERS,
@@ -28,7 +28,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
-from ros2_memory.triggers.rules import GLOB_MARKS, Firing, RuleKind
+from ros2_memory.triggers.rules import GLOB_MARKS, Firing
 from ros2_memory.triggers.splits import chains_to_search
 
 if TYPE_CHECKING:
@@ -105,16 +105,6 @@ class Triggers:
         with self._lock:
             self._restarts.append((first, at))
 
-    def note_unclean_end(self) -> None:
-        """Records, by the last heartbeat, that the recorder ended without a shutdown.
-
-        Call it before anything is recorded.
-        """
-        last = read_heartbeat(self._bag_dir).heartbeat
-        if last is not None and last.state is not RecorderState.STOPPED:
-            now = self._clock.now()
-            self.note_restart(min(last.updated, now), now)
-
     @property
     def has_restarts(self) -> bool:
         """Whether a restart is still to be evaluated."""
@@ -128,12 +118,41 @@ class Triggers:
             OSError: the state or the list of recordings cannot be read, or the state not written.
         """
         state = deepcopy(self._loaded(snapshot))
+        self._search_closed(state, snapshot)
+        with self._lock:
+            restarts, self._restarts = self._restarts, []
+            deleted, self._deleted = self._deleted, 0
+        for first, at in restarts:
+            for rule in self._rules.values():
+                if rule.topic is None:
+                    self._take(Firing(rule.name, "", first, at), state, snapshot)
+        for name, rule in self._rules.items():
+            self._store(name, state.rules[name], snapshot)
+            if rule.condition is not None:
+                _judge(name, state.rules[name])
+        if deleted:
+            sentence = (
+                f"{counted(deleted, 'bag')} that rules may have needed were deleted to make room "
+                "(retention.max_total_gb, min_free_gb)"
+            )
+            _log.warning("needed_bags_deleted", bags=deleted, reason=sentence)
+            for record in state.rules.values():
+                record.problem = sentence
+        # What lies far back was searched to its end.
+        while len(state.searched) > MOST_SEARCHED:
+            state.before = next(iter(state.searched))
+            del state.searched[state.before]
+        # Even if it cannot be written, what was found is not searched for again.
+        self._is_written &= state == self._state
+        self._state = state
+        if not self._is_written:
+            TRIGGERS.write(self._bag_dir, state)
+            self._is_written = True
+
+    def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> None:
         deadline = self._monotonic() + LOOK_S
-        closed = self._closed(snapshot, state)
-        chains = chains_to_search(
-            closed, self._live(snapshot), state.searched, self._previous, self._split
-        )
-        for chain in chains:
+        closed, live = self._closed(snapshot, state)
+        for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
             fired, stopped = self._search.search(chain, state, lambda: self._monotonic() > deadline)
             for firing in fired:
                 self._take(firing, state, snapshot)
@@ -142,21 +161,6 @@ class Triggers:
                 state.searched[part.recording] = max(stop, part.window.start)
             if stopped is not None:
                 break
-        for first, at in self._taken_restarts():
-            for rule in self._rules.values():
-                if rule.kind is RuleKind.RECORDER_RESTART:
-                    self._take(Firing(rule.name, "", first, at), state, snapshot)
-        for name in self._rules:
-            self._store(name, state.rules[name], snapshot)
-            self._judge(name, state)
-        self._note_lacking(state)
-        _forget_oldest(state)
-        # Even if it cannot be written, what was found is not searched for again.
-        self._is_written &= state == self._state
-        self._state = state
-        if not self._is_written:
-            TRIGGERS.write(self._bag_dir, state)
-            self._is_written = True
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: those not searched, and some time before."""
@@ -166,7 +170,7 @@ class Triggers:
         since = MIN_NS if reached is None else reached - before
         return frozenset(
             bag.file
-            for name, bags in self._closed(snapshot, state).items()
+            for name, bags in self._closed(snapshot, state)[0].items()
             for bag in bags
             if bag.end >= min(state.searched.get(name, MIN_NS), since)
         )
@@ -213,64 +217,40 @@ class Triggers:
                 record.problem = None
 
     def _begun(self, snapshot: Snapshot) -> TriggerState:
-        live = self._live(snapshot)
-        names = [*self._own.names()]
-        state = TriggerState(
-            before=next((each for each in reversed(names) if each not in live), None)
-        )
-        for name, bags in self._closed(snapshot, TriggerState()).items():
-            if name in live:
-                state.searched[name] = max(each.end for each in bags) + 1
-        return state
+        closed, live = self._closed(snapshot, TriggerState())
+        before = (name for name in reversed([*self._own.names()]) if name not in live)
+        searched = {
+            name: max(bag.end for bag in closed[name]) + 1 for name in closed if name in live
+        }
+        return TriggerState(before=next(before, None), searched=searched)
 
-    def _live(self, snapshot: Snapshot) -> frozenset[str]:
-        """Returns the recordings that are being written."""
-        named = read_heartbeat(self._bag_dir).recordings
+    def _closed(
+        self, snapshot: Snapshot, state: TriggerState
+    ) -> tuple[dict[str, list[BagFile]], frozenset[str]]:
+        """Returns the closed bags of recordings that are not finished, in their order.
+
+        With them the recordings that are being written.
+        """
         active = (self._own.name_of(each.path.parent) for each in snapshot.active)
-        return frozenset(named) | frozenset(active)
-
-    def _closed(self, snapshot: Snapshot, state: TriggerState) -> dict[str, list[BagFile]]:
-        """Returns the closed bags of recordings that are not finished, in their order."""
+        live = frozenset((*read_heartbeat(self._bag_dir).recordings, *active))
         names = [*self._own.names()]
         at = {name: number for number, name in enumerate(names)}
         known = [at[name] for name in (state.before, *state.searched) if name in at]
         first = at[state.before] + 1 if state.before in at else min(known, default=0)
         folders = {str(self._bag_dir / name): name for name in names[first:]}
-        live = self._live(snapshot)
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
             if folders.keys().isdisjoint(segment.folders):
                 continue
             for bag in segment.bags:
                 name = folders.get(str(bag.recording))
-                if name is None:
-                    continue
-                if bag.state is BagState.CLOSED or name not in live:
+                if name is not None and (bag.state is BagState.CLOSED or name not in live):
                     closed[name].append(bag)
-        return {name: bags for name, bags in closed.items() if bags}
+        return {name: bags for name, bags in closed.items() if bags}, live
 
     def _previous(self, recording: str) -> str | None:
         handover = read_handover(self._bag_dir / recording).handover
         return handover.previous if handover.state is Counting.COUNTS else None
-
-    def _taken_restarts(self) -> list[tuple[Ns, Ns]]:
-        with self._lock:
-            taken, self._restarts = self._restarts, []
-        return taken
-
-    def _note_lacking(self, state: TriggerState) -> None:
-        """Logs that bags were deleted before the rules could use them."""
-        with self._lock:
-            bags, self._deleted = self._deleted, 0
-        if not bags:
-            return
-        sentence = (
-            f"{counted(bags, 'bag')} that rules may have needed were deleted to make room "
-            "(retention.max_total_gb, min_free_gb)"
-        )
-        _log.warning("needed_bags_deleted", bags=bags, reason=sentence)
-        for record in state.rules.values():
-            record.problem = sentence
 
     def _take(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
         """Counts a firing, and joins it to the newest moment of its rule or begins another."""
@@ -343,17 +323,16 @@ class Triggers:
         """Whether a problem was noted in the hour before a rule fired."""
         return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
 
-    def _judge(self, name: str, state: TriggerState) -> None:
-        """Logs once that a rule has matched for too long to be useful."""
-        record = state.rules[name]
-        runs = [each for each in record.runs.values() if each.fired]
-        longest = min(
-            (each.first for each in runs if each.last - each.first > HOUR_NS), default=None
-        )
-        is_silence = self._rules[name].kind is RuleKind.SILENT
-        if longest is not None and record.always_since is None and not is_silence:
-            _log.warning("trigger_matches_always", rule=name, since_ns=longest)
-        record.always_since = None if is_silence else longest
+
+def _judge(name: str, record: RuleRecord) -> None:
+    """Logs once that a rule has matched for too long to be useful."""
+    lasting = (
+        run.first for run in record.runs.values() if run.fired and run.last - run.first > HOUR_NS
+    )
+    longest = min(lasting, default=None)
+    if longest is not None and record.always_since is None:
+        _log.warning("trigger_matches_always", rule=name, since_ns=longest)
+    record.always_since = longest
 
 
 _TOO_OFTEN: Final = (
@@ -368,10 +347,3 @@ def _joins(start: Ns, end: Ns, other_start: Ns, other_end: Ns) -> bool:
         return False
     longest = max(LONGEST_NS, end - start, other_end - other_start)
     return max(end, other_end) - min(start, other_start) <= longest
-
-
-def _forget_oldest(state: TriggerState) -> None:
-    """Bounds the state: what lies far back was searched to its end."""
-    while len(state.searched) > MOST_SEARCHED:
-        state.before = next(iter(state.searched))
-        del state.searched[state.before]

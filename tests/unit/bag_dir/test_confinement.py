@@ -38,7 +38,7 @@ from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
 from ros2_memory.recorder import ros2bag
-from ros2_memory.recorder.handover.recovery import recover_handovers
+from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.writer import McapWriter

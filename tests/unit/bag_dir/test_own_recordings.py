@@ -91,14 +91,12 @@ class TestWhatARecorderLists:
     ) -> None:
         world = World(tmp_path)
         listed_at_start: list[list[dict[str, Any]]] = []
-        start = world._start
 
-        def starting(name: str, directory: Path) -> Any:
+        def starting(directory: Path) -> None:
             assert not directory.exists()
             listed_at_start.append(lines(tmp_path))
-            return start(name, directory)
 
-        world.supervisor._sessions._start_child = starting
+        world.before_start = starting
         world.supervisor.start()
         [recorder] = world.recorders
         name = recorder.directory.name

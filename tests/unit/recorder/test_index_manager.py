@@ -13,9 +13,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import Clock
-from ros2_memory.index.bag_table import PATROL
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
@@ -77,23 +76,6 @@ def _beat(*recordings: str, updated: int = NOW) -> Heartbeat:
     return Heartbeat(
         1, updated, RecorderState.RECORDING, recordings, updated, 0, (), (), None, interval_s=2.0
     )
-
-
-def test_several_recordings_are_indexed_in_the_order_of_their_times(yard: Yard) -> None:
-    for split in range(12):
-        plain(yard.bag_dir / "rec_b" / f"rec_b_{split}.mcap", [split * 10, split * 10 + 9])
-    plain(yard.bag_dir / "2026" / "rec_a" / "rec_a_0.mcap", [200, 209])
-    yard.age()
-    snapshot = yard.index.snapshot()
-    assert _names(snapshot.bags) == [*(f"rec_b_{n}.mcap" for n in range(12)), "rec_a_0.mcap"]
-    assert (snapshot.earliest, snapshot.latest) == (0, 209)
-    assert snapshot.timeline.topics() == ("/odom",)
-    assert _names(snapshot.timeline.overlapping(TimeWindow(109, 111))) == [
-        "rec_b_10.mcap",
-        "rec_b_11.mcap",
-    ]
-    assert len([*snapshot.timeline.extents("/odom", TimeWindow.everything())]) == 13
-    assert (snapshot.problem, snapshot.scanned_at) == (None, NOW)
 
 
 def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
@@ -158,15 +140,6 @@ def test_an_active_bag_is_served_once_it_lay_still_for_three_splits(yard: Yard) 
     assert _names(yard.scan_after(1).bags) == ["rec_0.mcap"]
 
 
-def test_an_incomplete_bag_that_was_repaired_is_read_again(yard: Yard) -> None:
-    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
-    yard.age()
-    assert yard.scan_after().bags[0].state is BagState.INCOMPLETE
-    plain(yard.bag_dir / "rec" / "rec_0.repaired", [1, 2]).rename(path)
-    (bag,) = yard.scan_after().bags
-    assert (bag.state, bag.end) == (BagState.CLOSED, 2)
-
-
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
     for split in range(3):
         plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
@@ -178,42 +151,6 @@ def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
         assert len(yard.scan_after(10).bags) == 4
     assert yard.reader.summaries == {f"rec_{split}.mcap": 1 for split in range(4)}
     assert yard.reader.closings == yard.reader.summaries
-
-
-def test_a_changed_file_is_read_again_and_a_vanished_one_leaves(yard: Yard) -> None:
-    first = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
-    second = plain(yard.bag_dir / "rec" / "rec_1.mcap", [2], topic="/scan")
-    yard.age()
-    before = yard.scan_after()
-    plain(yard.bag_dir / "rec" / "new", [1, 5]).rename(first)
-    second.unlink()
-    after = yard.scan_after()
-    assert [(bag.path.name, bag.end) for bag in after.bags] == [("rec_0.mcap", 5)]
-    assert after.timeline.topics() == ("/odom",)
-    assert _names(before.bags) == ["rec_0.mcap", "rec_1.mcap"]
-    assert before.timeline.topics() == ("/odom", "/scan")
-
-
-def test_a_renamed_split_is_known_under_its_name_of_today(yard: Yard) -> None:
-    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
-    yard.scan_after()
-    path.rename(path.with_name("kitchen.mcap"))
-    assert _names(yard.scan_after().bags) == ["kitchen.mcap"]
-
-
-def test_a_closed_bag_that_was_overwritten_in_place_is_found_on_patrol(yard: Yard) -> None:
-    count = PATROL + 10
-    for split in range(count):
-        plain(yard.bag_dir / f"rec_{split}.mcap", [split])
-    yard.age()
-    yard.scan_after()
-    overwritten = [yard.bag_dir / f"rec_{split}.mcap" for split in (0, count - 1)]
-    for path in overwritten:
-        plain(path, [10_000, 20_000])
-    yard.age()
-    for _ in range(3):
-        snapshot = yard.scan_after(5)
-    assert [bag.path for bag in snapshot.bags if bag.end == 20_000] == overwritten
 
 
 @pytest.mark.parametrize(
@@ -248,17 +185,6 @@ def test_two_whole_forms_are_one_bag_while_one_is_young_and_two_when_both_are_ke
     assert sorted(_names(yard.scan_after().bags)) == ["rec_0.mcap", "rec_0.mcap.zstd"]
 
 
-def test_the_compressed_form_takes_over_when_the_plain_one_goes(tmp_path: Path) -> None:
-    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
-    path = plain(tmp_path / "rec_0.mcap", [1, 2])
-    yard.age()
-    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
-    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1, 2]), ns=(NOW, NOW))
-    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
-    path.unlink()
-    assert _names(yard.scan_after().bags) == ["rec_0.mcap.zstd"]
-
-
 def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
     tmp_path: Path,
 ) -> None:
@@ -287,17 +213,6 @@ def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_
     plain(path, [1])
     yard.age()
     assert _names(yard.scan_after().bags) == ["rec_0.mcap", "rec_1.mcap"]
-
-
-def test_a_missing_bag_directory_is_warned_of_once(tmp_path: Path) -> None:
-    yard = Yard(tmp_path / "bags")
-    with capture_logs() as logged:
-        yard.index.refresh()
-        yard.index.refresh()
-    warned = [each for each in logged if each["log_level"] == "warning"]
-    assert [each["event"] for each in warned] == ["bag_directory_not_read"]
-    assert "does not exist" in warned[0]["reason"]
-    assert warned[0]["bag_dir"] == str(tmp_path / "bags")
 
 
 def test_a_bag_directory_that_is_missing_is_a_problem_until_it_appears(tmp_path: Path) -> None:
@@ -348,12 +263,6 @@ def test_a_question_that_reaches_past_the_newest_end_looks_for_newer_bags(yard: 
     assert yard.index.snapshot() is first
     assert yard.index.snapshot(reach=9) is first
     assert _names(yard.index.snapshot(reach=10).bags) == ["rec_0.mcap", "rec_1.mcap"]
-
-
-def test_a_question_to_an_empty_memory_always_looks(yard: Yard) -> None:
-    assert yard.index.snapshot(reach=0).bags == ()
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
-    assert _names(yard.index.snapshot(reach=0).bags) == ["rec_0.mcap"]
 
 
 def test_callers_that_come_during_a_scan_share_its_result(yard: Yard) -> None:
@@ -424,23 +333,3 @@ def test_a_growing_active_bag_is_no_log_event(yard: Yard) -> None:
             os.utime(path, ns=(yard.clock.at,) * 2)
             assert _names(yard.scan_after(1).active) == ["rec_0.mcap"]
     assert events == []
-
-
-def test_the_heartbeat_is_handed_on_live_or_not(yard: Yard) -> None:
-    assert yard.index.heartbeat() is None
-    stale = _beat("rec", updated=LONG_AGO)
-    write_heartbeat(yard.bag_dir, stale)
-    assert yard.index.heartbeat() == stale
-
-
-def test_nothing_is_written_into_the_bag_directory(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [0, 9])
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [0, 9], closed=False)
-    yard.age()
-    before = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
-    for _ in range(3):
-        list(yard.scan_after(5).timeline.extents("/odom", TimeWindow.everything()))
-    after = {path: path.lstat() for path in (yard.bag_dir, *yard.bag_dir.rglob("*"))}
-    assert {path: (stat.st_size, stat.st_mtime_ns) for path, stat in after.items()} == {
-        path: (stat.st_size, stat.st_mtime_ns) for path, stat in before.items()
-    }

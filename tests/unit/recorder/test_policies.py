@@ -1,18 +1,10 @@
-"""When a recording begins anew, what a full disk asks for, and how silent topics are described."""
+"""When a recording begins anew, and when a robot has fallen silent."""
 
 from __future__ import annotations
-
-import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from ros2_memory.recorder.policies import (
     Backoff,
     SilenceWatch,
-    SpaceAction,
-    describe_silent_topics,
-    resume_bytes,
-    space_action,
 )
 
 
@@ -80,54 +72,3 @@ class TestSilence:
         watch.rotated(for_silence=True)
         watch.began(40, 5)
         assert [now for now in range(40, 400) if watch.is_silent(now, 0)] == []
-
-
-class TestSpace:
-    @pytest.mark.parametrize(
-        ("free", "paused", "room_requested", "expected"),
-        [
-            (1000, False, False, SpaceAction.NONE),
-            (999, False, False, SpaceAction.MAKE_ROOM),
-            (999, False, True, SpaceAction.PAUSE),
-            (1000, False, True, SpaceAction.NONE),
-            (0, True, True, SpaceAction.STAY_PAUSED),
-            (1199, True, True, SpaceAction.STAY_PAUSED),
-            (1200, True, True, SpaceAction.RESUME),
-        ],
-    )
-    def test_first_room_is_made_then_recording_pauses_and_resumes_by_itself(
-        self, free: int, paused: bool, room_requested: bool, expected: SpaceAction
-    ) -> None:
-        assert space_action(free, 1000, paused=paused, room_requested=room_requested) is expected
-
-    @pytest.mark.parametrize(
-        ("free", "paused", "expected"),
-        [
-            (999, False, SpaceAction.WAIT),
-            (500, False, SpaceAction.WAIT),
-            (499, False, SpaceAction.PAUSE),
-            (1000, False, SpaceAction.NONE),
-            (1199, True, SpaceAction.STAY_PAUSED),
-        ],
-    )
-    def test_room_that_is_being_made_is_waited_for_while_half_the_least_is_free(
-        self, free: int, paused: bool, expected: SpaceAction
-    ) -> None:
-        assert (
-            space_action(free, 1000, paused=paused, room_requested=True, making_room=True)
-            is expected
-        )
-
-    @given(st.integers(0, 10**13), st.integers(0, 10**12))
-    def test_what_it_resumes_with_is_never_what_it_pauses_for(self, free: int, least: int) -> None:
-        if space_action(free, least, paused=True, room_requested=True) is SpaceAction.RESUME:
-            assert space_action(free, least, paused=False, room_requested=True) is SpaceAction.NONE
-
-    def test_a_least_of_nothing_never_pauses(self) -> None:
-        assert space_action(0, 0, paused=False, room_requested=False) is SpaceAction.NONE
-        assert resume_bytes(0) == 0
-
-
-def test_nothing_is_reported_where_all_topics_were_heard() -> None:
-    assert describe_silent_topics(["/odom"], ["/odom", "/tf"], "ask") is None
-    assert describe_silent_topics([], [], "ask") is None

@@ -147,12 +147,6 @@ def test_a_latched_message_is_in_each_recording_once() -> None:
     assert DISK.bytes_per_day([latched]) == pytest.approx(144 * 66)
 
 
-def test_the_budget_holds_so_many_days() -> None:
-    assert DISK.days([]) == pytest.approx(5e9 / DISK.files_per_day)
-    daily = DISK.files_per_day + DISK.bytes_per_day([ODOM])
-    assert DISK.days([ODOM]) == pytest.approx(5e9 / daily)
-
-
 def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> None:
     large = replace(DISK, budget_bytes=100e9)
     assert propose([ODOM, SCAN], large)[SCAN].choice is Choice.RECORD
@@ -165,10 +159,6 @@ def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> Non
 def test_a_small_scan_stays_though_the_list_does_not_fit() -> None:
     small = replace(SCAN, hz=0.3)
     assert propose([ODOM, small], replace(DISK, budget_bytes=1e9))[small].choice is Choice.RECORD
-
-
-def test_no_other_topic_is_left_out_for_its_size() -> None:
-    assert propose([ODOM], replace(DISK, budget_bytes=1.0))[ODOM].choice is Choice.RECORD
 
 
 def test_the_file_lists_what_is_proposed_and_has_the_rest_to_tick(tmp_path: Path) -> None:

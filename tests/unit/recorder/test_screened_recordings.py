@@ -12,12 +12,11 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, read_gate
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.screening import Screening
 from tests.support.bags import McapLayout
-from tests.support.housekeepers import keeper_of, recording_now
+from tests.support.housekeepers import background_keeper_of, keeper_of, recording_now
 from tests.support.memories import shipped_extractor
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
 from tests.support.simulated_recorders import World, assert_each_counts_once
@@ -143,15 +142,14 @@ class TestTheHouse:
 
     def test_a_step_runs_in_the_background_and_its_fault_is_reported(self, tmp_path: Path) -> None:
         bags = ScreenedBags(tmp_path / "bags")
-        house = BackgroundHousekeeper(keeper_of(bags.bag_dir, screening=bags.screening))
+        house = background_keeper_of(bags.bag_dir, screening=bags.screening)
         name = bags.begin(0)
         bags.split(name, [mode(-2, value=False), *words(0, 10)])
         house.screen(())
         house.wait()
         assert len(bags.served()) == 1
         (bags.bag_dir / SCREENED_FILE).write_text("{")
-        damaged = keeper_of(bags.bag_dir, screening=bags.new())
-        house = BackgroundHousekeeper(damaged)
+        house = background_keeper_of(bags.bag_dir, screening=bags.new())
         house.screen(())
         assert "screened.json" in house.faults()["screen"]
         house.finish()

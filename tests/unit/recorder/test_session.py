@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.recorder.session import EMPTY_GRACE_S, SplitChanges, Splits
+from ros2_memory.recorder.session import SplitChanges, Splits
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
 
@@ -24,11 +24,6 @@ def write(splits: Splits, number: int, *topics: str, finish: bool = True) -> Non
     layout = McapLayout() if finish else OPEN
     messages = [boolean(T0 + n, True, topic) for n, topic in enumerate(topics)]
     write_mcap(splits.directory / f"rec_1_{number}.mcap", messages, layout)
-
-
-def test_a_directory_that_is_not_there_yet_is_no_fault(splits: Splits) -> None:
-    assert splits.observe(0) == SplitChanges()
-    assert not splits.exists
 
 
 def test_a_split_is_reported_once_when_it_closes(splits: Splits) -> None:
@@ -50,22 +45,6 @@ def test_splits_that_close_at_once_are_reported_in_the_order_of_recording(splits
     assert splits.observe(0).closed == tuple(f"rec_1_{number}.mcap" for number in range(14))
 
 
-def test_what_was_heard_is_counted_over_closed_splits_alone(splits: Splits) -> None:
-    write(splits, 0, "/a", "/a", "/b")
-    write(splits, 1, "/c", finish=False)
-    splits.observe(0)
-    assert splits.received == {"/a", "/b"}
-    assert splits.messages == 3
-
-
-def test_a_directory_that_was_there_and_is_gone_is_reported_once(splits: Splits) -> None:
-    write(splits, 0, "/a")
-    splits.observe(0)
-    splits.directory.rename(splits.directory.with_name("elsewhere"))
-    assert splits.observe(1).gone
-    assert not splits.observe(2).gone
-
-
 def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) -> None:
     write(splits, 0, "/a", "/b")
     splits.observe(0)
@@ -74,25 +53,6 @@ def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) ->
     splits.observe(1)
     assert splits.bytes_written == before > 0
     assert splits.names() == {"rec_1_0.mcap"}
-
-
-def test_an_open_split_of_no_bytes_is_as_it_should_be(splits: Splits) -> None:
-    splits.directory.mkdir()
-    (splits.directory / "rec_1_0.mcap").touch()
-    assert [splits.observe(now).empty for now in (0, 10, 100)] == [(), (), ()]
-
-
-def test_a_split_of_no_bytes_behind_a_newer_one_counts_as_empty_after_a_while(
-    splits: Splits,
-) -> None:
-    splits.directory.mkdir()
-    (splits.directory / "rec_1_0.mcap").touch()
-    splits.observe(0)
-    (splits.directory / "rec_1_1.mcap").touch()
-    assert splits.observe(10).empty == ()
-    assert splits.observe(10 + EMPTY_GRACE_S - 0.1).empty == ()
-    assert splits.observe(10 + EMPTY_GRACE_S).empty == ("rec_1_0.mcap",)
-    assert splits.observe(100).empty == ("rec_1_0.mcap",)
 
 
 def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(
@@ -104,16 +64,6 @@ def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(
     assert changes.closed == ("rec_1_0.mcap",)
     assert len(changes.faults) == 1
     assert splits.observe(1) == SplitChanges()
-
-
-def test_other_files_are_not_looked_at(splits: Splits) -> None:
-    splits.directory.mkdir()
-    (splits.directory / "metadata.yaml").write_text("{}")
-    (splits.directory / "handover.json").write_text("{}")
-    (splits.directory / "dir.mcap").mkdir()
-    (splits.directory / "link.mcap").symlink_to("metadata.yaml")
-    splits.observe(0)
-    assert splits.names() == frozenset()
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read every directory")

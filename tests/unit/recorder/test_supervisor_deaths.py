@@ -13,7 +13,7 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.recovery import recover_handovers
+from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.storage.base import Closing
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,

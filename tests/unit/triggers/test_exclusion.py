@@ -107,7 +107,9 @@ def histories(draw: st.DrawFn) -> list[Past]:
         times = draw(st.lists(st.integers(start, end), max_size=6, unique=True).map(sorted))
         said = tuple((time, draw(st.sampled_from([True, False, False, None]))) for time in times)
         pasts.append(Past(start, end, said))
-        start = draw(st.integers(start, end + 6))
+        # No more than two recorders run at once.
+        ended = pasts[-2].end + 1 if len(pasts) > 1 else start
+        start = draw(st.integers(max(start, ended), max(end, ended) + 6))
     if draw(st.booleans()):
         # What is written now goes on beyond what is looked at, by the greatest margin.
         pasts[-1] = pasts[-1]._replace(live=True, end=LAST + MOST_MARGIN)

@@ -10,13 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.triggers.rules import RuleFold, RuleKind
-from tests.support.watched_bags import S, rule
+from ros2_memory.bag_dir.state_files import RunRecord
+from tests.support.watched_bags import SILENT, S, rule
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from ros2_memory.bag_dir.state_files import RunRecord
 
 Stream = list[tuple[int, bool | None]]
 
@@ -43,11 +41,11 @@ def fired(
     for until in (*sorted(cuts), max(end, stream[-1][0] + 1 if stream else 0)):
         piece = [each for each in stream if each[0] < until]
         stream = stream[len(piece) :]
-        fold = RuleFold(rule(hold=hold), runs)
+        watched = rule(hold=hold)
         for time, matches in piece:
-            found = fold.take("/bumper", time, matches=matches, latched=latched)
+            found = watched.take(runs, "/bumper", time, matches=matches, latched=latched)
             times += [] if found is None else [found.at]
-        times += [each.at for each in fold.reach(until)]
+        times += [each.at for each in watched.reach(runs, until)]
     return times
 
 
@@ -102,31 +100,21 @@ def test_a_silence_fires_once_and_again_after_the_topic_spoke(
     runs: dict[str, RunRecord] = {}
     left = times
     for until in (*sorted(cut * S for cut in cuts), end):
-        fold = RuleFold(rule(kind=RuleKind.SILENT, hold=hold), runs)
+        watched = rule(hold=hold, **SILENT)
         for time in [each for each in left if each < until]:
-            fire = fold.take("/bumper", time, matches=False)
+            fire = watched.take(runs, "/bumper", time, matches=False)
             found += [] if fire is None else [fire.at]
         left = [each for each in left if each >= until]
-        found += [each.at for each in fold.reach(until)]
+        found += [each.at for each in watched.reach(runs, until)]
     gaps = zip(times, [*times[1:], end], strict=True) if times else ()
     assert found == [last + hold for last, after in gaps if after - last >= hold]
 
 
-def test_a_gap_ends_what_goes_on() -> None:
-    fold = RuleFold(rule(hold=5 * S), {})
-    assert fold.take("/bumper", 0, matches=True) is None
-    fold.end()
-    assert fold.take("/bumper", 6 * S, matches=True) is None
-    fire = fold.take("/bumper", 11 * S, matches=True)
-    assert fire is not None
-    assert (fire.first, fire.at) == (6 * S, 11 * S)
-
-
 @pytest.mark.parametrize("latched", [True, False])
 def test_a_clock_that_was_set_back_ends_what_goes_on(*, latched: bool) -> None:
-    fold = RuleFold(rule(hold=5 * S), {})
-    assert fold.take("/bumper", 100 * S, matches=True, latched=latched) is None
-    assert fold.take("/bumper", 50 * S, matches=True, latched=latched) is None
-    fire = fold.take("/bumper", 55 * S, matches=True, latched=latched)
+    watched, runs = rule(hold=5 * S), dict[str, RunRecord]()
+    assert watched.take(runs, "/bumper", 100 * S, matches=True, latched=latched) is None
+    assert watched.take(runs, "/bumper", 50 * S, matches=True, latched=latched) is None
+    fire = watched.take(runs, "/bumper", 55 * S, matches=True, latched=latched)
     assert fire is not None
     assert fire.at == 55 * S

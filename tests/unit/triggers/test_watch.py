@@ -13,9 +13,8 @@ from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.retention import saved_moments
-from ros2_memory.triggers.rules import RuleKind
 from tests.support.bags import McapLayout, Msg, boolean, text
-from tests.support.watched_bags import T0, S, WatchedBags, flag, rule
+from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -148,7 +147,7 @@ class TestLatchedTopics:
 
 class TestOtherKinds:
     def test_a_topic_that_falls_silent(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", kind=RuleKind.SILENT, hold=5 * S))
+        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
         name = robot.begin(T0)
         robot.split(seconds(0, 10), name)
         robot.split([text(T0 + n * S, "x") for n in range(10, 20)], name)
@@ -159,14 +158,14 @@ class TestOtherKinds:
         assert robot.spans() == [(4, 17)]
 
     def test_a_silence_within_one_split(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", kind=RuleKind.SILENT, hold=5 * S))
+        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
         robot.begin(T0)
         robot.split([flag(0, False), *[text(T0 + n * S, "x") for n in range(1, 9)], flag(9, False)])
         robot.close_all()
         assert robot.fired_at() == [T0 + 5 * S]
 
     def test_a_recorder_that_was_off_is_no_silence(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", kind=RuleKind.SILENT, hold=5 * S))
+        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
         robot.begin(T0)
         robot.split(seconds(0, 10))
         robot.beat(state=RecorderState.STOPPED)
@@ -186,7 +185,7 @@ class TestOtherKinds:
         assert robot.record("bumper").problem is None
 
     def test_a_recording_that_ended_unasked(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("restart", kind=RuleKind.RECORDER_RESTART))
+        robot = watched(tmp_path, rule("restart", **RESTART))
         robot.begin(T0)
         robot.split(seconds(0, 10))
         robot.clock.at = T0 + 9 * S
@@ -195,7 +194,7 @@ class TestOtherKinds:
         assert robot.spans() == [(4, 12)]
 
     def test_a_recorder_that_was_killed(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("restart", kind=RuleKind.RECORDER_RESTART))
+        robot = watched(tmp_path, rule("restart", **RESTART))
         robot.begin(T0)
         robot.split(seconds(0, 10))
         robot.clock.at = T0 + 9 * S

@@ -1,10 +1,14 @@
-"""Compares two recordings that overlapped, so that what either of them holds counts, and once.
+"""Settles what counts of two recordings that overlapped: what either of them holds, and once.
 
-A cut gives each message to one of two recordings. Where the one that it belongs to had stalled, the
-message is in the other alone, and the cut hides it. So the files on both sides are compared once
-they are closed: a message is the same by topic, publish time and payload, and counts as often as in
-the recording that holds it most often. The sidecars then list the messages for which the cut is not
-the answer; mostly there are none.
+A cut gives each message to one of two recordings. The recorder that wrote both wrote the cut, too,
+unless a crash interrupted it: then the old recording, which names the new one before that is
+started, counts up to its end, and the new one from there.
+
+Where the recording that a message belongs to had stalled, the message is in the other alone, and
+the cut hides it. So the files on both sides are compared once they are closed: a message is the
+same by topic, publish time and payload, and counts as often as in the recording that holds it most
+often. The sidecars then list the messages for which the cut is not the answer; mostly there are
+none.
 
 What `recording.exclude_when` holds back counts as still being written: what is excluded of it must
 not be listed.
@@ -17,22 +21,28 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import structlog
 
 from ros2_memory.bag_dir.handover_file import (
+    LOG_CLOCK_NOTE,
     Counting,
+    CutClock,
     Handover,
     MessageList,
+    Overlap,
     handover_to_change,
     message_id,
+    read_handover,
+    write_handover,
     write_handovers,
 )
 from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.storage.base import Closing
 
 if TYPE_CHECKING:
@@ -42,23 +52,172 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader, Record
 
+JITTER_NS: Final[Ns] = 100 * NS_PER_MS
+"""Two recorders differ by less than this in when they received one message."""
+LONGEST_NS: Final[Ns] = 60 * NS_PER_S
+"""Two recorders never run side by side for longer, whatever a clock that was set shows."""
 STALL_NS: Final[Ns] = 5 * NS_PER_S
 """How much later than the other one a recorder may log a message."""
 FRESH_NS: Final[Ns] = NS_PER_S
 """A latched message logged later than this after it was published was received before."""
+SAMPLE: Final = 2000
+"""Messages read to find out whether publish times differ from log times."""
 MOST_LISTED: Final = 10_000
 """More messages are not listed in a sidecar: then all count, and queries leave out duplicates."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
-_Key: TypeAlias = "tuple[str, str]"
+_Copies: TypeAlias = "Counter[tuple[str, bool]]"
+"""How often a recording holds one message, by file, and by whether the cut counts it there."""
 
 
-class _Copies(NamedTuple):
-    """How often the files of a recording hold one message: where the cut counts it, and not."""
+def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
+    """Settles every handover below the bag directory; reports those that it cannot settle.
 
-    counted: Counter[str]
-    excluded: Counter[str]
+    `running` are recordings that are being written, which may still complete theirs.
+
+    Raises:
+        OSError: the bag directory cannot be listed.
+    """
+    for directory in sorted(filter(_is_folder, bag_dir.iterdir())):
+        handover = read_handover(directory).handover
+        pairs: list[tuple[Path, Path]] = []
+        if handover.next is not None and handover.counts_until is None:
+            pairs.append((directory, bag_dir / handover.next))
+        # Retention may have deleted the one before, and then there is nothing to compare.
+        if handover.previous is not None and handover.compared is False:
+            previous = bag_dir / handover.previous
+            pairs += [(previous, directory)] * _is_folder(previous)
+        for old, new in pairs:
+            try:
+                settle_handover(old, new, reader, running)
+            except RecorderError as error:
+                _log.error("handover_not_settled", recording=directory.name, reason=str(error))
+
+
+def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection[str] = ()) -> bool:
+    """Completes the handover between two recordings as far as these have ended, and compares them.
+
+    `running` names the recordings that are being written; the reader must ignore sidecars.
+
+    Returns:
+        Whether nothing is left to do: not while a file that may matter is being written.
+
+    Raises:
+        RecorderError: the recordings cannot be read, or the sidecars cannot be written.
+    """
+    try:
+        if not _is_folder(old):
+            if _is_folder(new) and handover_to_change(new).hides_all:
+                write_handover(new, Handover())
+            return True
+        begun = read_handover(old).handover
+        if begun.next == new.name and begun.counts_until is None:
+            if old.name in running and _is_folder(new):
+                return False
+            _write_cut(old, new, reader)
+            _log.info("handover_settled", recording=old.name, next=new.name)
+        return not _is_folder(new) or _compare(old, new, reader, running)
+    except OSError as error:
+        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
+    except BagUnreachableError as error:
+        # What the disk cannot show at present must not be taken for missing.
+        raise RecorderError(str(error)) from error
+
+
+def _is_folder(path: Path) -> bool:
+    """Whether it is a directory, and not a link to one elsewhere."""
+    return path.is_dir() and not path.is_symlink()
+
+
+def intended(old: Handover, new_name: str | None) -> Handover:
+    """Returns the old sidecar before the new recording is started, as a crash may come any time.
+
+    None in place of its name withdraws it: the new recording did not take over.
+    """
+    return replace(old, next=new_name, counts_until=None, end=None)
+
+
+def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
+    """Writes the cut of a handover that was interrupted, after the old recording has ended.
+
+    The new one may itself have handed over since, if this could not be written at once: what its
+    sidecar records about its own end is kept.
+    """
+    before = handover_to_change(old)
+    after = handover_to_change(new) if _is_folder(new) else Handover(Counting.VOID)
+    last = None if after.state is Counting.VOID else _end_of(old, reader)
+    if after.state is Counting.COUNTS and after.counts_from is not None:
+        # The crash came between the two sidecars of a complete handover.
+        start = None if after.begin is None else after.begin.log_from
+        bags = bags_of(old, reader).items()
+        files = tuple(name for name, bag in bags if start is None or bag.end >= start)
+        end = Overlap(start, None, files)
+        write_handover(old, replace(before, counts_until=after.counts_from, end=end))
+    elif last is None:
+        if after.state is not Counting.VOID:
+            counts = replace(after, state=Counting.COUNTS, previous=old.name, compared=True)
+            write_handover(new, counts)
+        write_handover(old, intended(before, None))
+    else:
+        published, logged = last
+        found = bags_of(new, reader)
+        first = min((bag.start for bag in found.values()), default=logged)
+        until = min(logged + JITTER_NS, first + LONGEST_NS)
+        later = {name for name, bag in found.items() if bag.start >= until}
+        # A file that cannot be read yet is still being written.
+        names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
+        clock = cut_clock(new / next(iter(found)), reader) if found else CutClock.PUBLISH
+        start_of_new = replace(
+            after,
+            state=Counting.COUNTS,
+            clock=clock,
+            previous=old.name,
+            counts_from=published + 1,
+            begin=Overlap(None, until, names),
+            notes=(LOG_CLOCK_NOTE,) if clock is CutClock.LOG else (),
+            compared=False,
+        )
+        write_handover(new, start_of_new)
+        end = Overlap(None, None, ())
+        write_handover(old, replace(before, counts_until=published + 1, end=end))
+
+
+def _end_of(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
+    """Returns the newest publish time and log time in the last bag file that is not empty."""
+    bags = bags_of(recording, reader)
+    if not bags:
+        return None
+    last = recording / max(bags, key=lambda name: bags[name].end)
+    newest: tuple[Ns, Ns] | None = None
+    for record in _readable(_unlatched(last, reader)):
+        published, logged = newest or (MIN_NS, MIN_NS)
+        # A publish time of 0 means that there is none.
+        latest = max(published, record.publish_time or record.log_time)
+        newest = latest, max(logged, record.log_time)
+    return newest
+
+
+def cut_clock(bag: Path, reader: BagReader) -> CutClock:
+    """Finds out whether a bag file has publish times of their own; yes if it is empty.
+
+    Raises:
+        RecorderError: the disk fails.
+    """
+    try:
+        records = list(islice(_unlatched(bag, reader), SAMPLE))
+    except BagUnreachableError as error:
+        raise RecorderError(str(error)) from error
+    except BagError:
+        return CutClock.PUBLISH
+    equal = bool(records) and all(each.publish_time in {0, each.log_time} for each in records)
+    return CutClock.LOG if equal else CutClock.PUBLISH
+
+
+def _unlatched(bag: Path, reader: BagReader) -> Iterator[Record]:
+    """Yields messages of topics that are not latched: latched ones may be published long before."""
+    topics = [each.topic for each in reader.summarize(bag).topics if not each.latched]
+    return reader.records(bag, topics, TimeWindow.everything())
 
 
 class _Side(NamedTuple):
@@ -77,81 +236,47 @@ class _Side(NamedTuple):
     @property
     def start(self) -> Ns:
         """The first log time."""
-        return min(each.start for each in self.bags.values())
+        return min(bag.start for bag in self.bags.values())
 
     @property
     def end(self) -> Ns:
         """The last log time."""
-        return max(each.end for each in self.bags.values())
+        return max(bag.end for bag in self.bags.values())
 
 
-def compare_recordings(
-    old: Path, new: Path, reader: BagReader, running: Collection[str] = ()
-) -> bool:
-    """Lists in the sidecars of two recordings what counts against the cut between them.
+class _Listed(NamedTuple):
+    """What is to be listed of one recording, as file, topic and message."""
 
-    `running` names the recordings that are being written; the reader must ignore sidecars.
+    also_counts: set[tuple[str, str, str]]  # where the cut says that they do not
+    counts_elsewhere: set[tuple[str, str, str]]  # where it says that they count
 
-    Returns:
-        Whether that is done: False while a file that may hold such messages is being written.
 
-    Raises:
-        RecorderError: the recordings cannot be read, or the sidecars cannot be written.
-    """
-    after = handover_to_change(new)
+def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
+    """Lists in the sidecars of two recordings what counts against the cut between them."""
+    before, after = handover_to_change(old), handover_to_change(new)
     if after.compared is not False or after.previous != old.name:
         return True
-    ends_first = new if after.state is Counting.VOID else old
     gate = read_gate(old.parent)
     running = {*running, *(each.name for each in (old, new) if gate.holds_some(each.name))}
-    if after.state is Counting.PENDING or ends_first.name in running:
+    is_void = after.state is Counting.VOID
+    if after.state is Counting.PENDING or (new if is_void else old).name in running:
         return False
-    try:
-        one, other = _sides(old, new, reader, running)
-        ended, lasting = (one, other) if ends_first is old else (other, one)
-        if lasting.recording.name in running and (
-            not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
-        ):
-            return False
-        found = _differences(one, other, reader)
-    except OSError as error:
-        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
-    except BagUnreachableError as error:
-        # What the disk cannot show at present must not be taken for missing.
-        raise RecorderError(str(error)) from error
-    _write(one, other, found)
+    cut = Handover()
+    if before.next == new.name:
+        cut = Handover(counts_until=before.counts_until, end=before.end)
+    one = _Side(old, before, cut, bags_of(old, reader, only_closed=old.name in running))
+    cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
+    other = _Side(new, after, cut, bags_of(new, reader, only_closed=new.name in running))
+    ended, lasting = (other, one) if is_void else (one, other)
+    if lasting.recording.name in running and (
+        not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
+    ):
+        return False
+    _write_lists(one, other, _against_the_cut(one, other, reader))
     return True
 
 
-class _Lists(NamedTuple):
-    """What one sidecar is to list: files, topics and messages."""
-
-    also_counts: dict[str, dict[str, set[str]]]
-    counts_elsewhere: dict[str, dict[str, set[str]]]
-
-    @property
-    def messages(self) -> int:
-        """How many messages are listed."""
-        return sum(
-            len(ids) for each in self for by_topic in each.values() for ids in by_topic.values()
-        )
-
-
-def _sides(
-    old: Path, new: Path, reader: BagReader, running: Collection[str]
-) -> tuple[_Side, _Side]:
-    before, after = handover_to_change(old), handover_to_change(new)
-    before_cut = Handover(counts_until=before.counts_until, end=before.end)
-    if before.next != new.name:
-        before_cut = Handover()
-    after_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
-    one, other = (
-        dict(bags_of(each, reader, only_closed=each.name in running)) for each in (old, new)
-    )
-    return _Side(old, before, before_cut, one), _Side(new, after, after_cut, other)
-
-
-def _differences(old: _Side, new: _Side, reader: BagReader) -> tuple[_Lists, _Lists]:
+def _against_the_cut(old: _Side, new: _Side, reader: BagReader) -> tuple[_Listed, _Listed]:
     """Returns what counts against the cut, for both sidecars."""
     window = TimeWindow.everything()
     if old.bags and new.bags:
@@ -159,56 +284,56 @@ def _differences(old: _Side, new: _Side, reader: BagReader) -> tuple[_Lists, _Li
         window = TimeWindow(start - STALL_NS, end + STALL_NS + 1)
     # The cut does not apply to latched channels, but all of a recording without effect is hidden.
     latched = new.handover.state is Counting.VOID
-    of_old, of_new = (_copies(each, window, reader, latched=latched) for each in (old, new))
-    lists = _Lists({}, {}), _Lists({}, {})
+    of_old, of_new = (_copies(side, window, reader, latched=latched) for side in (old, new))
+    lists = _Listed(set(), set()), _Listed(set(), set())
     for key in of_old.keys() | of_new.keys():
-        of_one, of_other = (of_side.get(key, _NONE) for of_side in (of_old, of_new))
-        if of_one is None or of_other is None:
+        one, other = of_old.get(key, _NOWHERE), of_new.get(key, _NOWHERE)
+        if one is None or other is None:
             continue
-        copies = of_one, of_other
-        counted = [each.counted.total() for each in copies]
-        held = [each.counted.total() + each.excluded.total() for each in copies]
         # Where both hold it as often, the cut decides.
-        best = max((0, 1), key=lambda side: (held[side], counted[side]))
-        for side in (0, 1):
-            wrong = copies[side].excluded if side == best else copies[side].counted
-            for file in wrong:
-                listed = lists[side][side != best].setdefault(file, {})
-                listed.setdefault(key[0], set()).add(key[1])
+        weights = [
+            (copies.total(), sum(times for (_, counts), times in copies.items() if counts))
+            for copies in (one, other)
+        ]
+        best = weights.index(max(weights))
+        for side, copies in enumerate((one, other)):
+            for file, counts in copies:
+                if counts is (side != best):
+                    lists[side][counts].add((file, *key))
     return lists
 
 
-_NONE: Final = _Copies(Counter(), Counter())
+_NOWHERE: Final[_Copies] = Counter()
 
 
 def _copies(
     side: _Side, window: TimeWindow, reader: BagReader, *, latched: bool
-) -> dict[_Key, _Copies | None]:
+) -> dict[tuple[str, str], _Copies | None]:
     """Returns what a recording holds in a window, by topic and identity.
 
     None stands for a message without a publish time of its own.
     """
-    found: dict[_Key, _Copies | None] = {}
-    for name, summary in side.bags.items():
-        topics = [each.topic for each in summary.topics]
-        if not window.overlaps(summary.start, summary.end):
+    found: dict[tuple[str, str], _Copies | None] = {}
+    for name, bag in side.bags.items():
+        if not window.overlaps(bag.start, bag.end):
             continue
+        topics = [each.topic for each in bag.topics]
         rule = side.cut.rule(name)
         for record in _readable(reader.records(side.recording / name, topics, window)):
             published, logged = record.publish_time, record.log_time
             if record.channel.latched and not (latched and logged - published <= FRESH_NS):
                 continue
             key = record.channel.topic, message_id(published, record.payload)
-            copies = found.setdefault(key, _Copies(Counter(), Counter()))
+            copies = found.setdefault(key, Counter())
             if published in {0, logged}:
                 found[key] = None
             elif copies is not None:
-                copies[rule is not None and not rule.counts(record)][name] += 1
+                copies[name, rule is None or rule.counts(record)] += 1
     return found
 
 
 def _readable(records: Iterator[Record]) -> Iterator[Record]:
-    """Yields the messages that can be read: any other is not held."""
+    """Yields the messages that can be read."""
     while True:
         try:
             yield next(records)
@@ -221,16 +346,19 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
                 return
 
 
-def _write(old: _Side, new: _Side, found: tuple[_Lists, _Lists]) -> None:
-    """Writes the sidecars that change, that of the new recording in any case.
-
-    Raises:
-        RecorderError: one cannot be written.
-    """
+def _write_lists(old: _Side, new: _Side, found: tuple[_Listed, _Listed]) -> None:
+    """Writes the sidecars that change, that of the new recording in any case."""
     before, after = old.handover, new.handover
-    messages = sum(lists.messages for lists in found)
+    messages = sum(len(listed) for lists in found for listed in lists)
     if messages <= MOST_LISTED:
-        before, after = _with_lists(before, found[0]), _with_lists(after, found[1])
+        before, after = (
+            replace(
+                handover,
+                also_counts=_joined(handover.also_counts, lists.also_counts),
+                counts_elsewhere=_joined(handover.counts_elsewhere, lists.counts_elsewhere),
+            )
+            for handover, lists in zip((before, after), found, strict=True)
+        )
     else:
         # Without a cut all of both count.
         if before.end is not None and before.next == new.recording.name:
@@ -250,28 +378,23 @@ def _write(old: _Side, new: _Side, found: tuple[_Lists, _Lists]) -> None:
         )
 
 
-def _with_lists(handover: Handover, lists: _Lists) -> Handover:
-    """Returns the sidecar with more messages listed."""
-    return replace(
-        handover,
-        also_counts=_joined(handover.also_counts, lists.also_counts),
-        counts_elsewhere=_joined(handover.counts_elsewhere, lists.counts_elsewhere),
-    )
-
-
-def _joined(known: MessageList, more: dict[str, dict[str, set[str]]]) -> MessageList:
-    joined = {file: dict(by_topic) for file, by_topic in known.items()}
-    for file, by_topic in more.items():
-        of_file = joined.setdefault(file, {})
-        for topic, ids in by_topic.items():
-            of_file[topic] = tuple(sorted(ids.union(of_file.get(topic, ()))))
-    return joined
+def _joined(known: MessageList, more: Collection[tuple[str, str, str]]) -> MessageList:
+    joined = {
+        file: {topic: {*messages} for topic, messages in by_topic.items()}
+        for file, by_topic in known.items()
+    }
+    for file, topic, message in more:
+        joined.setdefault(file, {}).setdefault(topic, set()).add(message)
+    return {
+        file: {topic: tuple(sorted(messages)) for topic, messages in by_topic.items()}
+        for file, by_topic in joined.items()
+    }
 
 
 def bags_of(
     recording: Path, reader: BagReader, *, only_closed: bool = False
-) -> list[tuple[str, BagSummary]]:
-    """Returns name and summary of each bag file that can be read and is not empty.
+) -> dict[str, BagSummary]:
+    """Returns the bag files that can be read and are not empty, by name.
 
     With `only_closed`, of those that are closed and not held back.
 
@@ -279,9 +402,9 @@ def bags_of(
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
-    found: list[tuple[str, BagSummary]] = []
+    found: dict[str, BagSummary] = {}
     gate = read_gate(recording.parent) if only_closed else OPEN_GATE
-    for path in bag_files(recording, reader):
+    for path in _bag_files(recording, reader):
         try:
             if only_closed and (
                 gate.holds(recording.name, path.name) or reader.closing(path) is not Closing.CLOSED
@@ -293,14 +416,9 @@ def bags_of(
         except BagError:
             continue
         if not summary.empty:
-            found.append((path.name, summary))
+            found[path.name] = summary
     return found
 
 
-def bag_files(recording: Path, reader: BagReader) -> list[Path]:
-    """Returns the bag files of a recording by their names.
-
-    Raises:
-        OSError: the recording cannot be listed.
-    """
-    return sorted(each for each in recording.iterdir() if reader.reads(each))
+def _bag_files(recording: Path, reader: BagReader) -> list[Path]:
+    return sorted(path for path in recording.iterdir() if reader.reads(path))

@@ -78,23 +78,22 @@ def record_argv(
     argv += ["-e", topics.regex]
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]
-    # Of the statistics at most one message a second; without a rate they may be switched off.
-    limits = {CACHE: cache_bytes, MIN_FREE: min_free_bytes, STATISTICS: 1}
-    for name, limit in limits.items():
-        argv += [name, str(limit)] if name in known_options and limit else []
-    if topics.hidden:
-        argv.append("--include-hidden-topics")
-    if use_sim_time:
-        argv.append("--use-sim-time")
-    if KEYBOARD in known_options:
-        argv.append(KEYBOARD)
-    if NODE_NAME in known_options:
-        argv += [NODE_NAME, node_name]
-    if CUSTOM_DATA in known_options:
-        argv += [CUSTOM_DATA, f"{RECORDED_BY}={PROGRAM}"]
-        argv += [] if bag_dir_id is None else [f"{BAG_DIR_ID}={bag_dir_id}"]
-    if REPEAT in known_options and repeat_latched:
-        argv += [REPEAT, *repeat_latched]
+    argv += ["--include-hidden-topics"] * topics.hidden + ["--use-sim-time"] * use_sim_time
+    custom = [f"{RECORDED_BY}={PROGRAM}"]
+    custom += [] if bag_dir_id is None else [f"{BAG_DIR_ID}={bag_dir_id}"]
+    optional: dict[str, Sequence[str | int] | None] = {
+        CACHE: [cache_bytes],
+        MIN_FREE: [min_free_bytes] if min_free_bytes else None,
+        # At most one message a second; without a rate they may be switched off.
+        STATISTICS: [1],
+        KEYBOARD: [],
+        NODE_NAME: [node_name],
+        CUSTOM_DATA: custom,
+        REPEAT: repeat_latched or None,
+    }
+    for name, values in optional.items():
+        if name in known_options and values is not None:
+            argv += [name, *map(str, values)]
     return argv
 
 

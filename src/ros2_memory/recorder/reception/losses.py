@@ -1,49 +1,107 @@
-"""Adds up what is missing in closed splits, across splits and overlapping recordings.
+"""Counts what is missing in closed splits, by what messages state: a counter, or their stamps.
 
-A hole counts once the next split has been measured, and the other recording of a handover up to
-there: until then that one may turn out to have its messages. One at the end of a split waits for
-the next one, too: the messages there tell it from a late one. After a split that does not show
-what it has of a topic, the topic is followed from the start.
+No message is decoded: the first fields of a message lie at places that its definition gives (CDR,
+little-endian; alignment counts from behind the 4 bytes of encapsulation).
+
+What overlapping recordings have of a topic is put together, and holes are looked for in that, up to
+the time that all of them have reached. One at the end waits for more messages, which tell it from a
+late one. After a split that does not show what it has of a topic, the topic is followed anew.
 """
 
 from __future__ import annotations
 
-from array import array
-from bisect import bisect_left, bisect_right
+import struct
 from collections import deque
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+from statistics import fmean, median_low
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from ros2_memory.bag_dir.state_files import Loss
-from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.recorder.reception.continuity import Hole, Kind, Position, holes
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
+
+    from ros2_memory.storage.base import Schema
 
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
-_RECENT: Final = 6
-"""How many splits are compared, and after how many a recording is not waited for any more."""
+RECENT: Final = 6
+"""After so many splits nothing is waited for any more."""
+FEWEST: Final = 10
+"""Messages that show a cadence."""
+REGULAR: Final = 0.9
+"""The part of all steps that must be of one length, or nothing is expected."""
+LONGEST_NS: Final[Ns] = 5 * NS_PER_S
+"""A longer hole is a publisher that was silent, and reported as that."""
+MOST_MISSING: Final = 10_000
+_TOLERANCE: Final = 0.25
+_HEADERS: Final = frozenset({"std_msgs/Header", "std_msgs/msg/Header", "Header"})
+_TIMES: Final = frozenset(
+    f"builtin_interfaces/{middle}{name}" for middle in ("", "msg/") for name in ("Time", "Duration")
+)
+_COUNTERS: Final = frozenset(
+    {
+        "seq",
+        "sequence",
+        "sequence_number",
+        "sequence_id",
+        "seq_num",
+        "seq_id",
+        "counter",
+        "msg_counter",
+        "message_counter",
+        "packet_counter",
+        "frame_counter",
+        "frame_number",
+    }
+)
+_SIZES: Final = {
+    **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
+    **dict.fromkeys(("int16", "uint16"), 2),
+    **dict.fromkeys(("int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("int64", "uint64", "float64"), 8),
+}
+_UNSIGNED: Final = {"uint16": "<H", "uint32": "<I", "uint64": "<Q", "int32": "<i", "int64": "<q"}
+
+Kind = Literal["counter", "stamps"]
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+class Position(NamedTuple):
+    """Where one message lies: its counter or stamp (ns), and its log time."""
+
+    value: int
+    log_time: Ns
+
+
+class Progress(NamedTuple):
     """The messages of a topic in one split, at least one, by log time, and what shows holes."""
 
     kind: Kind
     positions: Sequence[Position]
 
 
+class Hole(NamedTuple):
+    """Messages that are missing between two that are not.
+
+    An open one may still turn out to be a late message: too few follow to tell.
+    """
+
+    before: Position
+    after: Position
+    missing: int
+    is_open: bool = False
+
+
 @dataclass(slots=True)
-class _Pending:
-    recording: str
-    topic: str
+class _Series:
+    """What the recordings have of a topic, by value; the first message is settled."""
+
     kind: Kind
-    hole: Hole
-    found_at: int
-    """How many splits had been measured before."""
-    missed: int
-    """How many are missing in this recording."""
+    positions: list[Position]
+    heard: int = 0
+    """How many splits had been measured when it last came."""
 
 
 class LossCounter:
@@ -55,69 +113,40 @@ class LossCounter:
         self._heard: dict[str, int] = {}
         # Up to which log time each recording has been measured.
         self._reached: dict[str, Ns] = {}
-        # The values of the newest splits by topic, ascending.
-        self._recent: deque[tuple[str, Mapping[str, array[int]]]] = deque(maxlen=_RECENT)
-        # By recording and topic: the newest messages, from the first gap on that may still close.
-        self._ends: dict[tuple[str, str], Sequence[Position]] = {}
-        self._pending: list[_Pending] = []
+        self._series: dict[str, _Series] = {}
         self._lately: deque[Loss] = deque(maxlen=10_000)
-        self.counted: set[str] = set()
+        self._counted: set[str] = set()
 
     def begun(self, recording: str) -> None:
         """Notes that a recording begins, which may have what another one misses."""
         self._heard[recording] = self._measured
 
-    def unclear(self, recording: str, topics: Collection[str] | None = None) -> None:
-        """Notes that the next split does not show what it has of these topics; None: of any."""
-        self._ends = {
-            key: end
-            for key, end in self._ends.items()
-            if key[0] != recording or (topics is not None and key[1] not in topics)
-        }
+    def unclear(self, topics: Collection[str] | None = None) -> None:
+        """Notes that a split does not show what it has of these topics; None: of any."""
+        for topic in [*self._series] if topics is None else topics:
+            self._series.pop(topic, None)
 
     def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
         """Takes the next split of a recording; returns the losses that are certain by now."""
-        values = {
-            topic: array("q", sorted(each.value for each in found.positions))
-            for topic, found in split.items()
-        }
         self._measured += 1
         self._heard[recording] = self._measured
-        ends = [found.positions[-1].log_time for found in split.values()]
-        self._reached[recording] = max([self._reached.get(recording, 0), *ends])
-        self._pending = [each for each in self._pending if self._remains(each, recording, values)]
-        due = [each for each in self._pending if self._is_settled(each)]
-        self._pending = [each for each in self._pending if each not in due]
         for topic, found in split.items():
-            new = self._new_holes(recording, topic, found)
-            if new is None:
-                continue
-            self.counted.add(topic)
-            for hole in new:
-                pending = _Pending(recording, topic, found.kind, hole, self._measured, hole.missing)
-                if all(self._remains(pending, *each) for each in self._recent):
-                    known = [*self._pending, *due]
-                    pending.hole = replace(
-                        pending.hole, missing=pending.hole.missing - _shared(pending, known)
-                    )
-                    if pending.hole.missing > 0:
-                        self._pending.append(pending)
-        self._recent.append((recording, values))
+            reached = max(self._reached.get(recording, 0), found.positions[-1].log_time)
+            self._reached[recording] = reached
+            self._add(topic, found)
         for name, heard in [*self._heard.items()]:
-            if self._measured - heard >= _RECENT:
+            if self._measured - heard >= RECENT:
                 del self._heard[name]
                 self._reached.pop(name, None)
-                self.unclear(name)
-        return self._certain(due)
+        return self._settle(min(self._reached.get(name, 0) for name in self._heard))
 
     def flush(self) -> list[Loss]:
         """Returns what no further split will fill."""
-        due, self._pending = self._pending, []
-        return self._certain(due)
+        return self._settle(MAX_NS)
 
     def reported(self, topic: str, start: Ns, stop: Ns, lost: int) -> list[Loss]:
         """Takes rosbag2's own count of a topic; returns it where nothing else counts the topic."""
-        if topic in self.counted:
+        if topic in self._counted:
             return []
         loss = Loss(topic, start, stop, lost, "rosbag2")
         self._lately.append(loss)
@@ -131,86 +160,143 @@ class LossCounter:
                 found[loss.topic] = found.get(loss.topic, 0) + loss.lost
         return found
 
-    def _new_holes(self, recording: str, topic: str, found: Progress) -> list[Hole] | None:
-        """Returns the holes that the next split of a recording adds; None without a cadence."""
-        end, positions = self._ends.get((recording, topic), ()), found.positions
-        if end and end[-1].value >= positions[0].value:
-            return holes(positions, found.kind)
-        positions = [*end, *positions]
-        self._ends[recording, topic] = positions[-1:]
-        new = holes(positions, found.kind)
-        if new is None:
-            return None
-        still_open = next((hole.before for hole in new if hole.is_open), None)
-        if still_open is not None:
-            self._ends[recording, topic] = positions[positions.index(still_open) :]
-        if not end:
-            return new
-        self._look_again(recording, topic, end[0], new)
-        return [hole for hole in new if hole.before.value >= end[-1].value]
+    def _add(self, topic: str, found: Progress) -> None:
+        """Puts what a split has of a topic together with what is known of it."""
+        positions, series = found.positions, self._series.get(topic)
+        steps = enumerate(pairwise(positions), 1)
+        back = [at for at, (one, other) in steps if one.value >= other.value]
+        if len(back) > 1:  # several publishers
+            self.unclear([topic])
+            return
+        first, last = positions[0] if series is None else series.positions[0], positions[-1]
+        if back and last.value < positions[back[0] - 1].value:
+            # Its publisher began anew. Else what it had sent before came again, as latched.
+            series, positions = None, positions[back[0] :]
+        elif last.value < first.value and last.log_time > first.log_time:
+            series = None
+        known = [] if series is None else series.positions
+        by_value = dict(sorted((*known, *positions), reverse=True))
+        merged = [Position(*item) for item in sorted(by_value.items())]
+        if series is not None:
+            merged = [position for position in merged if position.value >= first.value]
+        self._series[topic] = _Series(found.kind, merged, self._measured)
 
-    def _look_again(
-        self, recording: str, topic: str, first: Position, found: Sequence[Hole]
-    ) -> None:
-        """Corrects the open holes of a topic, from a first message on, by what was found since."""
-        now = {hole.before: hole for hole in found}
-        for each in self._pending:
-            if (each.recording, each.topic) != (recording, topic) or not each.hole.is_open:
-                continue
-            if each.hole.before.value < first.value:
-                continue
-            hole = now.get(each.hole.before)
-            missed = 0 if hole is None else hole.missing
-            missing = each.hole.missing + missed - each.missed
-            is_open = hole is not None and hole.is_open
-            each.hole, each.missed = replace(each.hole, missing=missing, is_open=is_open), missed
-        self._pending = [each for each in self._pending if each.hole.missing > 0]
-
-    def _is_settled(self, pending: _Pending) -> bool:
-        """Whether nothing more can show that less is missing."""
-        if pending.hole.is_open and self._measured - pending.found_at < _RECENT:
-            return False
-        return all(
-            self._reached.get(name, 0) >= pending.hole.after.log_time
-            for name, heard in self._heard.items()
-            if self._measured - max(heard, pending.found_at) < _RECENT
-        )
-
-    def _remains(self, pending: _Pending, recording: str, values: Mapping[str, array[int]]) -> bool:
-        """Takes from a hole what another recording has; returns whether anything is left."""
-        if pending.recording == recording or pending.topic not in values:
-            return True
-        known, hole = values[pending.topic], pending.hole
-        inside = bisect_left(known, hole.after.value) - bisect_right(known, hole.before.value)
-        pending.hole = replace(hole, missing=hole.missing - inside)
-        return inside < hole.missing
-
-    def _certain(self, due: Sequence[_Pending]) -> list[Loss]:
-        losses = [
-            Loss(
-                each.topic,
-                each.hole.before.log_time,
-                each.hole.after.log_time,
-                each.hole.missing,
-                each.kind,
+    def _settle(self, until: Ns) -> list[Loss]:
+        """Returns the losses up to a log time that all recordings have reached."""
+        losses: list[Loss] = []
+        for topic, series in self._series.items():
+            positions, is_over = series.positions, until == MAX_NS
+            is_over |= self._measured - series.heard >= RECENT
+            settled = max(
+                (at for at, position in enumerate(positions) if position.log_time <= until),
+                default=0,
             )
-            for each in due
-        ]
+            found = holes(positions, series.kind)
+            if found is not None:
+                self._counted.add(topic)
+            for hole in found or ():
+                if hole.after.value > positions[settled].value:
+                    break
+                if hole.is_open and not is_over:
+                    settled = positions.index(hole.before)
+                    break
+                losses.append(
+                    Loss(
+                        topic, hole.before.log_time, hole.after.log_time, hole.missing, series.kind
+                    )
+                )
+            series.positions = positions[settled:]
         self._lately += losses
         return losses
 
 
-def _shared(pending: _Pending, others: Sequence[_Pending]) -> int:
-    """Returns how much of a hole was found in another recording, too, where both miss it."""
-    hole = pending.hole
-    return max(
-        (
-            each.hole.missing
-            for each in others
-            if each.topic == pending.topic
-            and each.recording != pending.recording
-            and each.hole.before.value < hole.after.value
-            and hole.before.value < each.hole.after.value
-        ),
-        default=0,
-    )
+def reader_of(schema: Schema) -> tuple[Kind, Callable[[bytes], int]] | None:
+    """Returns what shows holes in messages of this type; None where nothing does.
+
+    The returned function takes a payload, and raises `struct.error` for one that does not fit.
+    """
+    if schema.encoding != "ros2msg":
+        return None
+    fields = _fields(schema.text.decode(errors="replace"))
+    before: list[str] = []
+    for kind, name in fields:
+        if name in _COUNTERS and kind in _UNSIGNED:
+            return "counter", partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+        if kind not in {"string", *_SIZES, *_HEADERS, *_TIMES}:
+            break
+        before.append(kind)
+    if fields and fields[0][0] in _HEADERS:
+        return "stamps", _stamp
+    return None
+
+
+def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
+    """Returns the holes between messages, in the order of their positions.
+
+    None where no cadence is to be seen, so that nothing can be expected: few messages, irregular
+    ones, or several publishers.
+
+    A message that was stamped late leaves a wide step, too, but then the next ones follow in a
+    burst. So what counts is how far behind the cadence the messages after the step remain.
+    """
+    if len(positions) < FEWEST:
+        return None
+    if sum(one.value >= other.value for one, other in pairwise(positions)) > 1:
+        return None
+    steps = [(one, other, other.value - one.value) for one, other in pairwise(positions)]
+    lengths = [length for _, _, length in steps if length > 0]
+    usual = 1 if kind == "counter" else median_low(lengths or [0])
+    allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
+    regular = [length for length in lengths if abs(length - usual) <= allowed]
+    if usual <= 0 or len(regular) < REGULAR * len(steps):
+        return None
+    period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
+    found: list[Hole] = []
+    for index, (one, other, length) in enumerate(steps):
+        missing = round(length / period) - 1
+        wide = length > (2 - _TOLERANCE) * period
+        short = other.log_time - one.log_time <= LONGEST_NS and missing <= MOST_MISSING
+        if not (wide and short):
+            continue
+        enough = 1 if kind == "counter" else missing + FEWEST
+        later = positions[index + 1 : index + 1 + enough]
+        behind = min(each.value - nth * period for nth, each in enumerate(later, 1)) - one.value
+        if (missing := round(behind / period)) > 0:
+            found.append(Hole(one, other, missing, len(later) < enough))
+    return found
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """Returns type and name of each field of the message itself."""
+    found: list[tuple[str, str]] = []
+    for raw in text.splitlines():
+        line = raw.partition("#")[0].strip()
+        if line.startswith("==="):
+            break
+        words = line.split()
+        if len(words) >= 2 and "=" not in "".join(words[1:3]):
+            found.append((words[0], words[1]))
+    return found
+
+
+def _stamp(payload: bytes) -> int:
+    seconds, nanoseconds = struct.unpack_from("<iI", payload, 4)
+    return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def _counter(payload: bytes, before: Sequence[str], form: str) -> int:
+    at = 0
+    for kind in before:
+        if kind in _SIZES:
+            at = _aligned(at, _SIZES[kind]) + _SIZES[kind]
+            continue
+        at = _aligned(at, 4)
+        if kind != "string":
+            at += 8
+        if kind == "string" or kind in _HEADERS:
+            at += 4 + int(struct.unpack_from("<I", payload, 4 + at)[0])
+    return int(struct.unpack_from(form, payload, 4 + _aligned(at, struct.calcsize(form)))[0])
+
+
+def _aligned(at: int, size: int) -> int:
+    return -(-at // size) * size

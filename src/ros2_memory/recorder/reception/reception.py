@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
@@ -18,9 +18,8 @@ from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import counted, listed
-from ros2_memory.recorder.reception.arrivals import Arrivals
 from ros2_memory.recorder.reception.losses import LossCounter
-from ros2_memory.recorder.reception.measure import measure_split
+from ros2_memory.recorder.reception.measure import Arrivals, measure_split
 from ros2_memory.recorder.reception.profiles import (
     QueuePlan,
     TopicFlow,
@@ -60,8 +59,10 @@ class Rotation(NamedTuple):
 @dataclass(slots=True)
 class _Recording:
     plan: QueuePlan
-    refused: set[str]
+    refused: set[str] = field(default_factory=set)
     """Topics with a publisher that this recording's subscription does not fit."""
+    span: tuple[Ns, Ns] = (0, 0)
+    """First and last log time of what it has."""
 
 
 class Reception:
@@ -94,7 +95,6 @@ class Reception:
         self._bag_dir = bag_dir
         self._losses = LossCounter()
         self._arrivals = Arrivals()
-        self._spans: dict[str, tuple[Ns, Ns]] = {}
         self._lock = threading.Lock()
         self._flows: dict[str, TopicFlow] = {}
         self._asked_anew: set[str] = set()
@@ -107,13 +107,13 @@ class Reception:
     def cut_short(self) -> frozenset[str]:
         """The topics whose queues hold less than two seconds, for want of memory."""
         with self._lock:
-            return plan_queues(self._planned_for(), self._queue_bytes).cut_short
+            return self._plan().cut_short
 
     def overrides(self, recording: str) -> str:
         """Returns the QoS overrides for a recording that is about to start."""
         with self._lock:
-            plan = plan_queues(self._planned_for(), self._queue_bytes)
-            self._recordings[recording] = _Recording(plan, set())
+            plan = self._plan()
+            self._recordings[recording] = _Recording(plan)
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
@@ -148,23 +148,16 @@ class Reception:
 
     def flush(self) -> None:
         """Counts what no further split can fill; called when nothing is recorded any more."""
-        self._run(self._flush)
-
-    def _flush(self) -> None:
-        with self._lock:
-            losses = self._losses.flush()
-        self._report(losses)
+        self._run(lambda: self._count(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
 
-        def count_them() -> None:
-            with self._lock:
-                start, stop = self._spans.get(recording, (0, 0))
-                losses = self._losses.reported(topic, start, stop, count)
-            self._report(losses)
+        def reported() -> list[Loss]:
+            known = self._recordings.get(recording)
+            return self._losses.reported(topic, *((0, 0) if known is None else known.span), count)
 
-        self._run(count_them)
+        self._run(lambda: self._count(reported))
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are known to be missing of the last hour."""
@@ -176,7 +169,9 @@ class Reception:
         with self._lock:
             return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
 
-    def _report(self, losses: Sequence[Loss]) -> None:
+    def _count(self, take: Callable[[], list[Loss]]) -> None:
+        with self._lock:
+            losses = take()
         if not losses:
             return
         by_topic: dict[str, int] = {}
@@ -221,18 +216,23 @@ class Reception:
                 if now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
             )
             if again:
-                return Rotation("asking_again", _asking_again(again), again, is_fault=True)
+                sentence = (
+                    f"a publisher offers weaker QoS than requested on {listed(sorted(again))}: a "
+                    "new recording subscribes again; messages sent by it meanwhile are not recorded"
+                )
+                return Rotation("asking_again", sentence, again, is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
                 return None
-            flows = self._planned_for()
-            plan = plan_queues(flows, self._queue_bytes)
-            shallow = too_shallow_topics(flows, plan, known.plan)
-            return Rotation("queues_deepened", _deeper(shallow), shallow) if shallow else None
+            shallow = too_shallow_topics(self._planned_for(), self._plan(), known.plan)
+            if not shallow:
+                return None
+            sentence = "a new recording starts, to subscribe with deeper queues: "
+            return Rotation("queues_deepened", sentence + listed(sorted(shallow)), shallow)
 
     def rotation_begun(self, rotation: Rotation, now_s: float) -> None:
         """Records why a rotation was started."""
         with self._lock:
-            if rotation.event == "asking_again":
+            if rotation.is_fault:
                 self._asked_s |= dict.fromkeys(rotation.topics, now_s)
             else:
                 self._deepened_s = now_s
@@ -245,6 +245,9 @@ class Reception:
             if not (topic in self._latched and flow.offered.latched)
         }
 
+    def _plan(self) -> QueuePlan:
+        return plan_queues(self._planned_for(), self._queue_bytes)
+
     def _measure(self, recording: str, path: Path) -> None:
         try:
             split = measure_split(self._reader, path, end_only=not recording)
@@ -252,10 +255,10 @@ class Reception:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
             with self._lock:
-                self._losses.unclear(recording)
+                self._losses.unclear()
             return
         with self._lock:
-            before = plan_queues(self._planned_for(), self._queue_bytes).cut_short
+            before = self._plan().cut_short
             known = self._recordings.get(recording)
             for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
@@ -263,18 +266,15 @@ class Reception:
                     old = self._flows.get(topic)
                     self._flows[topic] = flow if old is None else old.joined(flow)
                     self._asked_anew.discard(topic)
-            short = plan_queues(self._planned_for(), self._queue_bytes).cut_short
-            if split.span is not None:
-                begun = self._spans.pop(recording, split.span)
-                self._spans[recording] = (begun[0], split.span[1])
-                for name in [*self._spans][:-_PLANS_KEPT]:
-                    del self._spans[name]
-            self._losses.unclear(recording, split.unclear)
+            short = self._plan().cut_short - before
+            self._losses.unclear(split.unclear)
             if recording:
                 self._arrivals.measured(split)
-            losses = self._losses.measured(recording, split.progress) if recording else []
-        self._report(losses)
-        for topic in sorted(short - before):
+            if known is not None and split.span is not None:
+                known.span = known.span[0] or split.span[0], split.span[1]
+        if recording:
+            self._count(lambda: self._losses.measured(recording, split.progress))
+        for topic in sorted(short):
             _log.warning(
                 "queue_cut_short",
                 topic=topic,
@@ -305,14 +305,3 @@ def _in_thread() -> Callable[[Callable[[], None]], None]:
         pool.submit(task)
 
     return run
-
-
-def _asking_again(topics: Collection[str]) -> str:
-    return (
-        f"a publisher offers weaker QoS than requested on {listed(sorted(topics))}: a new "
-        "recording subscribes again; messages sent by it meanwhile are not recorded"
-    )
-
-
-def _deeper(topics: Collection[str]) -> str:
-    return f"a new recording starts, to subscribe with deeper queues: {listed(sorted(topics))}"

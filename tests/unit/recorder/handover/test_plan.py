@@ -8,20 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.handover_file import Counting, CutClock, Handover, Overlap
+from ros2_memory.bag_dir.handover_file import CutClock, Handover
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.recorder.handover.plan import (
+from ros2_memory.recorder.handover.transfer import (
     Bounds,
-    ClockReading,
     HandoverPlan,
-    Sidecars,
     Step,
     complete_sidecars,
-    intended,
-    pending,
-    set_back,
-    void,
 )
+from ros2_memory.recorder.policies import ClockReading, set_back
 
 T0 = 1_795_150_000 * NS_PER_S
 S = NS_PER_S
@@ -47,18 +42,6 @@ class TestSteps:
         assert plan.bounds(at(8)) is not None
         assert waited(plan, 8.0, ready=True) is Step.COMPLETE
 
-    def test_a_recorder_that_is_not_ready_is_waited_for(self) -> None:
-        plan = HandoverPlan(at(0))
-        assert waited(plan, 1.0, 10.0, 100.0, ready=False) is Step.WAIT
-        assert plan.bounds(at(100)) is None
-
-    def test_a_topic_that_nobody_publishes_any_more_is_waited_for_until_the_timeout(self) -> None:
-        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(plan, 19.9, ready=True, missing=("/gone",)) is Step.WAIT
-        assert plan.bounds(at(100)) is None
-        assert waited(plan, 20.0, 24.9, ready=True, missing=("/gone",)) is Step.WAIT
-        assert waited(plan, 25.0, ready=True, missing=("/gone",)) is Step.COMPLETE
-
     def test_a_publisher_that_appears_while_both_record_is_waited_for_again(self) -> None:
         plan = HandoverPlan(at(0), subscribe_timeout_s=20)
         assert waited(plan, 1.0, 2.5, ready=True) is Step.WAIT
@@ -72,12 +55,6 @@ class TestSteps:
         assert waited(plan, 19.0, ready=True) is Step.WAIT
         assert waited(plan, 20.5, ready=True, missing=("/late",)) is Step.WAIT
         assert waited(plan, 24.0, ready=True, missing=("/late",)) is Step.COMPLETE
-
-    def test_the_clock_set_back_abandons_it(self) -> None:
-        plan = HandoverPlan(at(0))
-        waited(plan, 0.2, ready=True)
-        step = plan.advance(at(0.4, stepped_s=-0.15), ready=True, missing=())
-        assert step is Step.ABANDON
 
     def test_the_clock_set_forward_does_not(self) -> None:
         plan = HandoverPlan(at(0))
@@ -103,54 +80,6 @@ class TestSteps:
 )
 def test_only_a_clock_that_falls_behind_at_once_was_set_back(wall_s: float, expected: bool) -> None:
     assert set_back(ClockReading(10.0, T0), ClockReading(11.0, T0 + round(wall_s * S))) is expected
-
-
-class TestSidecars:
-    def make(self, **changes: object) -> Sidecars:
-        arguments: dict[str, object] = {
-            "old_files": ["a_7.mcap", "a_6.mcap"],
-            "new_files": ["b_0.mcap"],
-            "simulated": False,
-            "clock": CutClock.PUBLISH,
-        }
-        old = Handover(previous="z", counts_from=5, begin=Overlap(1, 9, ("a_0.mcap",)))
-        bounds = Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
-        return complete_sidecars(old, "a", "b", bounds, **(arguments | changes))  # type: ignore[arg-type]
-
-    def test_both_name_each_other_and_the_cut(self) -> None:
-        old, new = self.make()
-        assert (old.next, old.counts_until) == ("b", T0 + 4 * S)
-        assert (new.previous, new.counts_from) == ("a", T0 + 4 * S)
-        assert new.state is Counting.COUNTS
-
-    def test_what_the_old_one_knew_of_its_own_beginning_stays(self) -> None:
-        old, _ = self.make()
-        assert (old.previous, old.counts_from) == ("z", 5)
-        assert old.begin == Overlap(1, 9, ("a_0.mcap",))
-
-    def test_each_cut_holds_only_in_the_overlap_and_in_the_files_of_it(self) -> None:
-        old, new = self.make()
-        assert old.end is not None
-        assert (old.end.log_from, old.end.files) == (T0 + 3 * S, ("a_6.mcap", "a_7.mcap"))
-        assert new.begin == Overlap(T0, T0 + 5 * S, ("b_0.mcap",))
-
-    def test_log_times_of_a_simulated_clock_do_not_bind(self) -> None:
-        old, new = self.make(simulated=True)
-        assert old.end == Overlap(None, None, ("a_6.mcap", "a_7.mcap"))
-        assert new.begin == Overlap(None, None, ("b_0.mcap",))
-
-    def test_a_cut_by_log_time_is_noted_in_both(self) -> None:
-        old, new = self.make(clock=CutClock.LOG)
-        assert old.clock is new.clock is CutClock.LOG
-        assert any("by log time" in note for note in old.notes)
-        assert any("by log time" in note for note in new.notes)
-
-    def test_before_and_after_a_failed_handover(self) -> None:
-        old = Handover(previous="z")
-        assert intended(old, "b") == Handover(previous="z", next="b")
-        assert intended(intended(old, "b"), None) == old
-        assert pending("a").hides_all
-        assert void("a").hides_all
 
 
 class Receiver(NamedTuple):

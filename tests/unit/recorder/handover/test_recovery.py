@@ -14,21 +14,15 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     Counting,
-    CutClock,
     Handover,
     Overlap,
     read_handover,
     write_handover,
 )
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat, write_heartbeat
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover.plan import intended, pending, void
-from ros2_memory.recorder.handover.recovery import (
-    cut_clock,
-    incomplete_handover,
-    recover_handovers,
-    recover_unwritten,
-)
+from ros2_memory.recorder.handover.transfer import pending, void
+from ros2_memory.recorder.handover.union import intended, recover_handovers
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
 
@@ -84,7 +78,7 @@ def test_whatever_either_holds_counts_exactly_once(
         range(round(new_start * 10), round((new_start + new_lasts) * 10))
     )
     assert counted(bag_dir) == dict.fromkeys((T0 + n * S // 10 for n in expected), 1)
-    assert incomplete_handover(old) is None
+    assert read_handover(old).handover.counts_until is not None
 
 
 def test_a_new_one_that_left_no_sidecar_is_completed_too(tmp_path: Path) -> None:
@@ -175,25 +169,7 @@ def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path
     with capture_logs() as logs:
         recover_handovers(tmp_path, READER)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
-    assert incomplete_handover(tmp_path / "c") is None
-
-
-class TestCutClock:
-    def test_publish_times_that_differ_from_log_times_are_what_is_cut_by(
-        self, tmp_path: Path
-    ) -> None:
-        old = recording(tmp_path, "a", 0, 3, delay=7)
-        assert cut_clock(old / "a_0.mcap", READER) is CutClock.PUBLISH
-
-    def test_where_they_are_equal_throughout_it_is_log_time(self, tmp_path: Path) -> None:
-        old = recording(tmp_path, "a", 0, 3, delay=0)
-        assert cut_clock(old / "a_0.mcap", READER) is CutClock.LOG
-
-    def test_a_bag_that_is_empty_or_unreadable_counts_as_publish_time(self, tmp_path: Path) -> None:
-        write_mcap(tmp_path / "empty.mcap", [])
-        (tmp_path / "broken.mcap").write_bytes(b"broken")
-        assert cut_clock(tmp_path / "empty.mcap", READER) is CutClock.PUBLISH
-        assert cut_clock(tmp_path / "broken.mcap", READER) is CutClock.PUBLISH
+    assert read_handover(tmp_path / "c").handover.next is None
 
 
 def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: Path) -> None:
@@ -224,7 +200,7 @@ class TestWhileSomethingIsRecorded:
         names = (running,)
         beat = Heartbeat(1, T0, RecorderState.RECORDING, names, T0, 0, (), (), None, 5.0)
         write_heartbeat(bag_dir, beat)
-        recover_unwritten(bag_dir, READER)
+        recover_handovers(bag_dir, READER, read_heartbeat(bag_dir).recordings)
 
     def test_what_nobody_writes_is_completed(self, bag_dir: Path) -> None:
         self.settle_beside(bag_dir, "c")
@@ -232,7 +208,7 @@ class TestWhileSomethingIsRecorded:
 
     def test_a_recording_that_still_hands_over_is_left_alone(self, bag_dir: Path) -> None:
         self.settle_beside(bag_dir, "a")
-        assert incomplete_handover(bag_dir / "a") == "b"
+        assert read_handover(bag_dir / "a").handover == intended(Handover(), "b")
         assert read_handover(bag_dir / "b").handover == pending("a")
 
 

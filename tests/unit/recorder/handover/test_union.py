@@ -23,15 +23,8 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.handover import union
-from ros2_memory.recorder.handover.plan import (
-    Bounds,
-    complete_sidecars,
-    intended,
-    pending,
-    void,
-)
-from ros2_memory.recorder.handover.recovery import recover_handovers, settle_handover
-from ros2_memory.recorder.handover.union import compare_recordings
+from ros2_memory.recorder.handover.transfer import Bounds, complete_sidecars, pending, void
+from ros2_memory.recorder.handover.union import intended, recover_handovers, settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.examples import examples
@@ -208,7 +201,7 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
     else:
         write_handover(bag_dir / "a", Handover() if kind == "void" else intended(Handover(), "b"))
         write_handover(bag_dir / "b", void("a") if kind == "void" else pending("a"))
-    assert settle_handover(bag_dir / "a", bag_dir / "b", READER, ())
+    assert settle_handover(bag_dir / "a", bag_dir / "b", READER)
     assert_union(bag_dir)
 
 
@@ -232,7 +225,7 @@ def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Pa
     Recorder(4, 13).writes(tmp_path / "b", published)
     hand_over(tmp_path, 5)
     before = (tmp_path / "a" / "handover.json").stat().st_mtime_ns
-    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
     assert (tmp_path / "a" / "handover.json").stat().st_mtime_ns == before
     after = read_handover(tmp_path / "b").handover
     assert (after.compared, after.also_counts, after.counts_elsewhere) == (True, {}, {})
@@ -245,7 +238,7 @@ def test_of_one_that_holds_nothing_the_other_has_all(tmp_path: Path, empty: str)
     Recorder(0, 0 if empty == "a" else 7.5).writes(tmp_path / "a", published)
     Recorder(4, 4 if empty == "b" else 13).writes(tmp_path / "b", published)
     hand_over(tmp_path, 5)
-    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
     assert_union(tmp_path)
 
 
@@ -256,11 +249,11 @@ class TestWhenItIsDue:
         Recorder(4, 9, (Stall(6, 1),), splits=(8.0,)).writes(tmp_path / "b", published)
         hand_over(tmp_path, 5)
         old, new = tmp_path / "a", tmp_path / "b"
-        assert not compare_recordings(old, new, READER, running={"a", "b"})
-        assert not compare_recordings(old, new, READER, running={"b"})
+        assert not settle_handover(old, new, READER, running={"a", "b"})
+        assert not settle_handover(old, new, READER, running={"b"})
         more = Recorder(9, 14).receives(published)
         write_mcap(new / "b_2.mcap", more, LAYOUT)
-        assert compare_recordings(old, new, READER, running={"b"})
+        assert settle_handover(old, new, READER, running={"b"})
         assert_union(tmp_path)
 
     def test_a_recorder_that_was_killed_before_does_it_at_its_next_start(
@@ -288,7 +281,7 @@ class TestWhenItIsDue:
         with monkeypatch.context() as patch:
             patch.setattr(McapReader, "records", fails)
             with pytest.raises(RecorderError, match="input/output"):
-                compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+                settle_handover(tmp_path / "a", tmp_path / "b", READER)
         assert read_handover(tmp_path / "b").handover.compared is False
 
 
@@ -305,7 +298,7 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
         ]
         write_mcap(tmp_path / name / f"{name}_0.mcap", written, LAYOUT)
     hand_over(tmp_path, 5, clock=CutClock.LOG)
-    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
     after = read_handover(tmp_path / "b").handover
     assert (after.notes, after.also_counts) == ((LOG_CLOCK_NOTE,), {})
     assert_union(tmp_path)
@@ -319,7 +312,7 @@ def test_where_too_many_would_be_listed_all_count(
     Recorder(0, 7.5).writes(tmp_path / "a", published)
     Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)
     hand_over(tmp_path, 5)
-    assert compare_recordings(tmp_path / "a", tmp_path / "b", READER)
+    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
     reader = BagDirReader(READER)
     for name in ("a", "b"):
         assert numbers(tmp_path / name, reader) == numbers(tmp_path / name, READER)

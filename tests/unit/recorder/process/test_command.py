@@ -16,7 +16,6 @@ from ros2_memory.recorder.process.command import (
     storage_config,
 )
 from ros2_memory.recorder.process.topics import TopicSelection
-from ros2_memory.recorder.ros2bag import record_argv as record_argv_of_the_adapter
 
 TOPICS = TopicSelection(("/odom", "/tf", "/tf_static"))
 COMMON = (
@@ -113,11 +112,17 @@ def test_the_argv_is_this_to_the_letter() -> None:
 
 
 def test_what_a_distribution_knows_is_added_to_the_letter() -> None:
-    known = frozenset((*OPTIONAL, "--repeat-transient-local"))
+    known = frozenset(
+        (*OPTIONAL, "--repeat-transient-local", "--max-cache-size", "--min-free-space")
+    )
     added = argv_for(known, use_sim_time=True, repeat_latched=("/tf_static=32", "/map"))
     assert added[: len(argv_for())] == argv_for()
     assert added[len(argv_for()) :] == [
         "--use-sim-time",
+        "--max-cache-size",
+        "67108864",
+        "--min-free-space",
+        "1000000000",
         "--disable-keyboard-controls",
         "--node-name",
         "ros2_memory_rec_1",
@@ -127,19 +132,6 @@ def test_what_a_distribution_knows_is_added_to_the_letter() -> None:
         "/tf_static=32",
         "/map",
     ]
-
-
-def test_nothing_is_repeated_where_nothing_is_to_be() -> None:
-    assert "--repeat-transient-local" not in argv_for(frozenset({"--repeat-transient-local"}))
-
-
-def test_hidden_topics_are_included_only_when_one_is_named() -> None:
-    assert "--include-hidden-topics" not in argv_for()
-    assert "--include-hidden-topics" in argv_for(topics=TopicSelection(("/_hidden",)))
-
-
-def test_the_adapter_shows_the_same_function() -> None:
-    assert record_argv_of_the_adapter is record_argv
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
@@ -177,10 +169,6 @@ def test_an_option_that_only_a_description_mentions_is_not_there() -> None:
     )
 
 
-def test_text_that_is_no_help_lists_nothing() -> None:
-    assert options_in_help("Command 'ros2' not found; try --node-name") == frozenset()
-
-
 def test_an_installation_without_mcap_is_refused() -> None:
     usage = "usage: ros2 bag record [-h] [-s {sqlite3,my_plugin}]\n\noptions: mcap\n"
     with pytest.raises(RecorderError, match="rosbag2-storage-mcap"):
@@ -196,17 +184,6 @@ def test_what_rosbag2_reports_as_lost_is_recorded_where_it_reports_it() -> None:
     assert re.search(pattern, "/odom")
     assert not re.search(pattern, "/events/write_split")
     assert "/events" not in " ".join(argv_for())
-
-
-def test_what_waits_for_the_disk_is_bounded() -> None:
-    argv = argv_for(frozenset({"--max-cache-size"}))
-    assert argv[argv.index("--max-cache-size") + 1] == "67108864"
-
-
-def test_it_ends_by_itself_on_a_full_disk_where_it_can() -> None:
-    assert "--min-free-space" not in argv_for()
-    argv = argv_for(frozenset({"--min-free-space"}))
-    assert argv[argv.index("--min-free-space") + 1] == "1000000000"
 
 
 def test_chunks_are_small_and_compressed() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
@@ -45,20 +44,6 @@ def test_the_shipped_list_is_that_of_the_specification() -> None:
         "/vision/scene/scene_objects",
         "/vision/find_object/detections_meta",
     )
-
-
-def test_a_topic_that_is_commented_out_stays_out(tmp_path: Path) -> None:
-    topics = load_topics(listed(tmp_path, "topics:\n  - /odom\n  # - /camera/image_raw\n"))
-    assert topics.entries == ("/odom",)
-    assert not topics.matches("/camera/image_raw")
-
-
-def test_an_entry_that_is_listed_twice_counts_once(tmp_path: Path) -> None:
-    assert load_topics(listed(tmp_path, "topics: [/tf, /odom, /tf]")).entries == ("/tf", "/odom")
-
-
-def test_the_pattern_is_anchored_and_in_the_order_of_the_file() -> None:
-    assert TopicSelection(("/odom", "/tf", "/tf_static")).regex == "^(/odom|/tf|/tf_static)$"
 
 
 def test_a_topic_does_not_bring_those_whose_names_begin_or_end_alike() -> None:
@@ -157,19 +142,9 @@ def test_a_missing_list_is_refused_with_its_key(tmp_path: Path) -> None:
     assert "recording.topics_file" in refusal(tmp_path / "nowhere.yaml")
 
 
-def test_bytes_that_are_no_text_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "topics.yaml"
-    path.write_bytes(b"\xff\xfe\x00")
-    assert "it is not YAML" in refusal(path)
-
-
 def test_more_topics_than_a_pattern_can_hold_are_refused(tmp_path: Path) -> None:
     lines = "\n".join(f"- /{'t' * 200}_{number}" for number in range(400))
     assert "use globs" in refusal(listed(tmp_path, f"topics:\n{lines}\n"))
-
-
-def test_the_pattern_is_a_regular_expression() -> None:
-    re.compile(TopicSelection(("/a*b/c", "/*")).regex)
 
 
 def test_what_is_excluded_is_not_selected_by_a_glob(tmp_path: Path) -> None:

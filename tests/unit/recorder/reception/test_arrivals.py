@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from ros2_memory.recorder.reception.arrivals import Arrivals
-from ros2_memory.recorder.reception.measure import Arrival, SplitMeasure
+from ros2_memory.recorder.reception.measure import Arrival, Arrivals, SplitMeasure
 
 S = 10**9
 

@@ -10,8 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.state_files import Loss
-from ros2_memory.recorder.reception.continuity import Position, holes, reader_of
-from ros2_memory.recorder.reception.losses import HOUR_NS, LossCounter, Progress
+from ros2_memory.recorder.reception.losses import (
+    HOUR_NS,
+    LossCounter,
+    Position,
+    Progress,
+    holes,
+    reader_of,
+)
 from ros2_memory.storage.base import Schema
 
 NS = 10**9
@@ -107,8 +113,8 @@ def test_a_publisher_that_was_silent_for_long_lost_nothing() -> None:
 def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     counter = LossCounter()
     assert counter.measured("a", progress([*range(100)])) == []
-    assert counter.measured("a", progress([*range(103, 200)])) == []
-    [loss] = counter.measured("a", progress([*range(200, 300)]))
+    [loss] = counter.measured("a", progress([*range(103, 200)]))
+    assert counter.measured("a", progress([*range(200, 300)])) == []
     assert (loss.topic, loss.lost, loss.by) == ("/odom", 3, "stamps")
     assert loss.start == T0 + 99 * PERIOD + 1000
     assert counter.measured("a", progress([*range(300, 400)])) == []
@@ -122,6 +128,8 @@ def test_what_the_other_recording_of_a_handover_has_is_not_lost() -> None:
     splits = {"old": old, "new": new}
     for order in (("old", "new"), ("new", "old")):
         counter = LossCounter()
+        for name in splits:
+            counter.begun(name)
         losses = [loss for name in order for loss in counter.measured(name, splits[name])]
         assert [*losses, *counter.flush()] == []
 
@@ -169,13 +177,12 @@ def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
 def test_nothing_is_missing_between_splits_around_one_that_was_not_measured() -> None:
     counter = LossCounter()
     counter.measured("a", progress([*range(100)]))
-    counter.unclear("a", {"/odom", "/tf"})
+    counter.unclear({"/odom", "/tf"})
     counter.measured("a", progress([*range(200, 300)]))
-    counter.unclear("a")
+    counter.unclear()
     counter.measured("a", progress([*range(400, 500)]))
-    counter.unclear("a", {"/tf"})
-    counter.measured("a", progress([*range(510, 600)]))
-    assert [each.lost for each in counter.measured("a", progress([*range(600, 700)]))] == [10]
+    counter.unclear({"/tf"})
+    assert [each.lost for each in counter.measured("a", progress([*range(510, 600)]))] == [10]
 
 
 def test_rosbags_own_count_counts_where_nothing_else_does() -> None:
@@ -228,3 +235,30 @@ def test_counters_and_stamps_are_found_by_the_definition(
 def test_other_types_show_nothing(text: str) -> None:
     assert reader_of(Schema("a/msg/B", "ros2msg", text.encode())) is None
     assert reader_of(Schema("a/msg/B", "ros2idl", b"uint32 seq\n")) is None
+
+
+def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -> None:
+    counter = LossCounter()
+
+    def counts(values: Iterable[int], first: int) -> dict[str, Progress]:
+        at = [Position(value, T0 + (first + nth) * PERIOD) for nth, value in enumerate(values)]
+        return {"/odom": Progress("counter", at)}
+
+    assert counter.measured("a", counts(range(500, 600), 0)) == []
+    assert counter.measured("a", counts([*range(600, 640), *range(40)], 100)) == []
+    assert [each.lost for each in counter.measured("a", counts(range(45, 100), 190))] == [5]
+    assert counter.measured("a", counts(range(50), 300)) == []
+    assert counter.flush() == []
+
+
+def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
+    counter = LossCounter()
+    counter.begun("old")
+    assert counter.measured("old", progress([*range(100)])) == []
+    counter.begun("new")
+    again = [Position(value, T0 + 205 * PERIOD) for value, _ in at([*range(90, 130)])]
+    new = [*at([*range(205, 210)]), *again, *at([*range(210, 300)])]
+    old = progress([tick for tick in range(100, 215) if not 180 <= tick < 190])
+    losses = counter.measured("new", {"/odom": Progress("stamps", new)})
+    losses += counter.measured("old", old)
+    assert [loss.lost for loss in [*losses, *counter.flush()]] == [10]

@@ -8,14 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.recorder.reception.profiles import (
-    DEFAULT_DEPTH,
     OfferedQos,
-    QueuePlan,
     TopicFlow,
     offered_by_all,
     plan_queues,
     qos_overrides,
-    too_shallow_topics,
 )
 
 MIB = 2**20
@@ -73,29 +70,6 @@ def test_queues_hold_two_seconds_or_are_named_and_fit_in_their_memory(
     for topic, flow in flows.items():
         assert (plan.depths[topic] < flow.burst) == (topic in plan.cut_short)
         assert plan.depths[topic] >= 1
-
-
-def test_a_camera_does_not_cut_short_what_is_small() -> None:
-    flows = {
-        "/odom": TopicFlow(RELIABLE, 200, 700),
-        "/camera": TopicFlow(RELIABLE, 60, 6 * MIB),
-    }
-    plan = plan_queues(flows, 64 * MIB)
-    assert plan.cut_short == {"/camera"}
-    assert plan.depths["/odom"] >= 200
-    assert plan.depths["/camera"] == 10
-
-
-def test_only_topics_that_would_be_deeper_want_a_new_recording() -> None:
-    flows = {
-        "/fast": TopicFlow(RELIABLE, 100, 10),
-        "/slow": TopicFlow(RELIABLE, DEFAULT_DEPTH, 10),
-        "/deep": TopicFlow(RELIABLE, 100, 10),
-        "/huge": TopicFlow(RELIABLE, 100, 60 * MIB),
-    }
-    planned = plan_queues(flows, 64 * MIB)
-    active = QueuePlan({"/deep": 100, "/huge": 1})
-    assert too_shallow_topics(flows, planned, active) == {"/fast"}
 
 
 def test_an_override_names_the_whole_profile_but_no_deadline() -> None:
