@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
 from ros2_memory.counts.values import count_values
@@ -67,7 +66,8 @@ def count_range(
             "name fewer fields, or ask about a shorter window"
         )
     numbers = _numbers(view, name, binned, names) if names else None
-    counts, first, last = _counted(view, name, binned)
+    edges = binned.bins.edges[1:-1]
+    counts, first, last = count_messages(view, name, binned.counted, edges)
     if not counts.any():
         raise no_data_between(view, (name,), asked)
     member = binned.bins.member
@@ -83,18 +83,6 @@ def count_range(
 
 def _extreme(times: Times, which: Callable[[Iterable[Ns]], Ns]) -> Ns | None:
     return which(times.tolist()) if len(times) else None
-
-
-def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times, Times]:
-    """Returns for each piece how many messages it holds, and when the first and the last came."""
-    edges = binned.bins.edges[1:-1]
-    size = len(binned.bins.member)
-    counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
-    for counted in count_messages(view, topic, binned.counted, edges):
-        counts[counted.piece] += counted.messages
-        first[counted.piece] = min(first[counted.piece], counted.first)
-        last[counted.piece] = max(last[counted.piece], counted.last)
-    return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
 
 
 def _numbers(
