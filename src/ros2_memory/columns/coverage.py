@@ -65,6 +65,7 @@ class Coverage:
         begins = np.cumsum([0, *map(len, numbers)])
         everything = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(everything, kind="stable")
+        self._of_parts: dict[int, IntArray] = {}
         self._begins: IntArray = begins
         self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
         self._numbers: IntArray = everything[self._order]
@@ -87,6 +88,13 @@ class Coverage:
     def among(self, numbers: IntArray) -> IntArray:
         """Returns those of some numbers whose bags are bags of the timeline."""
         return numbers[self.positions(numbers) >= 0]
+
+    def of_part(self, part: int, numbers: IntArray) -> IntArray:
+        """Returns the same of the numbers of a part, which are looked up once."""
+        found = self._of_parts.get(part)
+        if found is None:
+            found = self._of_parts[part] = self.among(numbers)
+        return found
 
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""

@@ -204,7 +204,7 @@ class Scan:
     def _follow(self, older: _Source, newer: _Source, ruled_out: Collection[int]) -> bool:
         """Returns whether two sources can be looked at as one."""
         one, other = older.part, newer.part
-        if one is None or other is None or self._asked.relatches:
+        if one is None or other is None:
             return False
         return (
             older.last < newer.first
@@ -212,6 +212,9 @@ class Scan:
             and (one.number in ruled_out) == (other.number in ruled_out)
             and self._asked.window.covers(older.first, newer.last)
             and not overlaps_any(self._shared, older.first, newer.last)
+            and not (
+                self._asked.relatches and any(self._may_be_late(p.number) for p in (one, other))
+            )
         )
 
     def _joined(self, some: Sequence[_Source], *, newest_first: bool) -> Iterable[Unit]:

@@ -282,7 +282,7 @@ class Scanner:
             messages=head.messages,
             dropped=head.dropped,
         )
-        counting = coverage.among(head.bags)
+        counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
 

@@ -42,7 +42,6 @@ class Unit(ABC):
         table: the rows, ordered by log time.
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
-        recording: that all the rows are of.
         part: the number of the part; None where it may be replaced, or they are a bag's.
     """
 
@@ -51,7 +50,11 @@ class Unit(ABC):
     table: Table
     first: Ns
     last: Ns
-    recording: Path
+
+    @property
+    @abstractmethod
+    def recording(self) -> Path:
+        """The recording that all the rows are of."""
 
     @abstractmethod
     def times(self) -> IntArray:
@@ -95,8 +98,12 @@ class BagUnit(Unit):
         self.key = (bag.file, nth)
         self.table = table
         self.first, self.last = int(table.log_times[0]), int(table.log_times[-1])
-        self.recording = bag.recording
         self._bag = bag
+
+    @property
+    def recording(self) -> Path:
+        """The bag's recording."""
+        return self._bag.recording
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -139,11 +146,15 @@ class PartUnit(Unit):
         self.part = head.number if head.is_whole else None
         self.table: StoredTable = table
         self.first, self.last = head.first, head.last
-        self.recording = bag_of(int(counting[0])).recording
         self._load = load
         self._counting = counting
         self._bag_of = bag_of
         self._all_count = counting.size == head.bags.size
+
+    @cached_property
+    def recording(self) -> Path:
+        """The recording that all the rows are of."""
+        return self._bag_of(int(self._counting[0])).recording
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -181,19 +192,20 @@ class PartUnit(Unit):
 
 
 class PartsUnit(Unit):
-    """Parts of one topic as one, in order of time. They do not overlap, and all their rows count.
-
-    `recording` is that of the first.
-    """
+    """Parts of one topic as one, in order of time: none overlaps another, and all rows count."""
 
     def __init__(self, parts: Sequence[PartUnit]) -> None:
         self.key = tuple(part.key for part in parts)
         self.table = joined_stored([part.table for part in parts])
         self.first, self.last = parts[0].first, parts[-1].last
-        self.recording = parts[0].recording
         self._parts = parts
         self._stops = np.cumsum([len(part.table) for part in parts])
         self._firsts = [part.first for part in parts]
+
+    @property
+    def recording(self) -> Path:
+        """The recording of the first part."""
+        return self._parts[0].recording
 
     def parts(self) -> Sequence[Unit]:
         """Returns the parts."""

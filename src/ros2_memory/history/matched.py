@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.columns.truth import ColumnCondition, Truth
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -84,7 +84,16 @@ class Matching:
         """
         waiting: Block | None = None
         try:
-            for rows in scan(self._view, topic, window, newest_first=True, may_be_empty=True):
+            for rows in scan(
+                self._view,
+                topic,
+                window,
+                newest_first=True,
+                may_match=self._test.may_match,
+                may_not_match=True,
+                may_be_empty=True,
+                joined=True,
+            ):
                 block = self._block(topic, rows, window)
                 if waiting is None or block.last < waiting.first:
                     if waiting is not None:
@@ -102,7 +111,7 @@ class Matching:
             yield waiting
 
     def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
-        truth = self._test.truth(rows.table)
+        truth = self._test.truth(rows.table) if rows.may_match else Truth(len(rows.table))
         self.ruled_out |= truth.is_none
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
         if truth.is_none:

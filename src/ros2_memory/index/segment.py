@@ -22,7 +22,7 @@ from ros2_memory.index.split_order import split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -280,6 +280,17 @@ class Segment:
         column = _columns(self).of(topic)
         none = np.empty(0, np.int64)
         return (none, none) if column is None else (column.firsts, column.lasts)
+
+    def bounds_in(self, topics: Collection[str], window: TimeWindow) -> NDArray[np.int64]:
+        """Returns the first and last log time of topics (2 x N) in each bag that has any there."""
+        firsts, lasts = np.full(len(self.bags), MAX_NS), np.full(len(self.bags), MIN_NS)
+        is_here = np.zeros(len(self.bags), np.bool_)
+        for column in filter(None, map(self.column, topics)):
+            here = (column.firsts < window.stop) & (column.lasts >= window.start)
+            is_here[column.bags[here]] = True
+            np.minimum.at(firsts, column.bags, column.firsts)
+            np.maximum.at(lasts, column.bags, column.lasts)
+        return np.stack((firsts, lasts))[:, is_here]
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
