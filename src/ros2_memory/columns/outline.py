@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.stored import StoredTable
-    from ros2_memory.columns.table import Numbers
+    from ros2_memory.columns.table import Numbers, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 
@@ -101,7 +100,7 @@ class Outline(NamedTuple):
         return texts + _BYTES * (1 + len(self.totals))
 
 
-def outline_of(table: StoredTable, times: IntArray) -> Outline:
+def outline_of(table: Table, times: IntArray) -> Outline:
     """Returns the outline of a part, all of whose columns are stored, and its log times."""
     totals: dict[str, Totals] = {}
     letters: dict[str, Letters] = {}

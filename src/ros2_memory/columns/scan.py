@@ -18,14 +18,14 @@ import numpy as np
 
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
-from ros2_memory.columns.units import BagUnit, PartsUnit, PartUnit, Rows, Unit
+from ros2_memory.columns.units import BagUnit, Rows, Unit
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.storage.base import RELATCHED_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.scanner import Scanner
@@ -47,8 +47,6 @@ _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
 _MOST_LOOKED_UP: Final = 64
 """Parts whose columns are looked up at once."""
-_MOST_ROWS: Final = 1 << 17
-"""Of parts that are joined."""
 _MOST_DECODED: Final = 16
 """Bags whose tables a scan keeps, to compare them with others."""
 _MOST_BYTES: Final = 64 << 20
@@ -72,8 +70,6 @@ class Asked:
         may_not_match: whether the others are yielded, too, as such.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
-        joined: whether parts that follow each other may be yielded as one table, whatever their
-            recordings.
         within: half-open spans, in order and apart; tables that overlap none of them are left out.
             None: none is.
         stored: whether bags that are not stored are left out.
@@ -90,7 +86,6 @@ class Asked:
     may_match: Callable[[PartZones], bool | Mask] | None = None
     may_not_match: bool = False
     may_be_empty: bool = False
-    joined: bool = False
     within: Sequence[tuple[Ns, Ns]] | None = None
     stored: bool = False
     check: Callable[[Ns], None] = lambda _: None
@@ -165,65 +160,20 @@ class Scan:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
         if (within := self._asked.within) is not None:
             sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
-        for group in self._groups(sources, ruled_out, newest_first=newest_first):
-            self._together = [source.part for source in group if source.part is not None]
-            for some in [group] if self._asked.joined else [[source] for source in group]:
-                first = some[0]
-                self._asked.check(first.last if newest_first else first.first)
-                may = first.part is None or first.part.number not in ruled_out
-                for unit in self._joined(some, newest_first=newest_first):
-                    rows = Rows(unit, partial(self._counting, unit), may_match=may)
-                    if self._asked.may_be_empty or len(rows):
-                        yield rows
-
-    def _groups(
-        self, sources: Sequence[_Source], ruled_out: Collection[int], *, newest_first: bool
-    ) -> Iterator[list[_Source]]:
-        """Yields sources, those together that are looked up at once: who goes on reads many.
-
-        Where they are to be joined, those that may be.
-        """
-        most, messages = 1, 0
-        group: list[_Source] = []
-        for source in sources:
-            own = 0 if source.part is None else source.part.messages
-            messages += own
-            before = group[-1] if group else source
-            older, newer = (source, before) if newest_first else (before, source)
-            is_apart = self._asked.joined and (
-                messages > _MOST_ROWS or not self._follow(older, newer, ruled_out)
-            )
-            if group and (is_apart or len(group) == most):
-                yield group
-                most, messages = min(2 * most, _MOST_LOOKED_UP), own
-                group = []
-            group.append(source)
-        if group:
-            yield group
-
-    def _follow(self, older: _Source, newer: _Source, ruled_out: Collection[int]) -> bool:
-        """Returns whether two sources can be looked at as one."""
-        one, other = older.part, newer.part
-        if one is None or other is None:
-            return False
-        return (
-            older.last < newer.first
-            and (one.topic, one.dropped) == (other.topic, other.dropped)
-            and (one.number in ruled_out) == (other.number in ruled_out)
-            and self._asked.window.covers(older.first, newer.last)
-            and not overlaps_any(self._shared, older.first, newer.last)
-            and not (
-                self._asked.relatches and any(self._may_be_late(p.number) for p in (one, other))
-            )
-        )
-
-    def _joined(self, some: Sequence[_Source], *, newest_first: bool) -> Iterable[Unit]:
-        """Returns the units of some sources: one, where all rows of several parts count."""
-        units = [unit for source in some for unit in self._units(source)]
-        parts = [unit for unit in units if isinstance(unit, PartUnit) and unit.is_simple]
-        if len(some) == 1 or len(parts) < len(units) or not parts:
-            return units
-        return [PartsUnit(parts[::-1] if newest_first else parts)]
+        ahead = together = 1
+        for nth, source in enumerate(sources):
+            if nth == ahead:
+                # Who goes on reads many.
+                together = min(2 * together, _MOST_LOOKED_UP)
+                ahead += together
+                parts = sources[nth:ahead]
+                self._together = [each.part for each in parts if each.part is not None]
+            self._asked.check(source.last if newest_first else source.first)
+            may = source.part is None or source.part.number not in ruled_out
+            for unit in self._units(source):
+                rows = Rows(unit, partial(self._counting, unit), may_match=may)
+                if self._asked.may_be_empty or len(rows):
+                    yield rows
 
     def copies(self) -> Iterator[Rows]:
         """Yields the rows that do not count, as another recording has their messages, too.

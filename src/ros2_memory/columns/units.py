@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from bisect import bisect_left
-from collections import ChainMap
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
-from ros2_memory.columns.stored import StoredTable, joined_stored
 from ros2_memory.core.errors import BusyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -76,20 +73,6 @@ class Unit(ABC):
         """Returns which rows are of bags that count; None: all are."""
         return None
 
-    def times_of(self, rows: IntArray) -> IntArray:
-        """Returns the log times of some rows."""
-        return self.times()[rows]
-
-    def rows_before(self, moments: IntArray) -> IntArray:
-        """Returns how many rows are earlier than each of some log times."""
-        if (moments <= self.first).all():
-            return np.zeros(moments.size, np.int64)
-        return np.searchsorted(self.times(), moments)
-
-    def parts(self) -> Sequence[Unit]:
-        """Returns what it is made of, in order of time."""
-        return (self,)
-
 
 class BagUnit(Unit):
     """A table of a bag that is not stored. `nth` tells tables of one bag apart."""
@@ -137,14 +120,14 @@ class PartUnit(Unit):
     def __init__(
         self,
         head: PartHead,
-        table: StoredTable,
+        table: Table,
         load: Callable[[str], IntArray | None],
         counting: IntArray,
         bag_of: Callable[[int], BagFile],
     ) -> None:
         self.key = head.number
         self.part = head.number if head.is_whole else None
-        self.table: StoredTable = table
+        self.table = table
         self.first, self.last = head.first, head.last
         self._load = load
         self._counting = counting
@@ -179,78 +162,11 @@ class PartUnit(Unit):
             return None
         return np.isin(self.bag_numbers(), self._counting)
 
-    @property
-    def is_simple(self) -> bool:
-        """Whether all of its rows count."""
-        return self._all_count
-
     def _column(self, path: str) -> IntArray:
         column = self._load(path)
         if column is None:
             raise GoneError
         return column
-
-
-class PartsUnit(Unit):
-    """Parts of one topic as one, in order of time: none overlaps another, and all rows count."""
-
-    def __init__(self, parts: Sequence[PartUnit]) -> None:
-        self.key = tuple(part.key for part in parts)
-        self.table = joined_stored([part.table for part in parts])
-        self.first, self.last = parts[0].first, parts[-1].last
-        self._parts = parts
-        self._stops = np.cumsum([len(part.table) for part in parts])
-        self._firsts = [part.first for part in parts]
-
-    @property
-    def recording(self) -> Path:
-        """The recording of the first part."""
-        return self._parts[0].recording
-
-    def parts(self) -> Sequence[Unit]:
-        """Returns the parts."""
-        return self._parts
-
-    def times(self) -> IntArray:
-        """Returns the log times of the rows (ns)."""
-        return np.concatenate([part.times() for part in self._parts])
-
-    def times_of(self, rows: IntArray) -> IntArray:
-        """Returns the log times of some rows; not unpacked where they begin or end parts."""
-        of = np.searchsorted(self._stops, rows, side="right")
-        found = np.empty(rows.size, np.int64)
-        for nth in np.unique(of).tolist():
-            part, here = self._parts[nth], of == nth
-            last = len(part.table) - 1
-            own = rows[here] - self._stops[nth] + last + 1
-            is_end = (own == 0) | (own == last)
-            ends = np.where(own == 0, part.first, part.last)
-            found[here] = ends if is_end.all() else part.times()[own]
-        return found
-
-    def rows_before(self, moments: IntArray) -> IntArray:
-        """Returns how many rows are earlier than each of some log times."""
-        found = []
-        for moment in moments.tolist():
-            nth = bisect_left(self._firsts, moment) - 1
-            before = 0 if nth < 0 else int(self._stops[nth])
-            if nth >= 0 and moment <= self._parts[nth].last:
-                part = self._parts[nth]
-                before += int(np.searchsorted(part.times(), moment)) - len(part.table)
-            found.append(before)
-        return np.array(found, np.int64)
-
-    def identities(self) -> tuple[IntArray, IntArray] | None:
-        """Returns None: where copies may be, parts are looked at one by one."""
-        return None
-
-    def bags(self) -> Mapping[int, BagFile]:
-        """Returns the bags of all parts, by their numbers in the store."""
-        return dict(ChainMap(*(dict(part.bags()) for part in self._parts)))
-
-    def bag_numbers(self) -> IntArray:
-        """Returns for each row the number of its bag."""
-        return np.concatenate([part.bag_numbers() for part in self._parts])
 
 
 class Rows:
@@ -316,21 +232,6 @@ class Rows:
             return self._unit.first, self._unit.last
         times = self.times
         return int(times[0]), int(times[-1])
-
-    def times_of(self, positions: IntArray) -> IntArray:
-        """Returns log times (ns) of some of the rows, by their positions among those that count."""
-        rows = positions if self.index is None else self.index[positions]
-        return self._unit.times_of(rows)
-
-    def before(self, moments: IntArray) -> IntArray:
-        """Returns how many of the rows are earlier than each of some log times (ns)."""
-        rows = self._unit.rows_before(moments)
-        return rows if self.index is None else np.searchsorted(self.index, rows)
-
-    def parts(self) -> list[Rows]:
-        """Returns the rows of each part, in order of time, where these are several."""
-        parts = self._unit.parts()
-        return [self] if len(parts) == 1 else [Rows(part, lambda: None) for part in parts]
 
     def bag_rows(self) -> Iterator[tuple[BagFile, IntArray]]:
         """Yields each bag with the positions of its rows among those that count, ascending."""

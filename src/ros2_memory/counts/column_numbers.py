@@ -149,12 +149,7 @@ class PieceNumbers:
         """
         try:
             for rows in scan(
-                self._view,
-                self._topic,
-                window,
-                newest_first=True,
-                joined=True,
-                reached=self._reached,
+                self._view, self._topic, window, newest_first=True, reached=self._reached
             ):
                 self._waiting.append(rows)
         except QueryTimeoutError:
@@ -199,13 +194,6 @@ class PieceNumbers:
         if self._reading.expired() and self._parts:
             raise QueryTimeoutError("the rest is left out")
 
-    def _add(self, rows: Rows, since: Ns) -> None:
-        """Adds the numbers of a table from a log time on."""
-        parts = rows.parts()
-        left = [part for part in parts if not self._add_totals(part, since)]
-        for some in [rows] if len(left) == len(parts) else reversed(left):
-            self._add_columns(some, since)
-
     def _add_totals(self, rows: Rows, since: Ns) -> bool:
         """Adds the numbers of a part, if all are of one piece and its outline tells them."""
         piece = bisect_right(self._edges, rows.first)
@@ -239,7 +227,10 @@ class PieceNumbers:
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
         return _Known(totals, (least, greatest))
 
-    def _add_columns(self, rows: Rows, since: Ns) -> None:
+    def _add(self, rows: Rows, since: Ns) -> None:
+        """Adds the numbers of a table from a log time on."""
+        if self._add_totals(rows, since):
+            return
         table, extractor = rows.table, self._view.memory.extractor
         found = [numbers(table, field, extractor) for field in self._fields]
         held = [some for some in found if some is not None]
@@ -247,9 +238,8 @@ class PieceNumbers:
             pieces = self._pieces(rows, since)
             self._add_found(rows, [_of_rows(some, rows) for some in held], pieces)
         elif isinstance(table, StoredTable):
-            for part in reversed(rows.parts()):
-                for decoded in decoded_rows(self._view, part):
-                    self._add(decoded, since)
+            for decoded in decoded_rows(self._view, rows):
+                self._add(decoded, since)
         else:
             self._add_read(rows, since)
 
@@ -257,7 +247,8 @@ class PieceNumbers:
         self, rows: Rows, held: Sequence[FieldNumbers], pieces: Iterable[tuple[int, int, int]]
     ) -> None:
         for piece, start, stop in pieces:
-            first, last = rows.times_of(np.array([start, stop - 1])).tolist()
+            is_whole = stop - start == len(rows)
+            first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
             for field, found in enumerate(held):
                 begin, end = np.searchsorted(found.rows, [start, stop]).tolist()
                 if begin == end:
@@ -277,8 +268,11 @@ class PieceNumbers:
         """Yields the number of each piece of some rows, with its first row and the one after it."""
         first, last = rows.span
         begin, end = (bisect_right(self._edges, at) for at in (first, last))
-        edges = np.append(max(since, first), self._edges[begin:end])
-        least, *bounds = rows.before(edges).tolist()
+        if begin == end and since <= first:
+            yield begin, 0, len(rows)
+            return
+        edges = np.append(since, self._edges[begin:end])
+        least, *bounds = np.searchsorted(rows.times, edges).tolist()
         starts, stops = [0, *bounds], [*bounds, len(rows)]
         for piece, (start, stop) in enumerate(zip(starts, stops, strict=True), begin):
             if max(start, least) < stop:
@@ -405,13 +399,13 @@ def _extreme(rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int)
     begin, end = among
     if not found.error or found.exactly is not None:
         number, row = _furthest(found, np.arange(begin, end), sign)
-        at = int(rows.times_of(np.array([row]))[0])
+        at = int(rows.times[row])
         return Extreme(number, number, at, at)
     signed = sign * found.numbers[begin:end]
     off = found.error if found.errors is None else found.errors[begin:end]
     low, high = float((signed - off).min()), float((signed + off).min())
     may = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
-    return Extreme(low, high, *rows.times_of(found.rows[may]).tolist())
+    return Extreme(low, high, *rows.times[found.rows[may]].tolist())
 
 
 def _of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:

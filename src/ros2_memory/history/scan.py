@@ -35,7 +35,6 @@ def scan(
     may_match: Callable[[PartZones], bool | Mask] | None = None,
     may_not_match: bool = False,
     may_be_empty: bool = False,
-    joined: bool = False,
     within: Sequence[tuple[Ns, Ns]] | None = None,
     stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
@@ -47,7 +46,7 @@ def scan(
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
     may hold copies, where the caller knows them. With `stored` bags that are not stored have no
-    rows. `may_match`, `may_not_match`, `may_be_empty`, `joined` and `within` are as in `Asked`.
+    rows. `may_match`, `may_not_match`, `may_be_empty` and `within` are as in `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -71,7 +70,6 @@ def scan(
         may_match=may_match,
         may_not_match=may_not_match,
         may_be_empty=may_be_empty,
-        joined=joined,
         within=within,
         stored=stored,
         relatches=not copies and view.stream.may_be_relatched([topic]),
