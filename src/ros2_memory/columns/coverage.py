@@ -66,6 +66,7 @@ class Coverage:
         everything = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(everything, kind="stable")
         self._of_parts: dict[int, IntArray] = {}
+        self._bags: dict[int, BagFile] = {}
         self._begins: IntArray = begins
         self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
         self._numbers: IntArray = everything[self._order]
@@ -98,12 +99,15 @@ class Coverage:
 
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
-        at = int(self._numbers.searchsorted(number))
-        if at == self._numbers.size or self._numbers[at] != number:
-            return None
-        nth = int(self._order[at])
-        segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
-        return self.segments[segment].segment.bags[nth - int(self._begins[segment])]
+        if number not in self._bags:
+            at = int(self._numbers.searchsorted(number))
+            if at == self._numbers.size or self._numbers[at] != number:
+                return None
+            nth = int(self._order[at])
+            segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
+            own = self.segments[segment].segment.bags
+            self._bags[number] = own[nth - int(self._begins[segment])]
+        return self._bags[number]
 
     def unhashed(self) -> list[BagFile]:
         """Returns the stored bags of which copies cannot be recognised."""

@@ -349,7 +349,8 @@ class Scanner:
 
 
 def _outline_key(head: PartHead) -> FragmentKey:
-    return FragmentKey(head.first, "", (head.number,))
+    # Those of a day are read together: of one topic alone.
+    return FragmentKey(head.first, str(head.topic), (head.number,))
 
 
 class _PartColumns(Mapping[str, "Packed"]):

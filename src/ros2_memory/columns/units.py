@@ -12,7 +12,7 @@ from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.errors import BusyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -233,14 +233,18 @@ class Rows:
         times = self.times
         return int(times[0]), int(times[-1])
 
-    def bag_rows(self) -> Iterator[tuple[BagFile, IntArray]]:
-        """Yields each bag with the positions of its rows among those that count, ascending."""
+    def bag_rows(self, among: Container[str] | None = None) -> Iterator[tuple[BagFile, IntArray]]:
+        """Yields each bag with the positions of its rows among those that count, ascending.
+
+        With `among` of these files alone.
+        """
         numbers = self._unit.bag_numbers()
         if self.index is not None:
             numbers = numbers[self.index]
         bags = self._unit.bags()
         for number in np.unique(numbers).tolist():
-            yield bags[number], np.flatnonzero(numbers == number)
+            if among is None or bags[number].file in among:
+                yield bags[number], np.flatnonzero(numbers == number)
 
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""

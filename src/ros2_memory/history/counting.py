@@ -72,9 +72,8 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
             to_read[segment.bags[of[row]].file] = int(firsts[row]), int(lasts[row]) + 1
     near_those = united(sorted(to_read.values()))
     for rows in scan(view, topic, window, columns=False, within=near_those):
-        for bag, positions in rows.bag_rows():
-            if bag.file in to_read:
-                counted.add(*_one_by_one(rows.times[positions], edges))
+        for _, positions in rows.bag_rows(to_read):
+            counted.add(*_one_by_one(rows.times[positions], edges))
     return counted
 
 
