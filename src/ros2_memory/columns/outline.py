@@ -75,7 +75,7 @@ class Letters(NamedTuple):
         if len(words) > _MOST_LETTERS:
             return None
         has = np.array([[word in some for some in known] for word in words], np.bool_)
-        rows = has.reshape(len(words), -1)[:, np.array(alike, np.int64)[texts.codes]]
+        rows = has.reshape(len(words), len(known))[:, np.array(alike, np.int64)[texts.codes]]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
     def may_have(self, text: str) -> Mask:
