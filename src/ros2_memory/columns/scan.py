@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
@@ -135,6 +136,11 @@ class Scan:
         if self._shared:
             self._shared = self._holding_copies()
         self._ends = [stop for _, stop in self._shared]
+
+    @property
+    def shared(self) -> Spans:
+        """The half-open spans in which two sources may have the same messages, in order."""
+        return self._shared
 
     def rows(self, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of the topic in the window.

@@ -12,7 +12,7 @@ import numpy as np
 
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import holding_copies, scan
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,19 +59,19 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
         for rows in scan(view, topic, window, columns=False):
             counted.add(*_one_by_one(rows.times, edges))
         return counted
-    timeline = view.snapshot.timeline
+    shared = holding_copies(view, topic, window)
     to_read: dict[str, tuple[Ns, Ns]] = {}
-    for segment in timeline.segments_in(window):
+    for segment in view.snapshot.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:
             continue
         of, firsts, lasts, messages = column
-        pieces, is_in, is_cut = _told_apart(column, window, edges, timeline.shared_times)
+        pieces, is_in, is_cut = _told_apart(column, window, edges, shared)
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_cut).tolist():
             to_read[segment.bags[of[row]].file] = int(firsts[row]), int(lasts[row]) + 1
     near_those = united(sorted(to_read.values()))
-    for rows in scan(view, topic, window, columns=False, within=near_those):
+    for rows in scan(view, topic, window, columns=False, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
             counted.add(*_one_by_one(rows.times[positions], edges))
     return counted

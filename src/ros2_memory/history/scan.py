@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -76,6 +77,16 @@ def scan(
         check=check,
     )
     return Scan(view.memory.columns, asked).rows(newest_first=newest_first)
+
+
+def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:
+    """Returns the half-open spans in which recordings may hold copies of a topic's messages.
+
+    As far as the times at which they were published are known.
+    """
+    timeline = view.snapshot.timeline
+    asked = Asked(topic, window, timeline, lambda *_: (), shared=timeline.shared_times)
+    return Scan(view.memory.columns, asked).shared
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
