@@ -88,16 +88,48 @@ class Letters(NamedTuple):
 
 
 class Outline(NamedTuple):
-    """What is known of the columns of a part, by their paths; of some of them nothing is."""
+    """What is known of the columns of a part; of some of them nothing is.
 
-    totals: Mapping[str, Totals]
+    Attributes:
+        paths: of columns of numbers.
+        sizes: how many finite numbers each has.
+        sums: what they add up to.
+        times: when the ends of each were, as of `Totals` (N x 4).
+        letters: of columns of texts, by their paths.
+    """
+
+    paths: Sequence[str]
+    sizes: IntArray
+    sums: Floats
+    times: NDArray[np.int64]
     letters: Mapping[str, Letters]
+
+    @classmethod
+    def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
+        """Returns the outline of columns, by their paths."""
+        every = [*totals.values()]
+        return cls(
+            [*totals],
+            np.array([one.size for one in every], np.int64),
+            np.array([one.total for one in every], np.float64),
+            np.array([(*one.least, *one.greatest) for one in every], np.int64).reshape(-1, 4),
+            letters,
+        )
+
+    def totals(self, path: str) -> Totals | None:
+        """Returns what is known of a column of numbers; None: nothing."""
+        if path not in self.paths:
+            return None
+        nth = self.paths.index(path)
+        first, second, third, fourth = self.times[nth].tolist()
+        size, total = int(self.sizes[nth]), float(self.sums[nth])
+        return Totals(size, total, (first, second), (third, fourth))
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        texts = sum(one.has.nbytes + _BYTES * len(one.words) // 5 for one in self.letters.values())
-        return texts + _BYTES * (1 + len(self.totals))
+        texts = sum(one.has.nbytes + 100 * len(one.words) for one in self.letters.values())
+        return texts + _BYTES + 120 * len(self.paths)
 
 
 def outline_of(table: Table, times: IntArray) -> Outline:
@@ -115,7 +147,7 @@ def outline_of(table: Table, times: IntArray) -> Outline:
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
                 totals[path] = _totals(column, table.error(path), times)
-    return Outline(totals, letters)
+    return Outline.of(totals, letters)
 
 
 def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
@@ -135,38 +167,20 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
 
 def _fragment(outline: Outline) -> Fragment:
     texts = {path: (one.words, one.size) for path, one in outline.letters.items()}
-    every = [*outline.totals.values()]
-    return Fragment(
-        json.dumps({"numbers": [*outline.totals], "texts": texts}),
-        {
-            "sizes": np.array([one.size for one in every], np.int64),
-            "totals": np.array([one.total for one in every], np.float64),
-            "times": np.array([(*one.least, *one.greatest) for one in every], np.int64),
-            **{path: one.has for path, one in outline.letters.items()},
-        },
-    )
+    arrays = {path: one.has for path, one in outline.letters.items()}
+    head = json.dumps({"numbers": outline.paths, "texts": texts})
+    numbers = {"sizes": outline.sizes, "sums": outline.sums, "times": outline.times}
+    return Fragment(head, {**arrays, **{f"#{name}": some for name, some in numbers.items()}})
 
 
 def _outline(fragment: Fragment) -> Outline:
     head = json.loads(fragment.head)
-    times: Sequence[Sequence[Ns]] = fragment.integers("times").reshape(-1, 4).tolist()
-    numbers = zip(
-        head["numbers"],
-        fragment.integers("sizes").tolist(),
-        fragment.floats("totals").tolist(),
-        times,
-        strict=True,
-    )
-    return Outline(
-        {
-            path: Totals(size, total, (at[0], at[1]), (at[2], at[3]))
-            for path, size, total, at in numbers
-        },
-        {
-            path: Letters(tuple(words), fragment.arrays[path].astype(np.uint8, copy=False), size)
-            for path, (words, size) in head["texts"].items()
-        },
-    )
+    letters = {
+        path: Letters(tuple(words), fragment.arrays[path].astype(np.uint8, copy=False), size)
+        for path, (words, size) in head["texts"].items()
+    }
+    sizes, times = (fragment.integers(name) for name in ("#sizes", "#times"))
+    return Outline(head["numbers"], sizes, fragment.floats("#sums"), times, letters)
 
 
 OUTLINE: Final = Kind("outline", _fragment, _outline)

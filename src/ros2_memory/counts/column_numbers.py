@@ -219,7 +219,7 @@ class PieceNumbers:
             extractor = self._view.memory.extractor
             self._columns[key] = column_of(table, self._fields[field], extractor)
         path, outline = self._columns[key], table.outline()
-        totals = None if path is None or outline is None else outline.totals.get(path)
+        totals = None if path is None or outline is None else outline.totals(path)
         zone = None if path is None or totals is None else table.zone(path)
         if totals is None or zone is None:
             return None

@@ -66,15 +66,15 @@ def test_an_outline_is_the_same_once_it_was_stored() -> None:
         "x": Totals(3, 0.1 + 0.2, (T0, T0), (T0 + 1, T0 + 9)),
         "y": Totals(1, -4, (0, 0), (0, 0)),
     }
-    outline = Outline(totals, {"data": letters})
-    found = OUTLINE.load(OUTLINE.store(outline))
-    assert found.totals == totals
+    found = OUTLINE.load(OUTLINE.store(Outline.of(totals, {"data": letters})))
+    assert {path: found.totals(path) for path in found.paths} == totals
+    assert found.totals("z") is None
     assert found.letters["data"].words == letters.words
     for needle in ("mug", "mugs", "two", "b"):
         wanted = letters.may_have(needle)
         np.testing.assert_array_equal(found.letters["data"].may_have(needle), wanted)
-    nothing = OUTLINE.load(OUTLINE.store(Outline({}, {})))
-    assert nothing == Outline({}, {})
+    nothing = OUTLINE.load(OUTLINE.store(Outline.of({}, {})))
+    assert (nothing.paths, nothing.letters) == ([], {})
 
 
 def write_world(folder: Path, draw: Random, hours: float = 2.5) -> None:
