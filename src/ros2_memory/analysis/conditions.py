@@ -100,6 +100,11 @@ class Contains:
         """Whether no boolean matches."""
         return self.boolean is None
 
+    @property
+    def is_one_word(self) -> bool:
+        """Whether it is a row of letters that is found wherever a text has it, and no number."""
+        return not self.whole and (self.folded or "").isalpha()
+
     def matches(self, value: JsonValue) -> bool:
         """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):

@@ -53,14 +53,13 @@ _TO_END: Final = 2
 
 
 def pieces_of(
-    starts: NDArray[np.int64], stops: NDArray[np.int64]
+    starts: NDArray[np.int64], stops: NDArray[np.int64], silence_ns: Ns = SILENCE_NS
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Returns when the pieces of spans, in order of their starts, begin and end.
-
-    A silence parts them.
-    """
+    """Returns when the pieces of spans begin and end, in order. A silence parts them."""
+    order = np.argsort(starts, kind="stable")
+    starts, stops = starts[order], stops[order]
     reached = np.maximum.accumulate(stops)
-    new = starts[1:] - reached[:-1] > SILENCE_NS
+    new = starts[1:] - reached[:-1] > silence_ns
     begins, ends = np.append([True], new), np.append(new, [True])
     return starts[begins[: len(starts)]], reached[ends[: len(starts)]]
 

@@ -65,6 +65,8 @@ class Coverage:
         begins = np.cumsum([0, *map(len, numbers)])
         everything = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(everything, kind="stable")
+        self._of_parts: dict[int, IntArray] = {}
+        self._bags: dict[int, BagFile] = {}
         self._begins: IntArray = begins
         self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
         self._numbers: IntArray = everything[self._order]
@@ -88,14 +90,24 @@ class Coverage:
         """Returns those of some numbers whose bags are bags of the timeline."""
         return numbers[self.positions(numbers) >= 0]
 
+    def of_part(self, part: int, numbers: IntArray) -> IntArray:
+        """Returns the same of the numbers of a part, which are looked up once."""
+        found = self._of_parts.get(part)
+        if found is None:
+            found = self._of_parts[part] = self.among(numbers)
+        return found
+
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
-        at = int(self._numbers.searchsorted(number))
-        if at == self._numbers.size or self._numbers[at] != number:
-            return None
-        nth = int(self._order[at])
-        segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
-        return self.segments[segment].segment.bags[nth - int(self._begins[segment])]
+        if number not in self._bags:
+            at = int(self._numbers.searchsorted(number))
+            if at == self._numbers.size or self._numbers[at] != number:
+                return None
+            nth = int(self._order[at])
+            segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
+            own = self.segments[segment].segment.bags
+            self._bags[number] = own[nth - int(self._begins[segment])]
+        return self._bags[number]
 
     def unhashed(self) -> list[BagFile]:
         """Returns the stored bags of which copies cannot be recognised."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -44,8 +43,6 @@ class FieldNumbers(NamedTuple):
         errors: the most by which each of them is off, where that differs.
         exactly: returns the exact numbers at some positions, ascending; None where only the bag
             has them.
-        least: the exact least number, where it is known without the bag.
-        greatest: the exact greatest number, likewise.
     """
 
     rows: Ints
@@ -53,8 +50,6 @@ class FieldNumbers(NamedTuple):
     error: float
     errors: Floats | None = None
     exactly: Callable[[Ints], Floats] | None = None
-    least: float | None = None
-    greatest: float | None = None
 
 
 def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumbers | None:
@@ -75,7 +70,7 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     values = Values(table)
     try:
         found = Shape(table.definition, table.channel.type, extractor).find(field)
-        parts = [] if found is None else [*_number_parts(values, found)]
+        parts = [_numbers_of(values, *of) for of in ([] if found is None else _leaves(found))]
     except UnknownShapeError:
         return None
     known = [part for part in parts if part is not None]
@@ -86,34 +81,19 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     return known[0] if len(known) == 1 else _joined(known)
 
 
-def extent(table: Table, field: str, extractor: SchemaExtractor) -> tuple[float, float] | None:
-    """Returns the exact least and greatest number of a field, without reading a column.
-
-    None where that is not known, also of a table without such numbers.
-    """
+def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:
+    """Returns the path of the column that has all numbers of a field as they are; None: none."""
     if table.definition is None:
         return None
-    values = Values(table)
     try:
         found = Shape(table.definition, table.channel.type, extractor).find(field)
-        spots = [] if found is None else [*opened(Spot(found))]
-        leaves = [leaf for spot in spots for leaf in leaves_below(spot)]
-        is_summary = any(
-            isinstance(spot.node, Message | Group) and _SUMMARY.issuperset(spot.node.names())
-            for spot in spots
-        )
+        leaves = [] if found is None else [*_leaves(found)]
     except UnknownShapeError:
         return None
-    if len(leaves) != 1 or is_summary:
+    if len(leaves) != 1 or leaves[0][0].level is not ROWS or leaves[0][1]:
         return None
-    _, leaf, limits = leaves[0]
-    is_plain = leaf.level is ROWS and not limits and leaf.made in {Made.STORED, Made.REAL}
-    if not is_plain or leaf.kind not in {Kind.INTEGER, Kind.REAL}:
-        return None
-    zone = values.zone(leaf)
-    if zone is None or not (math.isfinite(zone.low) and math.isfinite(zone.high)):
-        return None
-    return zone.low, zone.high
+    leaf, _ = leaves[0]
+    return leaf.sources[0] if leaf.made in {Made.STORED, Made.REAL} else None
 
 
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
@@ -148,15 +128,15 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     )
 
 
-def _number_parts(values: Values, found: Node) -> Iterator[FieldNumbers | None]:
-    """Yields the numbers of each leaf of a field; None for one that the table does not hold."""
+def _leaves(found: Node) -> Iterator[tuple[Leaf, Limits]]:
+    """Yields the numbers of a field; not those of a summary."""
     for spot in opened(Spot(found)):
         node = spot.node
         if isinstance(node, Message | Group) and _SUMMARY.issuperset(node.names()):
             continue
         for _, leaf, limits in leaves_below(spot):
             if leaf.kind in {Kind.INTEGER, Kind.REAL}:
-                yield _numbers_of(values, leaf, limits)
+                yield leaf, limits
 
 
 def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | None:
@@ -183,8 +163,4 @@ def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | No
     if known.exactly is not None:
         exactly = known.exactly
         found = found._replace(exactly=lambda among: exactly(kept[among]))
-    elif found.error and is_all and leaf.made in {Made.STORED, Made.REAL}:
-        zone = values.zone(leaf)
-        if zone is not None and math.isfinite(zone.low) and math.isfinite(zone.high):
-            return found._replace(least=zone.low, greatest=zone.high)
     return found

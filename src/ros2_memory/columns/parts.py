@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.columns.layout import Layout
+    from ros2_memory.columns.outline import Outline
     from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.core.timebase import Ns
@@ -134,6 +135,7 @@ def part_table(
     topic: Topic,
     packed: Mapping[str, Packed],
     load: Callable[[str], Column],
+    outline: Callable[[], Outline | None] = lambda: None,
     *,
     messages: int,
     dropped: Sequence[str] = (),
@@ -146,6 +148,7 @@ def part_table(
         topic: of the part.
         packed: what is known of each column; their data is not needed.
         load: returns a column by its path.
+        outline: as of `StoredTable`.
         messages: how many rows it has.
         dropped: the columns that are beyond the topic's share.
     """
@@ -168,4 +171,5 @@ def part_table(
         left_out,
         definition=topic.definition,
         packed=packed,
+        outline=outline,
     )

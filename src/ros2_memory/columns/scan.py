@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
@@ -67,6 +68,7 @@ class Asked:
         relatches: whether recordings may have received a message again, as of a latched topic.
         may_match: says by zones which parts may have rows that are wanted, of each or of all;
             the others are left out.
+        may_not_match: whether the others are yielded, too, as such.
         may_be_empty: whether rows are yielded also where none of them counts. Which do is then
             found out only where that is asked.
         within: half-open spans, in order and apart; tables that overlap none of them are left out.
@@ -83,6 +85,7 @@ class Asked:
     shared: Sequence[tuple[Ns, Ns]] = ()
     relatches: bool = False
     may_match: Callable[[PartZones], bool | Mask] | None = None
+    may_not_match: bool = False
     may_be_empty: bool = False
     within: Sequence[tuple[Ns, Ns]] | None = None
     stored: bool = False
@@ -134,6 +137,11 @@ class Scan:
             self._shared = self._holding_copies()
         self._ends = [stop for _, stop in self._shared]
 
+    @property
+    def shared(self) -> Spans:
+        """The half-open spans in which two sources may have the same messages, in order."""
+        return self._shared
+
     def rows(self, *, newest_first: bool = False) -> Iterator[Rows]:
         """Yields what counts of the topic in the window.
 
@@ -149,10 +157,12 @@ class Scan:
         window, may_match = self._asked.window, self._asked.may_match
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
         sources = [s for s in sources if window.overlaps(s.first, s.last)]
+        ruled_out: set[int] = set()
         if may_match is not None:
             heads = [source.part for source in sources if source.part is not None]
             wanted = self._scanner.matching(heads, may_match)
             ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+        if not self._asked.may_not_match:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
         if (within := self._asked.within) is not None:
             sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
@@ -165,8 +175,9 @@ class Scan:
                 parts = sources[nth:ahead]
                 self._together = [each.part for each in parts if each.part is not None]
             self._asked.check(source.last if newest_first else source.first)
+            may = source.part is None or source.part.number not in ruled_out
             for unit in self._units(source):
-                rows = Rows(unit, partial(self._counting, unit))
+                rows = Rows(unit, partial(self._counting, unit), may_match=may)
                 if self._asked.may_be_empty or len(rows):
                     yield rows
 

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.coverage import Covering
-from ros2_memory.columns.fragments import DAY_NS, Fragments
+from ros2_memory.columns.fragments import DAY_NS, FragmentKey, Fragments
+from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
 from ros2_memory.columns.table import Zone, column_bytes
@@ -146,6 +147,7 @@ class Scanner:
         self._settings = settings
         self._fragment_bytes = (cache_mb << 20) // 2
         self._fragments: dict[str, object] = {}
+        self._outlines = self.fragments(OUTLINE)
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
@@ -154,6 +156,19 @@ class Scanner:
             self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
+
+    def make_outlines(self, timeline: Timeline, window: TimeWindow) -> None:
+        """Makes the outlines of the whole parts that have rows in a window."""
+        coverage = self.coverage(timeline)
+        if coverage is None:
+            return
+        for topic in timeline.topics():
+            heads = [head for head in self.parts(topic, window, coverage) if head.is_whole]
+            for head in heads:
+                key = _outline_key(head)
+                unit = None if self._outlines.get(key) else self.part(head, coverage, heads)
+                if unit is not None:
+                    self._outlines.put(key, outline_of(unit.table, unit.times()))
 
     def fragments_of_others(self) -> list[Ns]:
         """Returns where slices begin that have fragments of other settings alone, newest first."""
@@ -259,8 +274,15 @@ class Scanner:
         def load(path: str) -> Column:
             return self._column(head.number, path, columns[path])
 
-        table = part_table(topic, columns, load, messages=head.messages, dropped=head.dropped)
-        counting = coverage.among(head.bags)
+        table = part_table(
+            topic,
+            columns,
+            load,
+            partial(self._outlines.get, _outline_key(head)),
+            messages=head.messages,
+            dropped=head.dropped,
+        )
+        counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
 
@@ -324,6 +346,11 @@ class Scanner:
         """Waits for the turn that what is stored needs where it is large."""
         if is_large(stored):
             self._large.acquire()
+
+
+def _outline_key(head: PartHead) -> FragmentKey:
+    # Those of a day are read together: of one topic alone.
+    return FragmentKey(head.first, str(head.topic), (head.number,))
 
 
 class _PartColumns(Mapping[str, "Packed"]):

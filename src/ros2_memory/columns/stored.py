@@ -7,12 +7,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from ros2_memory.columns.table import Elements, Table
+import numpy as np
+
+from ros2_memory.columns.table import Elements, Table, joined_column, joined_zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from ros2_memory.columns.layout import Layout
+    from ros2_memory.columns.outline import Outline
     from ros2_memory.columns.pack import Packed
     from ros2_memory.columns.table import Column, Zone
     from ros2_memory.storage.base import Channel, Definition, IntArray
@@ -52,9 +55,11 @@ class StoredTable(Table):
 
     Attributes:
         packed: what is known of each column, by the paths of `Layout.slots`; without its data.
+        outline: returns what else is known of them; None where it was not made.
     """
 
     packed: Mapping[str, Packed] = field(kw_only=True)
+    outline: Callable[[], Outline | None] = field(kw_only=True, default=lambda: None)
 
     def error(self, path: str) -> float:
         """Returns the greatest absolute error of a column; 0.0: it is exact.
@@ -74,6 +79,68 @@ class StoredTable(Table):
         """
         packed = self.packed.get(path.rstrip("."))
         return None if packed is None else packed.zone
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedTable(StoredTable):
+    """The rows of several tables of one topic and layout, one after the other."""
+
+    tables: Sequence[StoredTable] = field(kw_only=True)
+
+    def error(self, path: str) -> float:
+        """Returns the greatest absolute error of a column, as of `StoredTable`."""
+        return max(table.error(path) for table in self.tables)
+
+    def zone(self, path: str) -> Zone | None:
+        """Returns what is known of a column without unpacking it, as of `StoredTable`."""
+        zones = [table.zone(path) for table in self.tables]
+        known = [zone for zone in zones if zone is not None]
+        return joined_zone(known) if len(known) == len(zones) else None
+
+
+def parts_of(table: Table) -> Sequence[StoredTable]:
+    """Returns the parts that a table is made of; none of one that is not stored."""
+    if isinstance(table, JoinedTable):
+        return table.tables
+    return [table] if isinstance(table, StoredTable) else []
+
+
+def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
+    """Returns the rows of tables of one topic and layout; columns are joined when asked for."""
+    first, none = tables[0], np.zeros(sum(map(len, tables)), np.int64)
+    return JoinedTable(
+        first.channel,
+        none,
+        none,
+        none,
+        _joined_columns([table.columns for table in tables]),
+        _joined_elements([table.elements for table in tables], [*map(len, tables)]),
+        first.left_out,
+        definition=first.definition,
+        packed={},
+        tables=tables,
+    )
+
+
+def _joined_columns(parts: Sequence[Mapping[str, Column]]) -> Mapping[str, Column]:
+    return Lazily(parts[0], lambda path: joined_column([part[path] for part in parts]))
+
+
+def _joined_elements(
+    parts: Sequence[Mapping[str, Elements]], counts: Sequence[int]
+) -> Mapping[str, Elements]:
+    """Returns sequences of several parts as one; `counts` are the rows of each part."""
+
+    def make(path: str) -> Elements:
+        inner = [part[path] for part in parts]
+        before = np.cumsum([0, *counts[:-1]]).tolist()
+        return Elements(
+            np.concatenate([one.owners + rows for one, rows in zip(inner, before, strict=True)]),
+            _joined_columns([one.columns for one in inner]),
+            _joined_elements([one.elements for one in inner], [*map(len, inner)]),
+        )
+
+    return Lazily(parts[0], make)
 
 
 @dataclass(frozen=True, eq=False)

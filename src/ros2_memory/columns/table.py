@@ -101,6 +101,23 @@ class Zone(NamedTuple):
         return Zone(self.low / by, self.high / by, self.nulls)
 
 
+def joined_zone(zones: Sequence[Zone]) -> Zone:
+    """Returns what is known of columns one after the other; there is at least one."""
+    words = list(dict.fromkeys(zone.words for zone in zones if zone.words is not None))
+    if any(zone.words is None for zone in zones):
+        joined = None
+    elif any(each.startswith(IN_PART) for each in words):
+        joined = "\n".join([IN_PART, *dict.fromkeys(letters_of("\n".join(words)))])
+    else:
+        joined = "\n".join(words)
+    return Zone(
+        min((zone.least for zone in zones if zone.least is not None), default=None),
+        max((zone.greatest for zone in zones if zone.greatest is not None), default=None),
+        sum(zone.nulls for zone in zones),
+        joined,
+    )
+
+
 def letters_of(text: str) -> list[str]:
     """Returns the rows of letters in a text, each as long as it goes on."""
     return _LETTERS.findall(text)
@@ -323,10 +340,11 @@ def _rows(column: Column, positions: IntArray) -> Column:
 
 
 def _joined_columns(parts: Sequence[Mapping[str, Column]]) -> dict[str, Column]:
-    return {path: _joined_column([part[path] for part in parts]) for path in parts[0]}
+    return {path: joined_column([part[path] for part in parts]) for path in parts[0]}
 
 
-def _joined_column(parts: Sequence[Column]) -> Column:
+def joined_column(parts: Sequence[Column]) -> Column:
+    """Returns columns of one kind one after the other."""
     texts = [part for part in parts if isinstance(part, Texts)]
     if len(texts) < len(parts):
         return np.concatenate([part for part in parts if not isinstance(part, Texts)])

@@ -34,7 +34,7 @@ from ros2_memory.columns.shown import (
     placed,
     unknown,
 )
-from ros2_memory.columns.table import MAX_NUMBERS, Texts, as_float
+from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values, zone_of
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.messages.detections import MAX_DEPTH, without_low_scores
@@ -279,8 +279,7 @@ class _LeafTest:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
         leaf = self.leaf
         if leaf.kind is Kind.TEXT:
-            texts = values.texts(leaf)
-            yield leaf.level, None if texts is None else self._among_texts(texts), self.limits
+            yield leaf.level, self._among_texts(values), self.limits
             return
         numbers = values.numbers(leaf)
         if numbers is not None:
@@ -294,12 +293,24 @@ class _LeafTest:
     def _folded(self) -> str | None:
         return None if isinstance(self.test, Beyond) else self.test.folded
 
-    def _among_texts(self, texts: Texts) -> Kept:
-        words: Sequence[str] = texts.words
-        if self.leaf.json_depth:
-            words = [_without_low(word, self.least_score, self.leaf.json_depth) for word in words]
-        flags = np.fromiter(map(self.passes, words), np.bool_, len(words))
-        passed = flags[texts.codes] if words else np.zeros(0, np.bool_)
+    def _among_texts(self, values: Values) -> Kept | None:
+        """Returns which texts pass; None where the table cannot say."""
+        may = values.letters(self.leaf, self._folded or "")
+        is_word = isinstance(self.test, Contains) and self.test.is_one_word
+        if may is not None and (not may.any() or (is_word and not self.leaf.json_depth)):
+            return Kept(may, may)
+        texts = values.texts(self.leaf)
+        if texts is None:
+            return None if may is None else Kept(np.zeros_like(may), may)
+        used = [True] * len(texts.words)
+        if may is not None:
+            used = (np.bincount(texts.codes[may], minlength=len(texts.words)) > 0).tolist()
+        depth, least = self.leaf.json_depth, self.least_score
+        flags = [
+            is_used and self.passes(_without_low(word, least, depth) if depth else word)
+            for word, is_used in zip(texts.words, used, strict=True)
+        ]
+        passed = np.array(flags, np.bool_)[texts.codes] if flags else np.zeros(0, np.bool_)
         return Kept(passed, passed)
 
     def _among_numbers(self, numbers: Numbers) -> Kept:

@@ -12,7 +12,7 @@ from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.errors import BusyError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -39,7 +39,6 @@ class Unit(ABC):
         table: the rows, ordered by log time.
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
-        recording: that all the rows are of.
         part: the number of the part; None where it may be replaced, or they are a bag's.
     """
 
@@ -48,7 +47,11 @@ class Unit(ABC):
     table: Table
     first: Ns
     last: Ns
-    recording: Path
+
+    @property
+    @abstractmethod
+    def recording(self) -> Path:
+        """The recording that all the rows are of."""
 
     @abstractmethod
     def times(self) -> IntArray:
@@ -78,8 +81,12 @@ class BagUnit(Unit):
         self.key = (bag.file, nth)
         self.table = table
         self.first, self.last = int(table.log_times[0]), int(table.log_times[-1])
-        self.recording = bag.recording
         self._bag = bag
+
+    @property
+    def recording(self) -> Path:
+        """The bag's recording."""
+        return self._bag.recording
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -122,11 +129,15 @@ class PartUnit(Unit):
         self.part = head.number if head.is_whole else None
         self.table = table
         self.first, self.last = head.first, head.last
-        self.recording = bag_of(int(counting[0])).recording
         self._load = load
         self._counting = counting
         self._bag_of = bag_of
         self._all_count = counting.size == head.bags.size
+
+    @cached_property
+    def recording(self) -> Path:
+        """The recording that all the rows are of."""
+        return self._bag_of(int(self._counting[0])).recording
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -163,11 +174,15 @@ class Rows:
 
     Attributes:
         table: the table; not all of its rows need count.
+        may_match: whether some may be wanted, as far as zones tell.
     """
 
-    def __init__(self, unit: Unit, find: Callable[[], IntArray | None]) -> None:
+    def __init__(
+        self, unit: Unit, find: Callable[[], IntArray | None], *, may_match: bool = True
+    ) -> None:
         self._unit = unit
         self.table = unit.table
+        self.may_match = may_match
         self._find = find
 
     @classmethod
@@ -218,14 +233,18 @@ class Rows:
         times = self.times
         return int(times[0]), int(times[-1])
 
-    def bag_rows(self) -> Iterator[tuple[BagFile, IntArray]]:
-        """Yields each bag with the positions of its rows among those that count, ascending."""
+    def bag_rows(self, among: Container[str] | None = None) -> Iterator[tuple[BagFile, IntArray]]:
+        """Yields each bag with the positions of its rows among those that count, ascending.
+
+        With `among` of these files alone.
+        """
         numbers = self._unit.bag_numbers()
         if self.index is not None:
             numbers = numbers[self.index]
         bags = self._unit.bags()
         for number in np.unique(numbers).tolist():
-            yield bags[number], np.flatnonzero(numbers == number)
+            if among is None or bags[number].file in among:
+                yield bags[number], np.flatnonzero(numbers == number)
 
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
+from ros2_memory.columns.stored import parts_of
 from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
@@ -197,6 +198,18 @@ class Values:
         """Returns the texts of a leaf; None where the table does not hold them."""
         found = self.column(leaf.level, leaf.sources[0])
         return found if isinstance(found, Texts) else None
+
+    def letters(self, leaf: Leaf, text: str) -> Mask | None:
+        """Returns which texts of a leaf may have a casefolded text; None where that is not known.
+
+        They surely have it if it is one row of letters.
+        """
+        if leaf.level is not ROWS:
+            return None
+        known = [table.outline() for table in parts_of(self.table)]
+        letters = [one.letters.get(leaf.sources[0]) for one in known if one is not None]
+        found = [one.may_have(text) for one in letters if one is not None]
+        return np.concatenate(found) if found and len(found) == len(known) else None
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
         """Returns a column of numbers or booleans; None where the table does not hold it."""

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united, without
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.spans import without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
 from ros2_memory.history.clock_steps import elapsed_in
@@ -108,9 +109,14 @@ class BinnedWindow:
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
-        bags = self.view.stream.overlapping_bags(topics, self.counted)
         pause = round(2 * NS_PER_S * self.view.memory.limits.split_duration_s)
-        heard = united(((each.first, each.last) for each in bags), pause)
+        parts = self.view.snapshot.timeline.segments_in(self.counted)
+        spans = np.concatenate(
+            [np.empty((2, 0), np.int64), *(part.bounds_in(topics, self.counted) for part in parts)],
+            axis=1,
+        )
+        firsts, lasts = pieces_of(spans[0], spans[1], pause)
+        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
         self.add_lengths(column, "duration", without(heard, self.gaps))
 
     def add_unknown(self, spans: Spans) -> None:
@@ -150,14 +156,15 @@ class BinnedWindow:
     def _last_held(self, starts: NDArray[np.int64], stops: NDArray[np.int64]) -> Values:
         """Returns for each bin when something held there for the last time."""
         found: list[float | None] = [None] * len(self.bins.names)
-        members = [np.flatnonzero(each).tolist() for each in self.bins.member]
         begin, end = self.bins.pieces(starts), self.bins.pieces(stops)
-        for at, (first, last) in enumerate(zip(begin.tolist(), end.tolist(), strict=True)):
-            for piece in range(first, last + 1):
-                until = min(int(stops[at]), int(self.bins.edges[piece + 1]) - 1)
-                for number in members[piece]:
-                    known = found[number]
-                    found[number] = until if known is None else max(known, until)
+        newest = np.full(len(self.bins.member), MIN_NS)
+        np.maximum.at(newest, end, np.minimum(stops, self.bins.edges[end + 1] - 1))
+        for first, last in zip(begin[begin < end].tolist(), end[begin < end].tolist(), strict=True):
+            before = newest[first:last]
+            np.maximum(before, self.bins.edges[first + 1 : last + 1] - 1, out=before)
+        for number, some in enumerate(self.bins.member.T):
+            latest = int(newest[some].max(initial=MIN_NS))
+            found[number] = None if latest == MIN_NS else latest
         return found
 
     def usual_of(self, times: NDArray[np.int64]) -> Usual | None:

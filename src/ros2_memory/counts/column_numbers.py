@@ -8,31 +8,37 @@ least and the greatest lie is settled in the bags that may hold them.
 from __future__ import annotations
 
 import math
+import sys
 from bisect import bisect_right
 from collections import defaultdict
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.numbers import extent, numbers
+from ros2_memory.analysis.conditions import leaves
+from ros2_memory.columns.numbers import FieldNumbers, column_of, numbers
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.columns.table import Table
+from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.counts.field_numbers import FieldReader
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.scan import decoded_rows, messages_of, scan
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.columns.numbers import FieldNumbers
-    from ros2_memory.columns.units import Rows
-    from ros2_memory.core.errors import UndecodableError
+    from ros2_memory.columns.outline import Totals
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import Definition, IntArray, Record
 
+_LARGEST: Final = sys.float_info.max
+_SUMMARY: Final = frozenset({"bytes", "numbers"})
+"""The keys of a summary in place of numbers that are too many to show."""
 LEAST: Final = 1
 GREATEST: Final = -1
 """The greatest number is the least one of their negatives."""
@@ -88,6 +94,13 @@ class Part(NamedTuple):
     greatest: Extreme
 
 
+class _Known(NamedTuple):
+    """What is known of a column of a part without it: also its least and greatest number."""
+
+    totals: Totals
+    ends: tuple[Extreme, Extreme]
+
+
 class PieceNumbers:
     """Collects the numbers of some fields of a topic in pieces of a window.
 
@@ -97,8 +110,6 @@ class PieceNumbers:
         fields: dot-paths.
         edges: where pieces begin (ns), ascending; what is before the first is piece 0.
         most_read: messages that may be read from bags where columns do not hold a field.
-        only_extremes: whether nothing else is wanted: then `Part.size` and `Part.total` say
-            nothing, and most columns need not be read.
 
     Attributes:
         since: what is before this log time is not among the parts, for lack of time; or None.
@@ -113,7 +124,6 @@ class PieceNumbers:
         edges: IntArray,
         *,
         most_read: int | None = None,
-        only_extremes: bool = False,
     ) -> None:
         self.since: Ns | None = None
         self._view = view
@@ -121,19 +131,14 @@ class PieceNumbers:
         self._fields = tuple(fields)
         self._edges = edges
         self._most_read = most_read
-        self._only_extremes = only_extremes
+        self.failures: list[UndecodableError] = []
         self._read = 0
-        self._reader = FieldReader(view, fields)
         self._reading = view.call.partial_after(READING_S)
         self._left: Ns = MAX_NS
         self._waiting: list[Rows] = []
         self._parts: defaultdict[tuple[int, int], list[Part]] = defaultdict(list)
-        self._settled: dict[tuple[int, int, Extreme], Extreme] = {}
-
-    @property
-    def failures(self) -> Sequence[UndecodableError]:
-        """Why messages that were read cannot be decoded."""
-        return self._reader.failures
+        self._known: dict[tuple[int, int, Extreme], Extreme] = {}
+        self._columns: dict[tuple[Definition, str, str], str | None] = {}
 
     def collect(self, window: TimeWindow) -> None:
         """Collects the numbers of a window, for as long as there is time.
@@ -164,18 +169,18 @@ class PieceNumbers:
 
         What the columns do not decide is read, but for the time being over.
         """
-        found = [
-            (part.least if sign == LEAST else part.greatest, piece)
+        found = sorted(
+            part.least if sign == LEAST else part.greatest
             for piece in pieces
             for part in self.parts(field, piece)
-        ]
+        )
         best = (math.inf, MAX_NS)
-        for extreme, piece in sorted(found):
+        for extreme in found:
             if extreme.low > best[0]:
                 break
             if extreme.low == best[0] and extreme.first >= best[1]:
                 continue
-            settled = self._settle(field, piece, sign, extreme)
+            settled = self._settled(field, sign, extreme)
             best = min(best, (settled.high, settled.first))
         return (best[0] * sign, best[1]) if found else None
 
@@ -189,44 +194,75 @@ class PieceNumbers:
         if self._reading.expired() and self._parts:
             raise QueryTimeoutError("the rest is left out")
 
+    def _add_totals(self, rows: Rows, since: Ns) -> bool:
+        """Adds the numbers of a part, if all are of one piece and its outline tells them."""
+        piece = bisect_right(self._edges, rows.first)
+        is_cut = piece != bisect_right(self._edges, rows.last)
+        if rows.index is not None or is_cut or rows.first < since:
+            return False
+        every = [self._ends(rows, field) for field in range(len(self._fields))]
+        known = [some for some in every if some is not None]
+        if len(known) < len(every):
+            return False
+        for field, (totals, ends) in enumerate(known):
+            part = Part(rows.first, rows.last, totals.size, totals.total, *ends)
+            self._parts[field, piece].append(part)
+        return True
+
+    def _ends(self, rows: Rows, field: int) -> _Known | None:
+        """Returns what is known of a field in a part without its columns; None where nothing is."""
+        table = rows.table
+        if not isinstance(table, StoredTable) or table.definition is None:
+            return None
+        key = (table.definition, table.channel.type, self._fields[field])
+        if key not in self._columns:
+            extractor = self._view.memory.extractor
+            self._columns[key] = column_of(table, self._fields[field], extractor)
+        path, outline = self._columns[key], table.outline()
+        totals = None if path is None or outline is None else outline.totals(path)
+        zone = None if path is None or totals is None else table.zone(path)
+        if totals is None or zone is None:
+            return None
+        least = Extreme(zone.low, zone.low, *totals.least)
+        greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
+        return _Known(totals, (least, greatest))
+
     def _add(self, rows: Rows, since: Ns) -> None:
         """Adds the numbers of a table from a log time on."""
-        pieces = [*self._pieces(rows, since)]
-        if self._only_extremes and self._add_extents(rows, pieces):
+        if self._add_totals(rows, since):
             return
-        extractor = self._view.memory.extractor
-        found = [numbers(rows.table, field, extractor) for field in self._fields]
+        table, extractor = rows.table, self._view.memory.extractor
+        found = [numbers(table, field, extractor) for field in self._fields]
         held = [some for some in found if some is not None]
-        if len(held) < len(found):
-            if isinstance(rows.table, StoredTable):
-                for decoded in decoded_rows(self._view, rows):
-                    self._add(decoded, since)
-            else:
-                self._add_read(rows, since)
-            return
-        for field, some in enumerate(held):
-            whole = _of_rows(some, rows)
-            for piece, start, stop in pieces:
-                begin, end = np.searchsorted(whole.rows, [start, stop]).tolist()
-                if begin < end:
-                    part = _part(rows, whole, (start, stop), (begin, end))
-                    self._parts[field, piece].append(part)
+        if len(held) == len(found):
+            pieces = self._pieces(rows, since)
+            self._add_found(rows, [_of_rows(some, rows) for some in held], pieces)
+        elif isinstance(table, StoredTable):
+            for decoded in decoded_rows(self._view, rows):
+                self._add(decoded, since)
+        else:
+            self._add_read(rows, since)
 
-    def _add_extents(self, rows: Rows, pieces: Sequence[tuple[int, int, int]]) -> bool:
-        """Adds the least and the greatest number of a whole table, if no column must be read."""
-        if rows.index is not None or [piece[1:] for piece in pieces] != [(0, len(rows))]:
-            return False
-        extractor = self._view.memory.extractor
-        found = [extent(rows.table, field, extractor) for field in self._fields]
-        known = [some for some in found if some is not None]
-        if len(known) < len(found):
-            return False
-        [(piece, _, _)] = pieces
-        first, last = rows.span
-        for field, (least, greatest) in enumerate(known):
-            ends = [Extreme(number, number, first, last) for number in (least, -greatest)]
-            self._parts[field, piece].append(Part(first, last, 1, math.nan, *ends))
-        return True
+    def _add_found(
+        self, rows: Rows, held: Sequence[FieldNumbers], pieces: Iterable[tuple[int, int, int]]
+    ) -> None:
+        for piece, start, stop in pieces:
+            is_whole = stop - start == len(rows)
+            first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
+            for field, found in enumerate(held):
+                begin, end = np.searchsorted(found.rows, [start, stop]).tolist()
+                if begin == end:
+                    continue
+                total = float(found.numbers[begin:end].sum(dtype=np.float64))
+                ends = [_extreme(rows, found, (begin, end), sign) for sign in (LEAST, GREATEST)]
+                known = self._ends(rows, field) if rows.index is None else None
+                if known is not None:
+                    # Those of the whole part are exact, where they lie here.
+                    ends = [
+                        whole if first <= whole.first <= whole.last <= last else own
+                        for own, whole in zip(ends, known.ends, strict=True)
+                    ]
+                self._parts[field, piece].append(Part(first, last, end - begin, total, *ends))
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
         """Yields the number of each piece of some rows, with its first row and the one after it."""
@@ -235,10 +271,9 @@ class PieceNumbers:
         if begin == end and since <= first:
             yield begin, 0, len(rows)
             return
-        times = rows.times
-        least = int(np.searchsorted(times, since))
-        bounds = np.searchsorted(times, self._edges[begin:end]).tolist()
-        starts, stops = [0, *bounds], [*bounds, times.size]
+        edges = np.append(since, self._edges[begin:end])
+        least, *bounds = np.searchsorted(rows.times, edges).tolist()
+        starts, stops = [0, *bounds], [*bounds, len(rows)]
         for piece, (start, stop) in enumerate(zip(starts, stops, strict=True), begin):
             if max(start, least) < stop:
                 yield piece, max(start, least), stop
@@ -248,34 +283,36 @@ class PieceNumbers:
         self._read += len(rows)
         if self._most_read is not None and self._read > self._most_read:
             raise TooManyError
-        edges = self._edges.tolist()
-        by_piece = defaultdict(list)
-        for found in messages_of(self._view, rows):
-            if found.time >= since:
-                by_piece[bisect_right(edges, found.time)].append(found)
-        for piece, messages in by_piece.items():
-            known, _ = self._reader.numbers(messages)
-            for field, of_field in enumerate(known or ()):
-                if of_field.low_at is None or of_field.high_at is None:
-                    continue
-                low, high = of_field.low, -of_field.high
-                times = [found.time for found in messages]
-                part = Part(
-                    min(times),
-                    max(times),
-                    of_field.size,
-                    of_field.total,
-                    Extreme(low, low, of_field.low_at, of_field.low_at),
-                    Extreme(high, high, of_field.high_at, of_field.high_at),
-                )
-                self._parts[field, piece].append(part)
+        for bag, positions in rows.bag_rows():
+            read = [
+                (found.time, sample)
+                for found in messages_of(self._view, rows.some(positions))
+                if (sample := self._sample(found.record)) is not None
+            ]
+            if not read:
+                continue
+            times = np.array([time for time, _ in read], np.int64)
+            whole = Rows(BagUnit(bag, Table(rows.table.channel, times, times, times), 0), _all)
+            samples = [[sample[nth] for _, sample in read] for nth in range(len(self._fields))]
+            self._add_found(whole, [*map(_of_samples, samples)], self._pieces(whole, since))
 
-    def _settle(self, field: int, piece: int, sign: int, extreme: Extreme) -> Extreme:
+    def _sample(self, record: Record) -> list[list[float]] | None:
+        """Returns the numbers of each field in a message; None where it cannot be decoded."""
+        try:
+            message = self._view.memory.reader.decode(record)
+        except UndecodableError as error:
+            # A new one, since the one that was raised keeps the message by its traceback.
+            self.failures.append(UndecodableError(error.topic, error.type_name, error.reason))
+            return None
+        at = partial(self._view.memory.extractor.exact_at, message, record.channel.type)
+        return [[*numbers_in(at(field))] for field in self._fields]
+
+    def _settled(self, field: int, sign: int, extreme: Extreme) -> Extreme:
         """Returns an extreme as the bags have it."""
         if extreme.is_settled:
             return extreme
-        key = (field * 2 + (sign > 0), piece, extreme)
-        if key not in self._settled:
+        key = (field, sign, extreme)
+        if key not in self._known:
             try:
                 found = self._read_extreme(field, sign, extreme)
             except QueryTimeoutError:
@@ -285,8 +322,8 @@ class PieceNumbers:
                     f"those of {self._fields[field]} may be off in their last digits"
                 )
             number, first = extreme.middle, extreme.first
-            self._settled[key] = found or Extreme(number, number, first, first)
-        return self._settled[key]
+            self._known[key] = found or Extreme(number, number, first, first)
+        return self._known[key]
 
     def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
         """Returns an extreme by the bags that may hold it; None where these cannot be read."""
@@ -300,7 +337,14 @@ class PieceNumbers:
                 continue
             for some in _by_bag(rows, _candidates(rows, known, sign, extreme)):
                 waiting.append((int(some.times[0]), len(waiting), some))
-        for first, _, rows in sorted(waiting, key=lambda each: each[:2]):
+        if (
+            extreme.low == extreme.high
+            and best[1] == MAX_NS
+            and len(waiting) == 1 == len(waiting[0][2])
+        ):
+            # Of all messages only this one can have the number.
+            return Extreme(extreme.low, extreme.low, waiting[0][0], waiting[0][0])
+        for first, _, rows in sorted(waiting, key=lambda one: one[:2]):
             if best[0] <= extreme.low and best[1] <= first:
                 break
             if self._reading.expired():
@@ -348,43 +392,43 @@ def _of_rows(found: FieldNumbers, rows: Rows) -> FieldNumbers:
         numbers=found.numbers[kept],
         errors=None if found.errors is None else found.errors[kept],
         exactly=None if exactly is None else lambda among: exactly(kept[among]),
-        least=None,
-        greatest=None,
     )
 
 
-def _part(rows: Rows, found: FieldNumbers, some: tuple[int, int], among: tuple[int, int]) -> Part:
-    """Returns the numbers at some positions, which are of some of the rows."""
-    start, stop = some
-    is_whole = stop - start == len(rows)
-    first, last = rows.span if is_whole else (int(rows.times[start]), int(rows.times[stop - 1]))
-    begin, end = among
-    if not is_whole:
-        found = found._replace(least=None, greatest=None)
-    return Part(
-        first,
-        last,
-        end - begin,
-        float(found.numbers[begin:end].sum(dtype=np.float64)),
-        _extreme(rows, found, among, LEAST, (first, last)),
-        _extreme(rows, found, among, GREATEST, (first, last)),
-    )
-
-
-def _extreme(
-    rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int, span: tuple[Ns, Ns]
-) -> Extreme:
+def _extreme(rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int) -> Extreme:
     begin, end = among
     if not found.error or found.exactly is not None:
         number, row = _furthest(found, np.arange(begin, end), sign)
         at = int(rows.times[row])
         return Extreme(number, number, at, at)
-    known = found.least if sign == LEAST else found.greatest
-    if known is not None:
-        return Extreme(sign * known, sign * known, *span)
     signed = sign * found.numbers[begin:end]
     off = found.error if found.errors is None else found.errors[begin:end]
-    return Extreme(float((signed - off).min()), float((signed + off).min()), *span)
+    low, high = float((signed - off).min()), float((signed + off).min())
+    may = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
+    return Extreme(low, high, *rows.times[found.rows[may]].tolist())
+
+
+def _of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
+    """Returns the numbers of one field, of which each message has some."""
+    found = np.array([number for sample in samples for number in sample])
+    if found.dtype.kind != "i":
+        found = found.astype(np.float64)
+    return FieldNumbers(np.repeat(np.arange(len(samples)), [*map(len, samples)]), found, 0.0)
+
+
+def numbers_in(value: JsonValue) -> Iterator[float]:
+    """Yields the numbers of a field; not those of a summary in place of an array."""
+    if isinstance(value, dict) and value.keys() <= _SUMMARY:
+        return  # its numbers are counts, not the field's values
+    for leaf in leaves(value):
+        if isinstance(leaf, bool) or not isinstance(leaf, int | float):
+            continue
+        if -_LARGEST <= leaf <= _LARGEST:
+            yield leaf
+
+
+def _all() -> None:
+    """Finds that all rows count."""
 
 
 def _furthest(found: FieldNumbers, among: IntArray, sign: int) -> tuple[float, int]:

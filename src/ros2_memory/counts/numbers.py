@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
 from ros2_memory.counts.values import count_values
@@ -31,7 +30,16 @@ if TYPE_CHECKING:
     from ros2_memory.results import BinColumn, Bins
 
     Times: TypeAlias = NDArray[np.int64]
+    _Cell: TypeAlias = tuple[float, Ns, float, Ns, float]
 
+_CELL: Final[tuple[tuple[str, BinColumn], ...]] = (
+    ("min", "number"),
+    ("min_at", "time"),
+    ("max", "number"),
+    ("max_at", "time"),
+    ("mean", "number"),
+)
+"""The columns of a field."""
 _MEAN_DIGITS: Final = 12
 """What rounding of sums cannot change, however a window is cut into bags."""
 
@@ -67,7 +75,8 @@ def count_range(
             "name fewer fields, or ask about a shorter window"
         )
     numbers = _numbers(view, name, binned, names) if names else None
-    counts, first, last = _counted(view, name, binned)
+    edges = binned.bins.edges[1:-1]
+    counts, first, last = count_messages(view, name, binned.counted, edges)
     if not counts.any():
         raise no_data_between(view, (name,), asked)
     member = binned.bins.member
@@ -83,18 +92,6 @@ def count_range(
 
 def _extreme(times: Times, which: Callable[[Iterable[Ns]], Ns]) -> Ns | None:
     return which(times.tolist()) if len(times) else None
-
-
-def _counted(view: View, topic: str, binned: BinnedWindow) -> tuple[Times, Times, Times]:
-    """Returns for each piece how many messages it holds, and when the first and the last came."""
-    edges = binned.bins.edges[1:-1]
-    size = len(binned.bins.member)
-    counts, first, last = [0] * size, [MAX_NS] * size, [MIN_NS] * size
-    for counted in count_messages(view, topic, binned.counted, edges):
-        counts[counted.piece] += counted.messages
-        first[counted.piece] = min(first[counted.piece], counted.first)
-        last[counted.piece] = max(last[counted.piece], counted.last)
-    return np.array(counts, np.int64), np.array(first, np.int64), np.array(last, np.int64)
 
 
 def _numbers(
@@ -120,7 +117,7 @@ def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | Non
     mean = _mean(math.fsum(part.total for part in parts), sum(part.size for part in parts))
     # The extremes are exact; what columns add up to is not.
     mean = min(max(mean, least[0]), greatest[0]) + 0.0
-    return _Cell(mean, (least[0] + 0.0, least[1]), (greatest[0] + 0.0, greatest[1]))
+    return least[0] + 0.0, least[1], greatest[0] + 0.0, greatest[1], mean
 
 
 def _mean(total: float, count: int) -> float:
@@ -135,25 +132,11 @@ def _note_failures(view: View, failures: Sequence[UndecodableError]) -> None:
         view.notes.add(f"messages left out, since they cannot be decoded: {reason}")
 
 
-class _Cell:
-    """The numbers of one field in one bin: the mean, and least and greatest with their times."""
-
-    def __init__(self, mean: float, least: tuple[float, Ns], most: tuple[float, Ns]) -> None:
-        self.mean, self.least, self.most = mean, least, most
-
-
 def _add_columns(binned: BinnedWindow, field: str, cells: Sequence[_Cell | None]) -> None:
     """Adds the columns of a field; the last cell is that of all bins together."""
     if cells[-1] is None:
         binned.view.notes.add(f"{field} holds no number in the window")
         return
-    columns: tuple[tuple[str, BinColumn, Callable[[_Cell], float]], ...] = (
-        ("min", "number", lambda cell: cell.least[0]),
-        ("min_at", "time", lambda cell: cell.least[1]),
-        ("max", "number", lambda cell: cell.most[0]),
-        ("max_at", "time", lambda cell: cell.most[1]),
-        ("mean", "number", lambda cell: cell.mean),
-    )
-    for name, kind, of in columns:
-        *each, whole = [None if cell is None else of(cell) for cell in cells]
+    for nth, (name, kind) in enumerate(_CELL):
+        *each, whole = [None if cell is None else cell[nth] for cell in cells]
         binned.add(f"{field}.{name}", kind, each, whole)

@@ -6,39 +6,41 @@ Of the rest the times of messages are looked at, and where recordings overlap th
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ros2_memory.core.spans import united
-from ros2_memory.history.scan import scan
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.history.scan import holding_copies, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from numpy.typing import NDArray
 
     from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
+    from ros2_memory.index.segment import TopicColumn
     from ros2_memory.storage.base import IntArray
 
 
 class Counted(NamedTuple):
-    """How many messages a piece holds, or a part of it, and when the first and the last were.
+    """How many messages each piece holds, and the log times of its first and last one."""
 
-    `piece` is its number: how many edges do not lie after it.
-    """
+    messages: IntArray
+    first: IntArray
+    last: IntArray
 
-    piece: int
-    messages: int
-    first: Ns
-    last: Ns
+    def add(self, pieces: IntArray, messages: IntArray, first: IntArray, last: IntArray) -> None:
+        """Adds messages to pieces, each of which may be named several times."""
+        np.add.at(self.messages, pieces, messages)
+        np.minimum.at(self.first, pieces, first)
+        np.maximum.at(self.last, pieces, last)
 
 
-def count_messages(
-    view: View, topic: str, window: TimeWindow, edges: IntArray
-) -> Iterator[Counted]:
-    """Yields how many messages of a topic lie in a window, of parts that no edge cuts.
+def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) -> Counted:
+    """Returns how many messages of a topic lie in each piece of a window.
 
     Messages that cannot be decoded count, too.
 
@@ -46,40 +48,55 @@ def count_messages(
         view: the call's.
         topic: its name.
         window: of log time.
-        edges: where pieces begin (ns), ascending.
+        edges: where pieces begin (ns), ascending; what is before the first is piece 0.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
+    size = len(edges) + 1
+    counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
     if view.stream.may_be_relatched([topic]):
         for rows in scan(view, topic, window, columns=False):
-            yield from _in_pieces(rows.times, edges)
-        return
-    shared = view.snapshot.timeline.shared_times
-    ends = [stop for _, stop in shared]
+            counted.add(*_one_by_one(rows.times, edges))
+        return counted
+    shared = holding_copies(view, topic, window)
     to_read: dict[str, tuple[Ns, Ns]] = {}
-    for first, last, bag in view.stream.overlapping_bags([topic], window):
-        near = bisect_right(ends, first)
-        is_shared = near < len(shared) and shared[near][0] <= last
-        piece, until = np.searchsorted(edges, [first, last], side="right").tolist()
-        if piece == until and not is_shared and window.covers(first, last):
-            yield Counted(piece, sum(known.count for known in bag.summary.of(topic)), first, last)
-        else:
-            to_read[bag.file] = (first, last + 1)
+    for segment in view.snapshot.timeline.segments_in(window):
+        column = segment.column(topic)
+        if column is None:
+            continue
+        of, firsts, lasts, messages = column
+        pieces, is_in, is_cut = _told_apart(column, window, edges, shared)
+        counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
+        for row in np.flatnonzero(is_cut).tolist():
+            to_read[segment.bags[of[row]].file] = int(firsts[row]), int(lasts[row]) + 1
     near_those = united(sorted(to_read.values()))
-    for rows in scan(view, topic, window, columns=False, within=near_those):
-        for bag, positions in rows.bag_rows():
-            if bag.file in to_read:
-                yield from _in_pieces(rows.times[positions], edges)
+    for rows in scan(view, topic, window, columns=False, shared=shared, within=near_those):
+        for _, positions in rows.bag_rows(to_read):
+            counted.add(*_one_by_one(rows.times[positions], edges))
+    return counted
 
 
-def _in_pieces(times: IntArray, edges: IntArray) -> Iterator[Counted]:
-    """Yields the counts of ascending times."""
-    if not times.size:
-        return
-    bounds = np.searchsorted(times, edges)
-    starts = [0, *bounds.tolist()]
-    stops = [*bounds.tolist(), times.size]
-    for piece, (start, stop) in enumerate(zip(starts, stops, strict=True)):
-        if start < stop:
-            yield Counted(piece, stop - start, int(times[start]), int(times[stop - 1]))
+def _told_apart(
+    column: TopicColumn, window: TimeWindow, edges: IntArray, shared: Spans
+) -> tuple[IntArray, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Returns the piece of each bag, which of them are counted whole, and which are to be read."""
+    bags, firsts, lasts, _ = column
+    pieces = np.searchsorted(edges, firsts, side="right")
+    is_cut = pieces != np.searchsorted(edges, lasts, side="right")
+    is_cut |= (firsts < window.start) | (lasts >= window.stop) | _overlap(firsts, lasts, shared)
+    # Under none of its types is a bag counted that is read.
+    is_cut = np.isin(bags, bags[is_cut])
+    is_here = (firsts < window.stop) & (lasts >= window.start)
+    return pieces, is_here & ~is_cut, is_here & is_cut
+
+
+def _overlap(firsts: IntArray, lasts: IntArray, spans: Spans) -> NDArray[np.bool_]:
+    """Returns which times (inclusive) overlap one of half-open spans, in order and apart."""
+    starts, stops = np.array([*spans, (MAX_NS, MAX_NS)], np.int64).T
+    found: NDArray[np.bool_] = starts[np.searchsorted(stops, firsts, side="right")] <= lasts
+    return found
+
+
+def _one_by_one(times: IntArray, edges: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    return np.searchsorted(edges, times, side="right"), np.ones_like(times), times, times

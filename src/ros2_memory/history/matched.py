@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.truth import ColumnCondition
+from ros2_memory.columns.stored import StoredTable, joined_stored
+from ros2_memory.columns.truth import ColumnCondition, Truth
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -29,6 +30,8 @@ NOT_MET: Final = 0
 UNKNOWN: Final = 2
 """The message cannot be decoded."""
 
+_MOST_TOGETHER: Final = 64
+"""Parts whose columns are tested at once."""
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
 
@@ -84,8 +87,7 @@ class Matching:
         """
         waiting: Block | None = None
         try:
-            for rows in scan(self._view, topic, window, newest_first=True, may_be_empty=True):
-                block = self._block(topic, rows, window)
+            for block in self._blocks(topic, window):
                 if waiting is None or block.last < waiting.first:
                     if waiting is not None:
                         yield waiting
@@ -101,27 +103,58 @@ class Matching:
         if waiting is not None:
             yield waiting
 
-    def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
-        truth = self._test.truth(rows.table)
+    def _blocks(self, topic: str, window: TimeWindow) -> Iterator[Block]:
+        """Yields a block for each table, the newest first; of parts that are alike one for many."""
+        most = 1
+        together: list[Rows] = []
+        scanned = scan(
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._test.may_match,
+            may_not_match=True,
+            may_be_empty=True,
+        )
+        try:
+            for rows in scanned:
+                if together and not (len(together) < most and _follows(rows, together[-1])):
+                    yield self._block(topic, together[::-1], window)
+                    # Who goes on reads many.
+                    most, together = min(2 * most, _MOST_TOGETHER), []
+                together.append(rows)
+        except QueryTimeoutError:
+            if together:
+                yield self._block(topic, together[::-1], window)
+            raise
+        if together:
+            yield self._block(topic, together[::-1], window)
+
+    def _block(self, topic: str, parts: Sequence[Rows], window: TimeWindow) -> Block:
+        stored = [rows.table for rows in parts if isinstance(rows.table, StoredTable)]
+        table = parts[0].table if len(parts) == 1 else joined_stored(stored)
+        truth = self._test.truth(table) if parts[0].may_match else Truth(len(table))
         self.ruled_out |= truth.is_none
-        first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
+        first, last = max(parts[0].first, window.start), min(parts[-1].last, window.stop - 1)
         if truth.is_none:
 
             def none_met() -> Tested:
-                return Tested(rows.times, np.zeros(len(rows), np.uint8))
+                times = _times(parts)
+                return Tested(times, np.zeros(times.size, np.uint8))
 
             return Block(topic, first, last, has_match=False, tested=none_met)
         met, unsure = truth.met, truth.unsure
-        if rows.index is not None:
-            met, unsure = met[rows.index], unsure[rows.index]
+        if any(rows.index is not None for rows in parts):
+            counting = np.concatenate([rows.mask() for rows in parts])
+            met, unsure = met[counting], unsure[counting]
         self.ruled_out |= not (met | unsure).all()
-        test = partial(self._tested, topic, rows, met, unsure)
+        test = partial(self._tested, topic, parts, met, unsure)
         return Block(topic, first, last, has_match=bool((met | unsure).any()), tested=test)
 
     def _tested(
-        self, topic: str, rows: Rows, met: NDArray[np.bool_], unsure: NDArray[np.bool_]
+        self, topic: str, parts: Sequence[Rows], met: NDArray[np.bool_], unsure: NDArray[np.bool_]
     ) -> Tested:
-        times, found = rows.times, met.astype(np.uint8)
+        times, found = _times(parts), met.astype(np.uint8)
         undecided = np.flatnonzero(unsure)
         if undecided.size:
             edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
@@ -139,6 +172,23 @@ class Matching:
             read[each.time].append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
         return [read[time].pop() if read[time] else NOT_MET for time in times.tolist()]
+
+
+def _follows(older: Rows, newer: Rows) -> bool:
+    """Returns whether some rows end before others begin, and have the same columns."""
+    one, other = older.table, newer.table
+    return (
+        older.last < newer.first
+        and older.may_match == newer.may_match
+        and isinstance(one, StoredTable)
+        and isinstance(other, StoredTable)
+        and one.channel is other.channel
+        and one.left_out == other.left_out
+    )
+
+
+def _times(parts: Sequence[Rows]) -> IntArray:
+    return np.concatenate([rows.times for rows in parts])
 
 
 def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -33,6 +34,7 @@ def scan(
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
     may_match: Callable[[PartZones], bool | Mask] | None = None,
+    may_not_match: bool = False,
     may_be_empty: bool = False,
     within: Sequence[tuple[Ns, Ns]] | None = None,
     stored: bool = False,
@@ -45,8 +47,7 @@ def scan(
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
     a message counts in each recording that holds it. `shared` are the spans in which recordings
     may hold copies, where the caller knows them. With `stored` bags that are not stored have no
-    rows. `may_match`, `may_be_empty` and `within` are as in
-    `Asked`.
+    rows. `may_match`, `may_not_match`, `may_be_empty` and `within` are as in `Asked`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
@@ -68,6 +69,7 @@ def scan(
         decode,
         shared=shared,
         may_match=may_match,
+        may_not_match=may_not_match,
         may_be_empty=may_be_empty,
         within=within,
         stored=stored,
@@ -75,6 +77,16 @@ def scan(
         check=check,
     )
     return Scan(view.memory.columns, asked).rows(newest_first=newest_first)
+
+
+def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:
+    """Returns the half-open spans in which recordings may hold copies of a topic's messages.
+
+    As far as the times at which they were published are known.
+    """
+    timeline = view.snapshot.timeline
+    asked = Asked(topic, window, timeline, lambda *_: (), shared=timeline.shared_times)
+    return Scan(view.memory.columns, asked).shared
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:

@@ -22,7 +22,7 @@ from ros2_memory.index.split_order import split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -65,6 +65,18 @@ class TopicExtent(NamedTuple):
     bag: BagFile
     first: Ns
     last: Ns
+
+
+class TopicColumn(NamedTuple):
+    """What the bags of a segment hold of one topic, in bag order, a row for each of its types.
+
+    `bags` are positions in the segment; times are inclusive.
+    """
+
+    bags: NDArray[np.intp]
+    firsts: NDArray[np.int64]
+    lasts: NDArray[np.int64]
+    messages: NDArray[np.int64]
 
 
 class TopicTotals(NamedTuple):
@@ -255,15 +267,30 @@ class Segment:
             return
         if window is not None:
             here = np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
-            column = _Column(*(each[here] for each in column))
-        for row, first, last in zip(*(each.tolist() for each in column), strict=True):
+            column = TopicColumn(*(each[here] for each in column))
+        for row, first, last in zip(*(each.tolist() for each in column[:3]), strict=True):
             yield TopicExtent(self.bags[row], first, last)
+
+    def column(self, topic: str) -> TopicColumn | None:
+        """Returns what the bags hold of a topic; None where nothing."""
+        return _columns(self).of(topic)
 
     def bounds(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Returns the log times of the first and the last message of the topic in each bag."""
         column = _columns(self).of(topic)
         none = np.empty(0, np.int64)
         return (none, none) if column is None else (column.firsts, column.lasts)
+
+    def bounds_in(self, topics: Collection[str], window: TimeWindow) -> NDArray[np.int64]:
+        """Returns the first and last log time of topics (2 x N) in each bag that has any there."""
+        firsts, lasts = np.full(len(self.bags), MAX_NS), np.full(len(self.bags), MIN_NS)
+        is_here = np.zeros(len(self.bags), np.bool_)
+        for column in filter(None, map(self.column, topics)):
+            here = (column.firsts < window.stop) & (column.lasts >= window.start)
+            is_here[column.bags[here]] = True
+            np.minimum.at(firsts, column.bags, column.firsts)
+            np.maximum.at(lasts, column.bags, column.lasts)
+        return np.stack((firsts, lasts))[:, is_here]
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -369,17 +396,6 @@ class _SchemaGroup(NamedTuple):
     numbers: NDArray[np.int64]
 
 
-class _Column(NamedTuple):
-    """What the bags of a segment hold of one topic, in bag order, a row for each of its types.
-
-    `bags` are positions in the segment.
-    """
-
-    bags: NDArray[np.intp]
-    firsts: NDArray[np.int64]
-    lasts: NDArray[np.int64]
-
-
 class _Columns:
     """The numbers of a segment's summaries, and the columns that were asked for."""
 
@@ -392,25 +408,25 @@ class _Columns:
             numbers = numbers_of([bags[row].summary for row in own])
             schema = bags[own[0]].summary.schema
             self.groups.append(_SchemaGroup(schema, np.array(own, np.intp), numbers))
-        self._columns: dict[str, _Column | None] = {}
+        self._columns: dict[str, TopicColumn | None] = {}
 
-    def of(self, topic: str) -> _Column | None:
+    def of(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
         if topic not in self._columns:
             self._columns[topic] = self._merged(topic)
         return self._columns[topic]
 
-    def _merged(self, topic: str) -> _Column | None:
+    def _merged(self, topic: str) -> TopicColumn | None:
         columns = [
-            _Column(bags, numbers[:, position, 1], numbers[:, position, 2])
+            TopicColumn(bags, *(numbers[:, position, nth] for nth in (1, 2, 0)))
             for schema, bags, numbers in self.groups
             for position in schema.positions.get(topic, ())
         ]
         if len(columns) < 2:
             return columns[0] if columns else None
-        merged = _Column(*map(np.concatenate, zip(*columns, strict=True)))
+        merged = TopicColumn(*map(np.concatenate, zip(*columns, strict=True)))
         order = np.argsort(merged.bags, kind="stable")
-        return _Column(*(each[order] for each in merged))
+        return TopicColumn(*(each[order] for each in merged))
 
 
 @lru_cache(maxsize=_CACHED_SEGMENTS)

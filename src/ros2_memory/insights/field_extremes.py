@@ -45,7 +45,7 @@ def extremes_of(
     """
     names = tuple(dict.fromkeys(fields))
     whole = np.empty(0, np.int64)
-    found = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES, only_extremes=True)
+    found = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
     try:
         found.collect(window)
     except TooManyError:

@@ -281,7 +281,12 @@ def read_sightings(
     found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if found.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    spans = [(run.first, _until(view, run, scope)) for run in reversed(found.runs)]
+    is_log = view.snapshot.timeline.is_log
+    logs = {topic for topic in topics if is_log(topic)}
+    spans = [
+        (run.first, run.last if run.topic in logs else _until(view, run, scope))
+        for run in reversed(found.runs)
+    ]
     return spans, spans[0][0] if found.is_over else None
 
 

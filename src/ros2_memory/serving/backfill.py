@@ -178,6 +178,7 @@ def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
             make_tracks(view, window)
             Watching(view).make(window)
             make_events(view, window, topics_with_changes(view))
+            memory.columns.make_outlines(view.snapshot.timeline, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.

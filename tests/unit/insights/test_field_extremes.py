@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.counts.field_numbers import numbers_in
+from ros2_memory.counts.column_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import field_extremes

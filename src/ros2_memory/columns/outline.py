@@ -1,0 +1,186 @@
+"""What is known of the columns of a part besides their zones, without unpacking them again.
+
+Of numbers how many there are, their sum, and when the least and the greatest was; of texts that are
+too many to be listed (JSON, lines of a log) which rows of letters are in which row. It is made
+while filling, and is there also where a column was dropped.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
+
+import numpy as np
+
+from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.columns.table import IN_PART, Texts, letters_of
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.table import Numbers, Table
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.storage.base import IntArray
+
+    Mask = NDArray[np.bool_]
+    Floats = NDArray[np.float64]
+
+_SPACES: Final = {code: " " for code in range(128) if not chr(code).isalpha()}
+_BYTES: Final = 500
+"""About how much memory an entry takes."""
+_MOST_LETTERS: Final = 1_024
+"""Different rows of letters in the texts of a part; of more nothing is known."""
+
+
+class Totals(NamedTuple):
+    """The finite numbers of a column.
+
+    Attributes:
+        size: how many.
+        total: their sum.
+        least: log times between which the first of the least ones is, inclusive; equal if known.
+        greatest: of the greatest ones likewise.
+    """
+
+    size: int
+    total: float
+    least: tuple[Ns, Ns]
+    greatest: tuple[Ns, Ns]
+
+
+class Letters(NamedTuple):
+    """Which casefolded rows of letters are in the texts of a column.
+
+    Attributes:
+        words: the rows of letters, and of what is not ASCII between them.
+        has: for each of them, packed bits: which texts have it.
+        size: how many texts there are.
+    """
+
+    words: tuple[str, ...]
+    has: NDArray[np.uint8]
+    size: int
+
+    @classmethod
+    def of(cls, texts: Texts) -> Letters | None:
+        """Returns the letters of texts; None where they are too many."""
+        known: dict[frozenset[str], int] = {}
+        alike = [
+            known.setdefault(frozenset(text.casefold().translate(_SPACES).split()), len(known))
+            for text in texts.words
+        ]
+        words = sorted(frozenset().union(*known))
+        if len(words) > _MOST_LETTERS:
+            return None
+        has = np.array([[word in some for some in known] for word in words], np.bool_)
+        rows = has.reshape(len(words), len(known))[:, np.array(alike, np.int64)[texts.codes]]
+        return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
+
+    def may_have(self, text: str) -> Mask:
+        """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
+        found = np.full(self.has.shape[1], 0xFF, np.uint8)
+        for letters in letters_of(text):
+            here = [nth for nth, word in enumerate(self.words) if letters in word]
+            found &= np.bitwise_or.reduce(self.has[here], axis=0)
+        return np.unpackbits(found, count=self.size).view(np.bool_)
+
+
+class Outline(NamedTuple):
+    """What is known of the columns of a part; of some of them nothing is.
+
+    Attributes:
+        paths: of columns of numbers.
+        sizes: how many finite numbers each has.
+        sums: what they add up to.
+        times: when the ends of each were, as of `Totals` (N x 4).
+        letters: of columns of texts, by their paths.
+    """
+
+    paths: Sequence[str]
+    sizes: IntArray
+    sums: Floats
+    times: NDArray[np.int64]
+    letters: Mapping[str, Letters]
+
+    @classmethod
+    def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
+        """Returns the outline of columns, by their paths."""
+        every = [*totals.values()]
+        return cls(
+            [*totals],
+            np.array([one.size for one in every], np.int64),
+            np.array([one.total for one in every], np.float64),
+            np.array([(*one.least, *one.greatest) for one in every], np.int64).reshape(-1, 4),
+            letters,
+        )
+
+    def totals(self, path: str) -> Totals | None:
+        """Returns what is known of a column of numbers; None: nothing."""
+        if path not in self.paths:
+            return None
+        nth = self.paths.index(path)
+        first, second, third, fourth = self.times[nth].tolist()
+        size, total = int(self.sizes[nth]), float(self.sums[nth])
+        return Totals(size, total, (first, second), (third, fourth))
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        texts = sum(one.has.nbytes + 100 * len(one.words) for one in self.letters.values())
+        return texts + _BYTES + 120 * len(self.paths)
+
+
+def outline_of(table: Table, times: IntArray) -> Outline:
+    """Returns the outline of a part, all of whose columns are stored, and its log times."""
+    totals: dict[str, Totals] = {}
+    letters: dict[str, Letters] = {}
+    for path in table.columns:
+        zone = table.zone(path)
+        if zone is not None and (zone.words or "").startswith(IN_PART):
+            texts = table.columns[path]
+            found = Letters.of(texts) if isinstance(texts, Texts) else None
+            if found is not None:
+                letters[path] = found
+        elif zone is not None and np.isfinite([zone.low, zone.high]).all():
+            column = table.columns[path]
+            if not isinstance(column, Texts) and column.dtype.kind in "iuf":
+                totals[path] = _totals(column, table.error(path), times)
+    return Outline.of(totals, letters)
+
+
+def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
+    is_finite = np.isfinite(column)
+    if not is_finite.all():
+        column, times = column[is_finite], times[is_finite]
+    numbers = cast("Floats", column if error == 0.0 else column.astype(np.float64, copy=False))
+    total = float(numbers.sum(dtype=np.float64))
+    if error == 0.0:
+        ends = [int(times[nth]) for nth in (numbers.argmin(), numbers.argmax())]
+        return Totals(len(numbers), total, (ends[0],) * 2, (ends[1],) * 2)
+    least = times[numbers - error <= (numbers + error).min()]
+    most = times[numbers + error >= (numbers - error).max()]
+    spans = [(int(some[0]), int(some[-1])) for some in (least, most)]
+    return Totals(len(numbers), total, *spans)
+
+
+def _fragment(outline: Outline) -> Fragment:
+    texts = {path: (one.words, one.size) for path, one in outline.letters.items()}
+    arrays = {path: one.has for path, one in outline.letters.items()}
+    head = json.dumps({"numbers": outline.paths, "texts": texts})
+    numbers = {"sizes": outline.sizes, "sums": outline.sums, "times": outline.times}
+    return Fragment(head, {**arrays, **{f"#{name}": some for name, some in numbers.items()}})
+
+
+def _outline(fragment: Fragment) -> Outline:
+    head = json.loads(fragment.head)
+    letters = {
+        path: Letters(tuple(words), fragment.arrays[path].astype(np.uint8, copy=False), size)
+        for path, (words, size) in head["texts"].items()
+    }
+    sizes, times = (fragment.integers(name) for name in ("#sizes", "#times"))
+    return Outline(head["numbers"], sizes, fragment.floats("#sums"), times, letters)
+
+
+OUTLINE: Final = Kind("outline", _fragment, _outline)

@@ -1,0 +1,165 @@
+"""What is known of the columns of a part without them: nothing that the bags do not say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.columns.fill import StoreLimits
+from ros2_memory.columns.outline import OUTLINE, Letters, Outline, Totals
+from ros2_memory.columns.table import Texts
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.counts.matches import count_matches
+from ros2_memory.counts.numbers import count_range
+from ros2_memory.history.bag_access import BagAccess
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import TimeRange, View
+from ros2_memory.insights.field_extremes import extremes_of
+from tests.support.bags import Msg, odom, text, write_mcap
+from tests.support.column_worlds import World
+from tests.support.examples import examples
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from ros2_memory.history.context import Memory
+
+S = NS_PER_S
+T0 = 1_700_000_400 * S
+LABELS = ("mug", "big mug", "Tasse", "Straße", "ÉCLAIR", "x7", "éclair_2")
+
+
+@given(
+    st.lists(st.text("aAbé ß7_-\"\\'{[:\n\0", max_size=12), max_size=8),
+    st.text("abés7_ -", min_size=1, max_size=4),
+)
+def test_letters_rule_out_no_text_that_has_them(texts: list[str], needle: str) -> None:
+    column, folded = Texts.of(texts), needle.casefold()
+    letters = Letters.of(column)
+    assert letters is not None
+    may = letters.may_have(folded)
+    has = np.array([folded in word.casefold() for word in column.values()], np.bool_)
+    assert may.size == len(texts)
+    assert not (has & ~may).any()
+    if folded.isalpha():
+        assert (may == has).all()
+
+
+def test_of_texts_with_too_many_different_letters_nothing_is_known() -> None:
+    words = ["".join(chr(97 + int(digit)) for digit in str(number)) for number in range(2_000)]
+    assert Letters.of(Texts.of(words)) is None
+
+
+def test_an_outline_is_the_same_once_it_was_stored() -> None:
+    letters = Letters.of(Texts.of(["a mug", "", "two Mugs"]))
+    assert letters is not None
+    totals = {
+        "x": Totals(3, 0.1 + 0.2, (T0, T0), (T0 + 1, T0 + 9)),
+        "y": Totals(1, -4, (0, 0), (0, 0)),
+    }
+    found = OUTLINE.load(OUTLINE.store(Outline.of(totals, {"data": letters})))
+    assert {path: found.totals(path) for path in found.paths} == totals
+    assert found.totals("z") is None
+    assert found.letters["data"].words == letters.words
+    for needle in ("mug", "mugs", "two", "b"):
+        wanted = letters.may_have(needle)
+        np.testing.assert_array_equal(found.letters["data"].may_have(needle), wanted)
+    nothing = OUTLINE.load(OUTLINE.store(Outline.of({}, {})))
+    assert (nothing.paths, nothing.letters) == ([], {})
+
+
+def write_world(folder: Path, draw: Random, hours: float = 2.5) -> None:
+    """A robot that drives, stands still, and tells in JSON what it sees; some bags are missing."""
+    every = draw.choice([4, 10])
+    for number in range(round(hours * 60)):
+        start = T0 + number * 60 * S
+        if draw.random() < 0.05:
+            continue
+        messages: list[Msg] = []
+        for at in range(start, start + 60 * S, every * S):
+            x = draw.choice([0.0, 1.25, draw.gauss(0.0, 1.0), float("nan")])
+            messages.append(odom(at + draw.randrange(S), x, draw.gauss(0, 1e-5), 0.3))
+            seen = [{"label": draw.choice(LABELS), "at": draw.random()}] * draw.randrange(3)
+            data = json.dumps({"stamp": at / S, "seen": seen}, ensure_ascii=draw.random() < 0.5)
+            messages.append(text(at + draw.randrange(S), data, "/seen"))
+        messages.sort(key=lambda message: message.log_time)
+        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+
+
+def numbers_by(
+    memory: Memory, span: TimeRange, by: Literal["hour", "weekday"], *fields: str
+) -> object:
+    """The answer without its means, which are as exact as columns are."""
+    found = count_range(memory, Call(), "/odom", span, by, fields=fields)
+    rows = [*found.rows, ("", found.all)]
+    cells = [
+        (name, column, value)
+        for name, values in rows
+        for (column, _), value in zip(found.columns, values, strict=True)
+        if not column.endswith(".mean")
+    ]
+    return cells, found.notes
+
+
+def answers(memory: Memory, draw: Random) -> Iterator[object]:
+    first = T0 / S + draw.choice([0, 600, 1234.5])
+    span = TimeRange(first, first + draw.choice([1800, 5000, 9000]))
+    window = TimeWindow(round(first) * S, round(first + 6000) * S)
+    for fields in (["position.x"], ["position.y", "orientation.yaw_deg"], ["position.x", "stamp"]):
+        yield numbers_by(memory, span, "hour", *fields)
+        yield extremes_of(View(memory, Call()), "/odom", window, fields)
+    for value in ("mug", "MUG", "big mug", "tasse", "straße", "éclair", "x7", "seen", "none", "7"):
+        for kind in ("contains", "contains_word"):
+            start, end = span.start_s, span.end_s
+            yield count_matches(
+                memory, Call(), "/seen", kind, value, by="hour", start_s=start, end_s=end
+            )
+
+
+@pytest.mark.parametrize("seed", range(examples(4)))
+def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
+    with TemporaryDirectory() as folder:
+        write_world(Path(folder), Random(seed))
+        share = Random(seed).choice([10.0, 0.001])
+        world = World.of(Path(folder), limits=StoreLimits(max_share=share))
+        world.fill()
+        plain = answers(world.unstored().memory, Random(seed))
+        for found, expected in zip(answers(world.memory, Random(seed)), plain, strict=True):
+            assert found == expected
+
+
+def test_whole_parts_are_told_without_their_columns_and_without_bags(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_world(tmp_path, Random(1))
+    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
+    world.fill()
+    span = TimeRange(T0 / S, T0 / S + 9000)
+
+    def by_weekday(memory: Memory) -> list[object]:
+        return [
+            numbers_by(memory, span, "weekday", "position.y"),
+            count_matches(memory, Call(), "/seen", "contains", "tasse", by="weekday"),
+        ]
+
+    expected = by_weekday(world.unstored().memory)
+    read: list[object] = []
+    tables = BagAccess.tables
+
+    def counted(self: BagAccess, bag: object, *args: object, **more: object) -> object:
+        read.append(bag)
+        return tables(self, bag, *args, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(BagAccess, "tables", counted)
+    assert by_weekday(world.memory) == expected
+    # Of 142 bags those that hold an end of a number, or are in no whole part yet.
+    assert len(read) < 30
