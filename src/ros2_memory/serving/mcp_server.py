@@ -352,6 +352,7 @@ def _listed(tool: Tool) -> ListedTool:
     annotations = ToolAnnotations(
         read_only_hint=not tool.writes,
         destructive_hint=False if tool.writes else None,
+        idempotent_hint=False if tool.writes else None,
         open_world_hint=False,
     )
     return ListedTool(

@@ -644,7 +644,7 @@ class VisitsArguments(Arguments):
     start_s: _Start = None
     end_s: _End = None
     frame_id: Annotated[_Name, Field(description="Of x, y; default: the map.")] | None = None
-    radius_m: Annotated[_Positive, Field(description="Radius, m.")] | None = None
+    radius_m: Annotated[_Positive, Field(description="m.")] | None = None
     limit: _Limit = 10
     by: _By | None = None
     between: _Between | None = None

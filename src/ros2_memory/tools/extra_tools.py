@@ -56,7 +56,7 @@ _RECAP = ToolDeclaration(
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "Memory state"),),
     "Whether the recorder runs, age of the newest data, topics that fell silent, "
-    "damaged files, days that the disk budget holds, newest saved moments.",
+    "damaged files, days the disk budget holds, newest saved moments.",
     NoArguments,
     memory_status,
 )

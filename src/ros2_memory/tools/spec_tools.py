@@ -149,7 +149,7 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded times"),),
-        "The recorded time range, its gaps, and the current time. "
+        "The recorded time range, gaps, and the current time. "
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, null "
         "if nothing is recorded.",
         NoArguments,

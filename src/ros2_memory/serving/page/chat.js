@@ -128,7 +128,7 @@ function showReply(prefix, reply, { rows }) {
   at(`${prefix}rows`).replaceChildren(...lists(rows), ...(notes.length ? [el("details", rows.length ? {} : { open: "" },
     el("summary", {}, counted(notes.length, "note")), el("ul", {}, ...notes.map((note) => el("li", {}, note))))] : []));
 }
-/* Rows as lists, each below its title. */
+/* Rows as lists, which have their titles above. */
 function lists(rows) {
   const begins = rows.flatMap((row, n) => (!n || row.title ? [n] : []));
   return begins.flatMap((from, n) => {

@@ -135,7 +135,7 @@ function addWindows(part, { start, end, with_start: from, with_end: to }) {
   if ([start, end].every(Number.isFinite)) part.bar("this", start, end, "this window");
   if ([from, to].every(Number.isFinite)) part.bar("other", from, to, "the other window");
 }
-/* Things of two windows: where each was, where it is, and a line between the two. */
+/* Things of two windows: where a thing was, where it is, and a line between the two. */
 function addDifferences(part, kinds, reply) {
   const path = { t: [], x: [], y: [], yaw: [], begins: [], frame: reply.frame_id, whole: true, kind: "moved" };
   for (const [kind, things] of Object.entries(kinds)) {
@@ -208,7 +208,7 @@ const NUMBERS = { distance_m: ["Driven", far], max_speed: ["Top speed", mps], av
   total: ["In all", String], at_least: ["At least", String], entries: ["Entries", String], exits: ["Exits", String],
   there_now: ["There now", (is) => (is ? "yes" : "no")], minutes: ["There for", (minutes) => lasting(60 * minutes)],
   unknown_s: ["Not known for", lasting], things_unchanged: ["Unchanged things", String] };
-/* The numbers of a whole reply, each as a term and a text. */
+/* The numbers of a whole reply, as terms and texts. */
 function numbersOf(reply) {
   return Object.entries(NUMBERS).flatMap(([name, [term, format]]) => {
     const value = reply[name] ?? null;
