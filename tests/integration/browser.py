@@ -66,6 +66,13 @@ class Browser:
         """What a function body returns, run in the page."""
         return self._ask("POST", "/execute/sync", {"script": script, "args": arguments})
 
+    def enter_frame(self, index: int) -> None:
+        """From here on all is in a frame of what was the page, also of another origin."""
+        self._ask("POST", "/frame", {"id": index})
+
+    def leave_frames(self) -> None:
+        self._ask("POST", "/frame", {"id": None})
+
     def text(self, selector: str) -> str:
         return str(self.run("return document.querySelector(arguments[0]).innerText", selector))
 

@@ -60,6 +60,7 @@ named. Else it is kept once where all agree."""
 
 LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
 """Shorter spans have no local times."""
+_DAY_CHARS: Final = len("Tue 2026-11-17 ")
 
 
 def moment(at: Ns | None) -> float | None:
@@ -106,7 +107,7 @@ class LocalTimes:
         begins, ends = (None if at is None else local_text(at) for at in (start, end))
         if begins is None or ends is None or begins == ends:
             return begins or (f"- {ends}" if ends else None)
-        day = begins[: len("Tue 2026-11-17 ")]
+        day = begins[:_DAY_CHARS]
         return f"{begins} - {ends.removeprefix(day)}"
 
 
@@ -119,6 +120,7 @@ class Scope:
         now: what ages count from.
         bag_dir: files are named relative to it.
         local: of the span of the reply.
+        days: those of which a row has said a local time.
         notes: on what was left out.
     """
 
@@ -126,6 +128,7 @@ class Scope:
     now: Ns = 0
     bag_dir: Path = Path()
     local: LocalTimes = LocalTimes(None, None)
+    days: set[str] = field(default_factory=set)
     notes: list[str] = field(default_factory=list)
 
 
@@ -472,6 +475,16 @@ def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
     return scope.local.text(*times) or Absent.ABSENT
 
 
+def _local_of_days(found: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
+    times = (found,) if found is None or isinstance(found, int) else found
+    texts = (scope.local.text(at) for at in times if at is not None)
+    days = {text[:_DAY_CHARS] for text in texts if text is not None}
+    if days <= scope.days:
+        return Absent.ABSENT
+    scope.days.update(days)
+    return _local(times, scope)
+
+
 PLAIN: Final = unit(_plain)
 MESSAGE: Final = unit(quote)
 """A value of a message, or a part of it: its texts are quoted (`core/text.py`)."""
@@ -484,6 +497,8 @@ TIME: Final = unit(unix_rounded_up)
 ISO_LOCAL: Final = unit(iso_local, "_local")
 LOCAL: Final = Unit(_local)
 """Of two times, which are the ends of a stretch."""
+LOCAL_OF_DAYS: Final = Unit(_local_of_days)
+"""Likewise, in the first row of each day: for rows that a planner reads many of."""
 SECONDS: Final = unit(seconds, "_s")
 TENTHS_OF_S: Final = unit(lambda duration: round(seconds(duration), 1), "_s")
 MINUTES: Final = unit(lambda duration: round(duration / 60e9, 2))

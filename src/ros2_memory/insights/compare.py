@@ -75,8 +75,9 @@ def compare(
     asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
-    for each in (asked, other):
-        note_unrecorded(view, each)
+    for window in (asked, other):
+        if gap_around(view, window) is not None:
+            note_unrecorded(view, window)
     windows = clamped(view, asked), clamped(view, other)
     frame, things = _things(view, windows, region)
     drives = [drive_in(view, each) for each in windows]
@@ -86,11 +87,13 @@ def compare(
     places = _places(view, placement, windows, region, elapsed)
     apart = _paths_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
-    note_unread(view, windows[0], of="from start to end: ")
-    note_unread(view, windows[1], of="from with_start to with_end: ")
+    note_unread(view, windows[0], of="from start to end: ", gaps=False)
+    note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     _note_lengths(view, recorded)
     return Comparison(
+        oldest=min(each.start for each in windows),
+        newest=max(each.stop for each in windows),
         lengths=Pair(*(_length(*each) for each in zip(windows, elapsed, strict=True))),
         recorded=Pair(*recorded),
         frame_id=frame,

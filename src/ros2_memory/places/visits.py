@@ -100,7 +100,8 @@ def visits(
         elapsed = elapsed_in(view, window)
         places = place_visits(view, placed, window, elapsed)
         tracks = {each.frame_id: track for each, track in placed}.values()
-        note_unread(view, window, nothing=not any(each.duration for each in places))
+        been = any(each.duration for each in places)
+        note_unread(view, window, nothing=not been, gaps=not been)
         return Visits(
             frame_id=placement.frame_id,
             x=None,
@@ -242,7 +243,7 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
 def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
     """Adds notes on visits that are uncertain."""
     shown, newest = known.shown, known.newest
-    note_unread(view, window, nothing=not shown)
+    note_unread(view, window, nothing=not shown, gaps=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
             f"the newest pose, at {unix_text(newest)}, is too old to know whether the robot is "

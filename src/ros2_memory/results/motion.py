@@ -9,6 +9,7 @@ from ros2_memory.core.reply import (
     AGO,
     INSIDE,
     LOCAL,
+    LOCAL_OF_DAYS,
     MINUTES,
     NAME,
     NAMES,
@@ -322,6 +323,7 @@ class Visit:
     "exits",
     TIME("first_entry", "first").if_known,
     TIME("last_exit", "last").if_known,
+    LOCAL_OF_DAYS("local", "first", "last"),
 )
 class PlaceVisits:
     """How long the robot was in a named place, and how often it was seen to enter and to leave.
@@ -358,6 +360,7 @@ class PlaceVisits:
             NAME("frame_id"),
             OBJECTS("places").along("last_exit"),
             SECONDS("unknown_s").if_any.merged("added"),
+            span=("oldest", "now"),
         ),
     ),
 )
@@ -404,7 +407,8 @@ class Visits(AnswerWithNotes):
     @property
     def oldest(self) -> Ns | None:
         """The oldest time of the reply."""
-        ends = (at for visit in self.visits for at in (visit.arrived, visit.departed))
+        ends = [at for visit in self.visits for at in (visit.arrived, visit.departed)]
+        ends += [place.first for place in self.places or ()]
         return min((at for at in ends if at is not None), default=None)
 
     @property

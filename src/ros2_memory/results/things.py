@@ -8,6 +8,7 @@ from ros2_memory.core.reply import (
     AGO,
     COUNTS_BY_NAME,
     INSIDE,
+    LOCAL_OF_DAYS,
     NAME,
     NAMES,
     OBJECT,
@@ -50,6 +51,7 @@ _LABEL: Final = unit(lambda label: shortened(named(label), 40))
 @result(
     TIME("from", "start"),
     TIME("to", "end"),
+    LOCAL_OF_DAYS("local", "start", "end"),
     _XY("place"),
     INSIDE("inside"),
     PLAIN("times", "count"),
@@ -135,6 +137,7 @@ def thing(most_stays: int) -> Keys:
         digits(2)("near_m").if_known,
         TIME("first_seen", "first"),
         TIME("last_seen", "last").in_short,
+        LOCAL_OF_DAYS("local", "first", "last").in_short,
         AGO("ago_s", "last"),
         "count",
         an_object(keys(digits(3)("best"), digits(3)("median")))(
@@ -219,10 +222,11 @@ def listed_things(form: Keys) -> Keys:
         objects(form)("things").along("last_seen"),
         TOTAL("total", "total", "all_counted").merged("added"),
         COUNTS_BY_NAME("labels").merged("counted"),
+        span=("oldest", "now"),
     )
 
 
-@result(*listed_things(thing(8)).keys)
+@result(*listed_things(thing(8)).keys, span=("oldest", "now"))
 class Things(AnswerWithNotes):
     """Things, those seen last first; `labels` counts all of them, also those that are not shown."""
 
@@ -232,6 +236,11 @@ class Things(AnswerWithNotes):
     labels: tuple[tuple[str, int], ...]
     now: Ns
     all_counted: bool = True
+
+    @property
+    def oldest(self) -> Ns | None:
+        """The oldest time of the reply."""
+        return min((thing.first for thing in self.things), default=None)
 
 
 class Pair(NamedTuple):
@@ -251,14 +260,16 @@ def _named_pairs(places: int) -> Unit:
     return by_name(_pair(places), _LONGEST_NAME)
 
 
+def _spot(name: str, time: str) -> Unit:
+    """Returns the unit of a place at a time, which has this name."""
+    place = (_XY.spread("place"), INSIDE("inside"))
+    return an_object(keys(*place, TIME(name, time), LOCAL_OF_DAYS("local", time)))
+
+
 @result(
     _LABEL("label"),
-    an_object(keys(_XY.spread("place"), INSIDE("inside"), TIME("last_seen", "end")))(
-        "was", "before"
-    ).if_known,
-    an_object(keys(_XY.spread("place"), INSIDE("inside"), TIME("first_seen", "start")))(
-        "is", "after"
-    ).if_known,
+    _spot("last_seen", "end")("was", "before").if_known,
+    _spot("first_seen", "start")("is", "after").if_known,
     TIME("missed_by", "missed").if_known,
     PLAIN("looks").when("missed"),
 )
@@ -284,6 +295,7 @@ class ComparedThing:
     _XY.spread("place"),
     INSIDE("inside"),
     TIME("last_seen", "last"),
+    LOCAL_OF_DAYS("local", "last"),
 )
 class MoverSeen:
     """A mover in a window: the most at once, how often it was seen, and where last."""
@@ -371,10 +383,17 @@ _STANDSTILLS: Final = objects(
         _pair(0).spread("seconds"),
         TIME("this_since", lambda stood: stood.since[0]).if_known,
         TIME("with_since", lambda stood: stood.since[1]).if_known,
+        LOCAL_OF_DAYS("local", lambda stood: next(filter(None, stood.since), None)),
     )
 )
 _FAR: Final = an_object(
-    keys(_XY.spread("place"), INSIDE("inside"), digits(1)("away_m"), TIME("t", "time"))
+    keys(
+        _XY.spread("place"),
+        INSIDE("inside"),
+        digits(1)("away_m"),
+        TIME("t", "time"),
+        LOCAL_OF_DAYS("local", "time"),
+    )
 )
 
 
@@ -395,14 +414,16 @@ def compared(most: int) -> Keys:
         _named_pairs(2)("minutes", "places").first(most, "total").if_any,
         _named_pairs(0)("errors").first(most, "total").if_any.in_short,
         _named_pairs(0)("silent_s", "silences").first(most, "total").if_any,
+        span=("oldest", "newest"),
     )
 
 
-@result(*compared(5).keys)
+@result(*compared(5).keys, span=("oldest", "newest"))
 class Comparison(AnswerWithNotes):
     """What differs between two windows.
 
     Attributes:
+        oldest: where the earlier window begins; `newest`: where the later one ends.
         lengths: of the windows (s), and `recorded` how much of each was recorded.
         frame_id: of the things' places.
         way: numbers by name: metres, m/s, seconds and counts.
@@ -415,6 +436,8 @@ class Comparison(AnswerWithNotes):
         silences: seconds for which each topic was silent.
     """
 
+    oldest: Ns
+    newest: Ns
     lengths: Pair
     recorded: Pair
     frame_id: str

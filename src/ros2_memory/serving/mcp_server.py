@@ -11,6 +11,7 @@ from urllib.parse import unquote
 
 import anyio
 import anyio.to_thread
+from mcp.server.apps import Apps
 from mcp.server.caching import CacheHint
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
@@ -36,6 +37,7 @@ from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
 from ros2_memory.serving.auth import robots_of
+from ros2_memory.serving.chat_view import TOOLS_WITH_VIEW, VIEW_URI, view
 from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
@@ -148,6 +150,7 @@ class EpisodicServer(MCPServer[object]):
             # Lists do not change while the server runs, so no notifications are sent.
             subscriptions=False,
             cache_hints=dict.fromkeys(_LISTS, LISTS_CACHED),
+            extensions=[Apps()],
         )
         self.completion()(self._complete)  # type: ignore[no-untyped-call]  # of the SDK
         self._progress = progress
@@ -210,12 +213,14 @@ class EpisodicServer(MCPServer[object]):
     async def read_resource(
         self, uri: object, context: object | None = None
     ) -> Iterable[ReadResourceContents]:
-        """Returns a resource's JSON: the reply of its tool, errors included.
+        """Returns a resource's JSON: the reply of its tool, errors included; or the view of these.
 
         Raises:
             ResourceNotFoundError: there is no such resource; the client receives the code that the
                 protocol has for it, -32602 (SEP-2164).
         """
+        if str(uri) == VIEW_URI:
+            return [view()]
         name, arguments = self._resource_call(str(uri))
         client = _client(context)
         reply = await self.dispatcher.answer(
@@ -356,4 +361,5 @@ def _listed(tool: Tool) -> ListedTool:
         description=tool.description,
         input_schema=dict(tool.schema),
         annotations=annotations,
+        _meta={"ui": {"resourceUri": VIEW_URI}} if tool.name in TOOLS_WITH_VIEW else None,
     )

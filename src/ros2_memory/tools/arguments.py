@@ -288,9 +288,7 @@ _REGION_SCHEMA: Final[dict[str, JsonValue]] = {
 }
 _Where: TypeAlias = Annotated[
     _Region,
-    WithJsonSchema(
-        {**_REGION_SCHEMA, "description": "Of the robot, not a thing; forms: trajectory_summary."}
-    ),
+    WithJsonSchema({**_REGION_SCHEMA, "description": "Of the robot; forms: trajectory_summary."}),
 ]
 _WhereInFull: TypeAlias = Annotated[
     _Region,
@@ -338,7 +336,7 @@ _Between: TypeAlias = Annotated[
     WithJsonSchema(
         {
             "type": "string",
-            "description": "e.g. 19:00-22:00, local; each day.",
+            "description": "e.g. 19:00-22:00, local, daily.",
             "examples": ["19:00-22:00"],
         }
     ),
@@ -646,7 +644,7 @@ class VisitsArguments(Arguments):
     start_s: _Start = None
     end_s: _End = None
     frame_id: Annotated[_Name, Field(description="Of x, y; default: the map.")] | None = None
-    radius_m: Annotated[_Positive, Field(description="Radius, m.")] | None = None
+    radius_m: Annotated[_Positive, Field(description="m.")] | None = None
     limit: _Limit = 10
     by: _By | None = None
     between: _Between | None = None
@@ -675,9 +673,9 @@ class MatchesArguments(ConditionArguments):
     )
     start_s: _Start = None
     end_s: _End = None
-    oldest_first: Annotated[
-        bool, Field(strict=True, description="Oldest sightings first, with total.")
-    ] = False
+    oldest_first: Annotated[bool, Field(strict=True, description="Oldest first, with total.")] = (
+        False
+    )
     limit: _Limit = 5
     by: _ByInMatches | None = None
     beside: Annotated[_Name, Field(description="Also what this topic said during each.")] | None = (

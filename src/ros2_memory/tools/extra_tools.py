@@ -55,8 +55,8 @@ _RECAP = ToolDeclaration(
 )
 _STATUS = ToolDeclaration(
     (ToolName("memory_status", "Memory state"),),
-    "Whether the recorder runs, the age of the newest data, topics that fell silent, "
-    "damaged files, how many days the disk budget holds, newest saved moments.",
+    "Whether the recorder runs, age of the newest data, topics that fell silent, "
+    "damaged files, days the disk budget holds, newest saved moments.",
     NoArguments,
     memory_status,
 )
@@ -84,7 +84,7 @@ _THINGS = ToolDeclaration(
 )
 _COMPARE = ToolDeclaration(
     (ToolName("compare", "Differences"),),
-    "Differences between two windows: things that moved, appeared, or were not seen again; "
+    "Between two windows: things that moved, appeared, or were not seen again; "
     "path, standstills, minutes in places, errors, silences. Things go from the earlier "
     "to the later. Within a tenth counts as equal. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "

@@ -96,6 +96,7 @@ class Signature:
                 for key, item in schema.items()
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
+            shown = _with_list_of_types(shown)
             properties[name] = _with_plain_times(shown) if self._plain_times else shown
         required = [*self._required, *(self._either if self._plain_times else ())]
         whole: JsonObject = {"type": "object", "properties": properties}
@@ -190,6 +191,18 @@ def _flat(schema: JsonObject) -> JsonObject:
         some = next(kind for kind in kinds if kind != {"type": "null"})
         return {**(some if isinstance(some, dict) else {}), **kept}
     return kept
+
+
+def _with_list_of_types(schema: JsonObject) -> JsonObject:
+    """Returns the shorter schema that says the same: what it asks of one type concerns no other."""
+    kinds = schema.get("anyOf")
+    if not isinstance(kinds, list):
+        return schema
+    whole: JsonObject = {}
+    for kind in kinds:
+        whole |= kind if isinstance(kind, dict) else {}
+    types: JsonValue = [kind["type"] for kind in kinds if isinstance(kind, dict)]
+    return {**whole, **{key: item for key, item in schema.items() if key != "anyOf"}, "type": types}
 
 
 def _with_plain_times(schema: JsonObject) -> JsonObject:

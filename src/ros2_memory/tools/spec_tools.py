@@ -142,14 +142,14 @@ _DECLARATIONS = (
     ToolDeclaration(
         (ToolName("list_recorded_topics", "Recorded topics"),),
         "Lists every recorded topic. Call it first if unsure of a name. "
-        "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; if there are too "
-        "many, the busiest.",
+        "Reply: [{{topic, type, first_ts, last_ts, count}}], times in Unix s; of too many "
+        "the busiest.",
         TopicListArguments,
         _list_topics,
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded times"),),
-        "The time range that is recorded, gaps in it, and the current time. "
+        "The recorded time range, gaps, and the current time. "
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, null "
         "if nothing is recorded.",
         NoArguments,
@@ -179,7 +179,7 @@ _DECLARATIONS = (
         count=count_range,
     ),
     ToolDeclaration(
-        _at_and_ago("position", "Robot position"),
+        _at_and_ago("position", "Position"),
         "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
         "(counter-clockwise from x), timestamp, topic, frame_id}}; of NavSatFix latitude, "
         "longitude, altitude; x, y, z null.",
@@ -187,10 +187,10 @@ _DECLARATIONS = (
         at_each(queries.position),
     ),
     ToolDeclaration(
-        _at_and_ago("velocity", "Robot velocity"),
+        _at_and_ago("velocity", "Velocity"),
         "How fast the robot moved {when}, from {pose_topic}. Reply: {{linear: {{x, y, z}} (m/s), "
         "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}. In the robot's own frame "
-        "x is forward and positive angular z turns left.",
+        "x is forward, positive angular z turns left.",
         MotionArguments,
         at_each(queries.velocity),
     ),
@@ -204,7 +204,7 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),
-        "Lists every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
+        "Every recorded coordinate frame. Reply: {{frames, transforms: [{{parent, child, "
         "static}}]}}.",
         NoArguments,
         queries.frames,

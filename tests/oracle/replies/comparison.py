@@ -179,7 +179,9 @@ def _notes_no_gaps(recorded: Any, got: Any) -> bool:
     """Whether sentences on gaps are all that is gone."""
     kept = got if isinstance(got, list) else []
     gone = [each for each in recorded if each not in kept] if isinstance(recorded, list) else []
-    return bool(gone) and all("nothing was recorded" in each for each in gone)
+    return bool(gone) and all(
+        "nothing was recorded" in each or "recorded only" in each for each in gone
+    )
 
 
 _MOVING_MAPS: Final = ("moving_map", "robot_day_*", "drifting_map_*", "noisy_robot", "home_*")
@@ -263,7 +265,7 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
             "rows of several days have no local time",
             only=lambda recorded, _got: bool(recorded == "(absent)"),
         )
-        for name in ("get_topic_in_*", "*trajectory_summary")
+        for name in ("get_topic_in_*", "*trajectory_summary", "find_things", "visits", "compare")
     ),
     KnownWrong(
         "*",
@@ -282,12 +284,13 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         )
         for path in ("/fields", "/rows/*")
     ),
-    KnownWrong(
-        "*",
-        "tool get_topic_in_*",
-        "/notes",
-        "gaps are noted of a reply that has all messages",
-        only=_notes_no_gaps,
+    *(
+        KnownWrong("*", asked, "/notes", f"gaps are noted of {what}", only=_notes_no_gaps)
+        for asked, what in (
+            ("tool get_topic_in_*", "a reply that has all messages"),
+            ("tool visits", "visits, which were found"),
+            ("tool compare", "two windows, which have recorded_s"),
+        )
     ),
     *(
         KnownWrong(

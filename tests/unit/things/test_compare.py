@@ -339,6 +339,8 @@ def test_a_comparison_is_cut_to_6_kb_however_much_differs(tmp_path: Path) -> Non
     many = tuple((f"{nth} {'x' * 120}", pair) for nth in range(20))
     things = (thing,) * 20
     answer = Comparison(
+        oldest=at - 86_400 * S,
+        newest=at,
         lengths=pair,
         recorded=pair,
         frame_id="map",

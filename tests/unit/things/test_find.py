@@ -421,7 +421,8 @@ def test_a_long_list_has_each_thing_shortly_and_says_how_to_ask_for_more(tmp_pat
     assert 4_000 < len(reply.text) <= 6_000
     assert answer["total"] == 70
     assert 20 < len(rows) < 70
-    assert set(rows[0]) == {"label", "place", "last_seen"}
+    assert set(rows[0]) == {"label", "place", "last_seen", "local"}
+    assert set(rows[1]) == {"label", "place", "last_seen"}
     assert answer["notes"][0].startswith(f"{len(rows)} of 70 things are listed")
 
 

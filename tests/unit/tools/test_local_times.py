@@ -88,3 +88,61 @@ def test_the_topic_of_all_rows_is_said_once(memory: Memory, folder: Path) -> Non
     several = asked(memory, folder, "find_matches", topic="*", **given)
     assert "topic" not in several
     assert {row["topic"] for row in several["sightings"]} == {SEEN}
+
+
+def days_said(reply: Any) -> list[str]:
+    return [row["local"] for row in _objects(reply) if "local" in row]
+
+
+def _objects(value: Any) -> Iterator[dict[str, Any]]:
+    if isinstance(value, list):
+        for part in value:
+            yield from _objects(part)
+    elif isinstance(value, dict):
+        yield value
+        for part in value.values():
+            yield from _objects(part)
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("find_things", {}),
+        ("visits", {}),
+        (
+            "compare",
+            {"with_start": BEGIN, "with_end": BEGIN + DAY_S - 1, "start": BEGIN + DAY_S},
+        ),
+    ],
+)
+def test_rows_of_things_and_places_say_each_day_once(
+    memory: Memory, folder: Path, tool: str, given: dict[str, Any]
+) -> None:
+    span = {"start": BEGIN, "end": BEGIN + 2 * DAY_S, **given}
+    reply = asked(memory, folder, tool, **span)
+    said = days_said(reply)
+    days = [
+        f"{datetime.fromtimestamp(BEGIN + day * DAY_S, UTC).astimezone():%a %Y-%m-%d}"
+        for day in range(2)
+    ]
+    assert said
+    assert [sum(day in text for text in said) for day in days] == [1, 1]
+
+
+def test_a_row_that_says_a_day_says_the_whole_stretch(memory: Memory, folder: Path) -> None:
+    things = asked(memory, folder, "find_things")["things"]
+    rows = [thing for thing in things if "local" in thing]
+    assert 0 < len(rows) < len(things)
+    for row in rows:
+        begins, ends = (
+            f"{datetime.fromtimestamp(row[key], UTC).astimezone():%a %Y-%m-%d %H:%M:%S}"
+            for key in ("first_seen", "last_seen")
+        )
+        same_day = begins[:15] if begins[:15] == ends[:15] else ""
+        assert row["local"] == f"{begins} - {ends.removeprefix(same_day)}"
+
+
+def test_a_reply_about_minutes_has_none(memory: Memory, folder: Path) -> None:
+    short = {"start": BEGIN + DAY_S, "end": BEGIN + DAY_S + 3600}
+    earlier = {"with_start": BEGIN + DAY_S - 7200, "with_end": BEGIN + DAY_S - 3600}
+    assert days_said(asked(memory, folder, "compare", **short, **earlier)) == []

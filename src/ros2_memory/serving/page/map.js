@@ -232,14 +232,14 @@ class RobotMap {
   hover(x, y, event) {
     const thing = this.near(this.things || [], x, y);
     if (thing) {
-      tip(`${thing.label}, seen ${counted(thing.times, "time")}, last ${clock(thing.last)}`, event);
+      tip(thing.hint || `${thing.label}, seen ${counted(thing.times, "time")}, last ${clock(thing.last)}`, event);
       return;
     }
     const stop = this.near(this.stops || [], x, y);
     if (stop) {
       const away = stop.end === undefined ? "" : ` for ${lasting(stop.end - stop.t)}`;
-      tip(`stood${away}${stop.in ? ` in ${stop.in}` : ""}, from ${clock(stop.t)}`, event);
-      this.told.time(stop.t, false);
+      tip(stop.hint || `stood${away}${stop.in ? ` in ${stop.in}` : ""}, from ${clock(stop.t)}`, event);
+      this.told.time(stop.t ?? null, false);
       return;
     }
     const { t, path } = this.timeNear(x, y);
@@ -263,7 +263,7 @@ class RobotMap {
     const add = (x, y) => { xs.push(x); ys.push(y); };
     const { places = [], robot } = this.view;
     for (const path of this.paths) path.t.forEach((_, n) => add(path.x[n], path.y[n]));
-    for (const each of this.things) add(each.x, each.y);
+    for (const each of [...this.things, ...this.stops]) add(each.x, each.y);
     if (robot && this.paths.length && !xs.length) add(robot.x, robot.y);
     for (const each of places) {
       if (each.circle) {
@@ -319,7 +319,7 @@ class RobotMap {
       const x = Math.round(this.px(n * by)) + 0.5;
       c.moveTo(x, 0);
       c.lineTo(x, height);
-      if (x > 24 && x < width - 24) c.fillText(`${(n * by).toFixed(digits)}`, x + 3, height - 5);
+      if (x > 24 && x < width - 44) c.fillText(`${(n * by).toFixed(digits)}`, x + 3, height - 5);
     }
     for (let n = Math.ceil(low.y / by); n * by < high.y; n++) {
       const y = Math.round(this.py(n * by)) + 0.5;
@@ -448,7 +448,7 @@ class RobotMap {
     c.strokeStyle = colour("card");
     c.lineWidth = 1.5;
     for (const each of this.stops) {
-      const lasted = (each.end || each.t) - each.t;
+      const lasted = (each.end || each.t) - each.t || 0;
       c.beginPath();
       c.arc(this.px(each.x), this.py(each.y), clamp(3 + Math.log10(lasted + 1) * 1.6, 4, 10), 0,
         2 * Math.PI);

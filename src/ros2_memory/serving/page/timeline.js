@@ -20,7 +20,7 @@ const IN_VIEW = / in view$/;
    and by the events that came since. */
 function labelsOf(view) {
   const { labels, until } = view.seen || { labels: [], until: -Infinity };
-  const bars = new Map(labels.map((each) => [each.label, each.bars.map(([t, end]) => ({ t, end }))]));
+  const bars = new Map(labels.map((each) => [each.label, each.bars.map(([t, end, text]) => ({ t, end, text }))]));
   for (const each of view.events) {
     if (each.kind !== "thing" || (each.end ?? each.t) <= until) continue;
     const label = each.text.replace(IN_VIEW, "");
@@ -28,7 +28,7 @@ function labelsOf(view) {
     bars.get(label).push(each);
   }
   const rows = [...bars].map(([label, its]) => ({ label, bars: its.map((each) => (
-    { kind: "thing", t: each.t, end: each.end ?? each.t, text: `${label} in view` })) }));
+    { kind: "thing", t: each.t, end: each.end ?? each.t, text: each.text ?? `${label} in view` })) }));
   if (labels.length) return rows;
   const length = ({ bars: its }) => its.reduce((sum, each) => sum + each.end - each.t, 0);
   return rows.sort((one, other) => length(other) - length(one));
@@ -75,12 +75,15 @@ class Timeline {
     this.told.labels(labels.length);
     const seen = (this.hasAll ? labels : labels.slice(0, MOST_LABELS))
       .map(({ label, bars }) => ({ name: label, kind: "seen", label, bars }));
-    const lanes = [{ name: "recorded", kind: "recorded", bars: of("silence") },
+    const all = [{ name: "recorded", kind: "recorded", bars: of("silence") },
       { name: "stood", kind: "stood", bars: of("stop") }, ...seen,
       { name: "events", kind: "events",
-        bars: of("error", "failed goal", "goal", "flip", "drop", "clock step") },
+        bars: of("error", "failed goal", "goal", "flip", "drop", "clock step",
+          ...(view.isReply ? ["gap", "silence"] : [])) },
       { name: "kept", kind: "kept", bars: view.moments.map((each) => ({ kind: "kept", t: each.start,
         end: each.end, text: `kept: ${each.label}` })) }];
+    // A reply tells what happened, not when something was recorded.
+    const lanes = view.isReply ? all.filter(({ kind, bars }) => bars.length && kind !== "recorded") : all;
     let top = OVERVIEW + 6;
     for (const lane of lanes) {
       lane.top = top;
@@ -228,8 +231,10 @@ class Timeline {
     c.beginPath();
     c.rect(GUTTER, 0, this.wide, height);
     c.clip();
-    this.drawRecorded(c, OVERVIEW + 6);
-    for (const lane of this.lanes.slice(1)) this.drawLane(c, lane);
+    for (const lane of this.lanes) {
+      if (lane.kind === "recorded") this.drawRecorded(c, lane);
+      else this.drawLane(c, lane);
+    }
     this.drawChosen(c, bottom);
     c.restore();
     c.fillStyle = colour("soft");
@@ -284,7 +289,7 @@ class Timeline {
       c.textAlign = "left";
     }
   }
-  drawRecorded(c, top) {
+  drawRecorded(c, { top, bars }) {
     const { earliest, latest, gaps } = this.view.range;
     c.fillStyle = colour("recorded");
     c.fillRect(this.x(earliest), top + 3, Math.max(this.x(latest) - this.x(earliest), 1), LANE - 6);
@@ -296,7 +301,7 @@ class Timeline {
       c.fillRect(this.x(start), top + LANE - 7, wide, 3);
     }
     c.fillStyle = colour("warn");
-    for (const each of this.lanes[0].bars) {
+    for (const each of bars) {
       const left = this.x(each.t);
       c.fillRect(left, top + 4, Math.max(this.x(each.end || this.span.end) - left, 2), 4);
     }
