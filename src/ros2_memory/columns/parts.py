@@ -73,27 +73,28 @@ class PackedPart:
         return sum(map(len, self.first_of))
 
 
-def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:
+def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> PackedPart:
     """Returns the rows of some bags as one part.
 
     Args:
         layout: of the topic, type and definition that all these tables are of.
-        tables: each with the number of its bag, and at least one row.
+        tables: each with the number of the bag of each row, of which it has one at least.
     """
-    stops = np.cumsum([len(table) for _, table in tables])
+    if len(tables) == 1:
+        return pack_rows(layout, *tables[0])
+    stops = np.cumsum([len(table) for table, _ in tables])
     # The place of a row becomes its number among all rows: so its bag is known once sorted.
-    is_hashed = any(table.payload_hashes is not None for _, table in tables)
+    is_hashed = any(table.payload_hashes is not None for table, _ in tables)
     numbered = [
         replace(
             table,
             places=np.arange(stop - len(table), stop),
             payload_hashes=_hashes(table) if is_hashed else None,
         )
-        for (_, table), stop in zip(tables, stops.tolist(), strict=True)
+        for (table, _), stop in zip(tables, stops.tolist(), strict=True)
     ]
     whole = joined(numbered)
-    bags = np.array([bag for bag, _ in tables], np.int64)
-    return pack_rows(layout, whole, bags[np.searchsorted(stops, whole.places, side="right")])
+    return pack_rows(layout, whole, np.concatenate([bags for _, bags in tables])[whole.places])
 
 
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
