@@ -121,7 +121,9 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
         len(table),
         tuple(np.unique(bags).tolist()),
         {
-            path: replace(packed, data=compressed(packed.data)) if packed.data else packed
+            path: replace(packed, data=compressed(packed.data, packed.plane))
+            if packed.data
+            else packed
             for path, packed in columns.items()
         },
     )
