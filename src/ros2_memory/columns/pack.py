@@ -269,7 +269,7 @@ class _InLine:
         """Returns the greatest value of each column; NaN where it has one."""
         return np.maximum.reduceat(values, self.starts)
 
-    def means(self, values: Values) -> Floats:
+    def means(self, values: Numbers) -> Floats:
         """Returns the mean of each column."""
         means: Floats = np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
         return means
@@ -470,7 +470,7 @@ def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
     curve = _differences(steps, lie.starts)
     curve[lie.starts + 1] = 0
     around = (flat - lie.rows(lie.means(flat)), line - lie.rows(lie.means(line)), delta, curve)
-    bits = np.array([lie.means(np.log2(2.0 * np.abs(1.0 * numbers) + 1.0)) for numbers in around])
+    bits = np.array([lie.means(_bits_of(numbers)) for numbers in around])
     line -= lie.rows(np.minimum.reduceat(line, lie.starts))
     numbers = (flat, line, (delta << 1) ^ (delta >> 63), (curve << 1) ^ (curve >> 63))
     most = [np.maximum.reduceat(some.view(np.uint64), lie.starts).tolist() for some in numbers]
@@ -487,6 +487,16 @@ def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
         data = b"".join((column.head, head, byte_planes(left, width)))
         found.append(Packed(codec, stop - start, column.error, column.zone, data, len(left)))
     return found
+
+
+def _bits_of(numbers: Numbers) -> Numbers:
+    """Returns about how many bits each number takes, with its sign."""
+    # In single precision and in place: the memory of four such arrays is what takes long.
+    sizes = np.abs(numbers.astype(np.float32))
+    sizes *= 2
+    sizes += 1
+    np.log2(sizes, out=sizes)
+    return sizes
 
 
 def _differences(numbers: IntArray, starts: IntArray) -> IntArray:
