@@ -208,8 +208,6 @@ class Filling:
         done = 0
         for bag in sorted(bags, key=in_time):
             done += self._read(bag, found, hashed=self._is_shared(bag, timeline))
-            if found.small_bytes > LARGE_BYTES:
-                self._decode(found)
             self._large.release()
             if found.table_bytes > _MOST_HELD:
                 done += self._put(DecodedBags(found.bags, found.tables), whole=whole)
@@ -296,6 +294,8 @@ class Filling:
             if size > LARGE_BYTES or bag.end - bag.start > LONG_NS:
                 groups = decoded_groups(self._reader, chain(_popped(begin), read))
                 return self._add_large(to_store, groups, found)
+            if found.small_bytes + size > LARGE_BYTES:
+                self._decode(found)
             found.small.append((to_store, begin))
             found.small_bytes += size
         except Exception as error:  # noqa: BLE001 - the next bag may be whole
