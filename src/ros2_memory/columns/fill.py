@@ -333,11 +333,11 @@ class Filling:
                 self._decode(found)
 
     def _not_stored(self, bag: BagFile, error: Exception) -> None:
-        """Refuses a bag that cannot be read or decoded."""
+        """Refuses a bag that cannot be read or decoded. Called where the error is caught."""
         if isinstance(error, BagError):
             self._refuse(bag, error.reason)
         else:
-            log.error("bag_not_stored", path=str(bag.path), exc_info=error)
+            log.exception("bag_not_stored", path=str(bag.path))  # noqa: LOG004 - caught above
             self._refuse(bag, type(error).__name__)
 
     def _put(self, decoded: DecodedBags, *, whole: bool) -> int:
