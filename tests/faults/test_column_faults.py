@@ -15,6 +15,7 @@ import pytest
 
 from ros2_memory.columns import database, fill
 from ros2_memory.columns.writing import LongBag
+from ros2_memory.core.large_reads import LARGE_BYTES
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts
@@ -27,16 +28,16 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.database import Tables
 
-KILLS = 100 if LONG else 5
+KILLS = 100 if LONG else 3
 SPANNED = {"get_topic_in_range", "find_matches"}
 ROWS = 12 * 21 + 120
 # Not forked: SQLite must not have a file open across that.
 SPAWNED = multiprocessing.get_context("spawn")
 
 
-def write_bags(bag_dir: Path) -> None:
+def write_bags(bag_dir: Path, first: int = 0) -> None:
     """Twelve minutes of one recording, and a bag of an hour, which is stored in several goes."""
-    for number in range(12):
+    for number in range(first, first + 12):
         write_bag(bag_dir, number)
     write_long_bag(bag_dir / "long")
 
@@ -60,18 +61,22 @@ class StatementCounter:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def fill_up(bag_dir: Path, kill_at: int = 0) -> int:
-    """Stores everything, of long bags group by group; returns how many statements that took."""
+def fill_up(bag_dir: Path, kill_at: int = 0, small_bytes: int = 0) -> int:
+    """Stores everything, of long bags group by group; returns how many statements that took.
+
+    Bags of more than `small_bytes` are no small ones, which are decoded together.
+    """
     counter = StatementCounter(kill_at)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_connect", counter.connect)
-        patch.setattr(fill, "decoded", in_groups)
+        patch.setattr(fill, "LARGE_BYTES", small_bytes)
+        patch.setattr(fill, "decoded_groups", in_groups)
         World.of(bag_dir).fill()
     return counter.count
 
 
-def started(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
-    process = SPAWNED.Process(target=fill_up, args=(bag_dir, kill_at), daemon=True)
+def started(bag_dir: Path, kill_at: int = 0, small_bytes: int = 0) -> BaseProcess:
+    process = SPAWNED.Process(target=fill_up, args=(bag_dir, kill_at, small_bytes), daemon=True)
     process.start()
     return process
 
@@ -125,20 +130,21 @@ def assert_whole(bag_dir: Path) -> None:
         assert size < 0 or kinds == 1, path
 
 
+@pytest.mark.parametrize(("small_bytes", "first"), [(0, 0), (LARGE_BYTES, 70)])
 def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_answers(
-    tmp_path: Path,
+    tmp_path: Path, small_bytes: int, first: int
 ) -> None:
     whole = tmp_path / "whole"
-    write_bags(whole)
-    statements = fill_up(whole)
+    write_bags(whole, first)
+    statements = fill_up(whole, 0, small_bytes)
     assert check_all(World.of(whole)) == ROWS
     right = answers(World.of(whole).unstored())
     draw = random.Random()
     for _ in range(KILLS):
         kill_at = draw.randint(1, statements)
         bag_dir = tmp_path / f"killed at {kill_at} of {statements}"
-        write_bags(bag_dir)
-        process = started(bag_dir, kill_at)
+        write_bags(bag_dir, first)
+        process = started(bag_dir, kill_at, small_bytes)
         process.join()
         assert process.exitcode == -signal.SIGKILL
         if store_file(bag_dir).exists():
@@ -146,7 +152,7 @@ def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_an
             assert check_all(killed) == ROWS
             assert_same_answers(killed, right)
             assert_whole(bag_dir)
-        fill_up(bag_dir)
+        fill_up(bag_dir, 0, small_bytes)
         world = World.of(bag_dir)
         assert len(world.stored()) == 13
         assert_whole(bag_dir)
@@ -182,7 +188,7 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
     with pytest.MonkeyPatch.context() as patch:
         whole = LongBag.end
         patch.setattr(LongBag, "end", end)
-        patch.setattr(fill, "decoded", in_groups)
+        patch.setattr(fill, "decoded_groups", in_groups)
         assert filling.fill_alone() == 1
     assert found == [set()]
     assert asking.stored() == filling.stored() != set()

@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.core.arrays import row_maxima
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import multiply, rotate, slerp
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
@@ -500,7 +501,7 @@ def unit_quaternions(rotations: Floats) -> Floats:
     off = np.abs(x * x + y * y + z * z + w * w - 1) >= 1e-12
     if not off.any():
         return rotations
-    scaled = rotations[off] / np.abs(rotations[off]).max(axis=1)[:, None]
+    scaled = rotations[off] / row_maxima(np.abs(rotations[off]))[:, None]
     x, y, z, w = scaled.T
     made = rotations.copy()
     made[off] = scaled / np.sqrt(x * x + y * y + z * z + w * w)[:, None]

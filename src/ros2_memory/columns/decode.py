@@ -7,9 +7,11 @@ decoder message by message (`objects.py`), into the same columns. No message is 
 from __future__ import annotations
 
 import zlib
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, TypeVar
+from itertools import accumulate
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,7 +22,7 @@ from ros2_memory.columns.walk import NotWalkedError, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BATCH_BYTES
+from ros2_memory.storage.base import BATCH_BYTES, Batch
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.plan import Plan
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import BagReader, Batch, Channel, Schema
+    from ros2_memory.storage.base import BagReader, Channel, Definition, IntArray, Schema
 
 T = TypeVar("T")
 
@@ -60,10 +62,71 @@ _DECODED_BYTES: Final = 1 << 20
 _EVERYTHING: Final = TimeWindow.everything()
 
 
+class _Kind(NamedTuple):
+    """How the messages of a channel are decoded; without a plan, `reason` says why they are not."""
+
+    definition: Definition | None
+    plan: Plan | None
+    reason: str
+    is_hashed: bool
+
+
+class Piece(NamedTuple):
+    """Messages of a channel that are not decoded yet, and how they are."""
+
+    kind: _Kind
+    batch: Batch
+
+
+class BagRows(NamedTuple):
+    """A table, and which of some bags each of its rows is of, by their order."""
+
+    table: Table
+    bags: IntArray
+
+
 def never(channel: Channel) -> bool:
     """Returns False: no payload is hashed."""
     del channel
     return False
+
+
+def pieces(
+    reader: BagReader,
+    path: Path,
+    window: TimeWindow = _EVERYTHING,
+    *,
+    topics: Collection[str] | None = None,
+    hashed: Callable[[Channel], bool] = never,
+    columns: bool = True,
+) -> Iterator[Piece]:
+    """Yields the messages of a bag, not decoded yet; arguments and errors as of `decoded`."""
+
+    def found() -> Iterator[Piece | BagError]:
+        channels = [
+            channel
+            for channel in reader.channels(path)
+            if topics is None or channel.topic in topics
+        ]
+        kinds = _Kinds(reader, hashed, columns)
+        kinds.look_at(channels, path, window)
+        alone = reader.times_alone(path)
+        bare = {channel.topic for channel in channels}
+        for channel in channels:
+            kind = kinds.of(channel)
+            # Copies of messages without a payload are recognised by their publish times.
+            if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
+                bare.discard(channel.topic)
+        wanted = {channel.topic for channel in channels}
+        for batch in _or_errors(reader.batches(path, wanted, window, bare=bare)):
+            if isinstance(batch, BagError):
+                yield batch
+            elif batch.sizes.size:
+                yield Piece(kinds.read(batch), batch)
+            del batch  # and its buffer, before the next is read
+
+    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+    return map(_unless_error, found())
 
 
 def decoded(
@@ -98,43 +161,70 @@ def decoded(
         BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
             read.
     """
+    read = pieces(reader, path, window, topics=topics, hashed=hashed, columns=columns)
+    return decoded_groups(reader, read, group_bytes)
+
+
+def decoded_groups(
+    reader: BagReader, read: Iterator[Piece], group_bytes: int = GROUP_BYTES
+) -> Iterator[list[Table]]:
+    """Yields what `pieces` yields as `decoded` does."""
 
     def found() -> Iterator[list[Table] | BagError]:
-        channels = [
-            channel
-            for channel in reader.channels(path)
-            if topics is None or channel.topic in topics
-        ]
-        kinds = _Kinds(reader, hashed, columns)
-        kinds.look_at(channels, path, window)
-        alone = reader.times_alone(path)
-        bare = {channel.topic for channel in channels}
-        for channel in channels:
-            kind = kinds.of(channel)
-            # Copies of messages without a payload are recognised by their publish times.
-            if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
-                bare.discard(channel.topic)
-        batches = reader.batches(path, {each.topic for each in channels}, window, bare=bare)
-        group = _Group(kinds, group_bytes)
-        while True:
-            try:
-                batch = next(batches)
-            except StopIteration:
-                break
-            except BagError as error:
-                yield error
+        group = _Group(reader, group_bytes)
+        for piece in _or_errors(read):
+            if isinstance(piece, BagError):
+                yield piece
                 continue
-            if group.is_full_before(batch):
+            if group.is_full_before(piece.batch):
                 yield group.tables()
-                group = _Group(kinds, group_bytes)
-            group.add(batch)
-            del batch  # and its buffer, before the next is read
+                group = _Group(reader, group_bytes)
+            group.add(piece)
+            del piece  # and its buffer, before the next is read
         tables = group.tables()
         if tables:
             yield tables
 
-    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
     return map(_unless_error, found())
+
+
+def decoded_together(
+    reader: BagReader, bags: Sequence[tuple[Path, Sequence[Piece]]]
+) -> list[BagRows]:
+    """Returns all messages of small bags as tables that have rows of many of them.
+
+    Numpy takes longer to be called than to go through the messages of one topic in a bag of 10 s.
+    Messages that cannot be decoded have rows, too, as by `with_all_messages`.
+
+    Args:
+        reader: reads the bags.
+        bags: each with all of its messages. Times that are equal are in this order.
+
+    Raises:
+        BagError: a bag cannot be read again.
+    """
+    buffers = {id(piece.batch.buffer): piece.batch.buffer for _, read in bags for piece in read}
+    ends = accumulate(map(len, buffers.values()), initial=0)
+    begins = dict(zip(buffers, ends, strict=False))
+    whole = b"".join(buffers.values())
+    alike: dict[object, list[_Own]] = defaultdict(list)
+    for nth, (path, read) in enumerate(bags):
+        # All messages of a topic in a bag are of the first channel, and have columns, or none has.
+        firsts: dict[object, Channel] = {}
+        kinds: dict[object, _Kind] = {}
+        for kind, batch in read:
+            topic = _topic_of(batch)
+            firsts.setdefault(topic, batch.channel)
+            if topic not in kinds or kind.plan is None:
+                kinds[topic] = kind
+        for _, batch in read:
+            topic = _topic_of(batch)
+            channel, kind = firsts[topic], kinds[topic]
+            starts = batch.starts + begins[id(batch.buffer)]
+            moved = replace(batch, channel=channel, buffer=whole, starts=starts)
+            key = (topic, channel.latched, kind.plan is None, kind.is_hashed)
+            alike[key].append(_Own(nth, path, kind, moved))
+    return [rows for own in alike.values() for rows in _together(reader, own)]
 
 
 def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeWindow) -> Table:
@@ -174,30 +264,35 @@ def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeW
     )
 
 
+def _or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
+    """Yields the items, and in place of those that are lost the errors that `next` raises."""
+    while True:
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        except BagError as error:
+            yield error
+            continue
+        yield item
+        del item
+
+
 def _unless_error(item: T | BagError) -> T:
     if isinstance(item, BagError):
         raise item
     return item
 
 
-@dataclass(frozen=True, slots=True)
-class _Kind:
-    """How the messages of a channel are decoded; without a plan, `reason` says why they are not."""
-
-    channel: Channel
-    plan: Plan | None
-    reason: str
-    is_hashed: bool
-
-
 @dataclass(slots=True)
 class _Kinds:
-    """The kinds of the channels of one bag, of which `read_bytes` were read so far."""
+    """The kinds of the channels of one bag, while it is read."""
 
     reader: BagReader
     hashed: Callable[[Channel], bool]
     columns: bool
-    read_bytes: int = 0
+    _buffer: bytes = b""
+    _read_bytes: int = 0
     # By identity, since hashing a channel hashes its definition.
     _known: dict[int, _Kind] = field(default_factory=dict)
     _bulky: set[str] = field(default_factory=set)
@@ -212,7 +307,7 @@ class _Kinds:
         if size <= LARGE_FILE_BYTES:
             return
         for channel in channels:
-            if self._plan(channel)[0] is None:
+            if self._plan(channel, self.reader.definition(channel))[0] is None:
                 continue
             with suppress(BagError):
                 newest = self.reader.newest(path, channel.topic, window)
@@ -223,24 +318,28 @@ class _Kinds:
         """Returns the kind of a channel."""
         known = self._known.get(id(channel))
         if known is None:
-            plan, reason = self._plan(channel)
-            known = _Kind(channel, plan, reason, self.hashed(channel))
+            definition = self.reader.definition(channel)
+            plan, reason = self._plan(channel, definition)
+            known = _Kind(definition, plan, reason, self.hashed(channel))
             self._known[id(channel)] = known
         return known
 
-    def leave_out_large(self, batch: Batch) -> None:
-        """Has no more columns made of a channel with large messages."""
-        most = LARGEST_MESSAGE_BYTES if self.read_bytes <= LARGE_FILE_BYTES else BULKY_BYTES
+    def read(self, batch: Batch) -> _Kind:
+        """Returns the kind of what was read: of large messages no more columns are made."""
+        if batch.buffer is not self._buffer:
+            self._buffer = batch.buffer
+            self._read_bytes += len(batch.buffer)
+        most = LARGEST_MESSAGE_BYTES if self._read_bytes <= LARGE_FILE_BYTES else BULKY_BYTES
         kind = self.of(batch.channel)
         if kind.plan is not None and batch.sizes.max() > most:
-            self._known[id(batch.channel)] = replace(kind, plan=None, reason=_BULKY)
+            kind = self._known[id(batch.channel)] = kind._replace(plan=None, reason=_BULKY)
+        return kind
 
-    def _plan(self, channel: Channel) -> tuple[Plan | None, str]:
+    def _plan(self, channel: Channel, definition: Definition | None) -> tuple[Plan | None, str]:
         if not self.columns:
             return None, _NOT_ASKED
         if channel.type in BULKY_TYPES or channel.topic in self._bulky:
             return None, _BULKY
-        definition = self.reader.definition(channel)
         if definition is None:
             reason = self.reader.undecodable(channel)
             return None, reason or f"messages encoded as {channel.encoding} have no columns"
@@ -254,11 +353,11 @@ class _Kinds:
 
 @dataclass(slots=True)
 class _Group:
-    """The tables of some buffers, while they are read."""
+    """The tables of some buffers of one bag, while they are read."""
 
-    kinds: _Kinds
+    reader: BagReader
     limit: int
-    _parts: dict[tuple[str, str, Schema], list[Table]] = field(default_factory=dict)
+    _parts: dict[tuple[Schema, str, str], list[Table]] = field(default_factory=dict)
     _buffer: bytes = b""
     _bytes: int = 0
 
@@ -271,19 +370,15 @@ class _Group:
             size = sum(part.memory_bytes for parts in self._parts.values() for part in parts)
         return size > self.limit
 
-    def add(self, batch: Batch) -> None:
-        """Decodes a batch."""
+    def add(self, piece: Piece) -> None:
+        """Decodes a piece."""
+        batch = piece.batch
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._bytes += len(batch.buffer)
-            self.kinds.read_bytes += len(batch.buffer)
-        if not batch.sizes.size:
-            return
-        channel = batch.channel
-        parts = self._parts.setdefault((channel.topic, channel.encoding, channel.schema), [])
-        self.kinds.leave_out_large(batch)
-        for piece in _pieces(batch):
-            self._add(parts, _table(self.kinds, piece))
+        parts = self._parts.setdefault(_topic_of(batch), [])
+        for some in _parts_of(batch):
+            self._add(parts, _table(piece.kind, some, self.reader))
 
     def _add(self, parts: list[Table], table: Table) -> None:
         """Adds a table to those of its topic, of which all have columns or none has."""
@@ -305,8 +400,8 @@ class _Group:
         return found[::-1]
 
 
-def _pieces(batch: Batch) -> Iterator[Batch]:
-    """Yields a batch of a large chunk in pieces: to walk one takes some times its bytes."""
+def _parts_of(batch: Batch) -> Iterator[Batch]:
+    """Yields a batch of a large chunk in parts: to walk one takes some times its bytes."""
     if batch.sizes.sum() <= BATCH_BYTES:
         yield batch
         return
@@ -315,29 +410,81 @@ def _pieces(batch: Batch) -> Iterator[Batch]:
         yield batch.taken(rows)
 
 
-def _table(kinds: _Kinds, batch: Batch) -> Table:
-    """Returns the messages of a batch as a table."""
-    kind = kinds.of(batch.channel)
+class _Own(NamedTuple):
+    """Messages of one bag among those of others."""
+
+    bag: int
+    path: Path
+    kind: _Kind
+    batch: Batch
+
+
+def _topic_of(batch: Batch) -> tuple[Schema, str, str]:
+    channel = batch.channel
+    return channel.schema, channel.encoding, channel.topic
+
+
+def _together(reader: BagReader, own: Sequence[_Own]) -> Iterator[BagRows]:
+    """Yields messages of one topic and kind in some bags, which lie in one buffer."""
+    first = own[0]
+    batches = [entry.batch for entry in own]
+    of = np.repeat([entry.bag for entry in own], [batch.sizes.size for batch in batches])
+    times = np.concatenate([batch.log_times for batch in batches])
+    order: IntArray = np.arange(times.size)
+    if not (times[1:] > times[:-1]).all():
+        order = np.lexsort((np.concatenate([batch.places for batch in batches]), of, times))
+    whole = Batch(
+        first.batch.channel,
+        times[order],
+        np.concatenate([batch.publish_times for batch in batches])[order],
+        np.arange(times.size),
+        first.batch.buffer,
+        np.concatenate([batch.starts for batch in batches])[order],
+        np.concatenate([batch.sizes for batch in batches])[order],
+    )
+    bags = {entry.bag for entry in own}
+    if len(bags) == 1:
+        table = _table(first.kind, whole, reader)
+        table = with_all_messages(reader, first.path, table, _EVERYTHING)
+        yield BagRows(table, np.full(len(table), first.bag))
+        return
+    try:
+        yield BagRows(_table(first.kind, whole, None), of[order])
+    except NotWalkedError:
+        for bag in sorted(bags):
+            yield from _together(reader, [entry for entry in own if entry.bag == bag])
+
+
+def _table(kind: _Kind, batch: Batch, reader: BagReader | None) -> Table:
+    """Returns the messages of a batch as a table; what cannot be walked the reader decodes.
+
+    Raises:
+        NotWalkedError: there is such a message, and no reader.
+    """
     order = order_of(batch.log_times, batch.places)
     if order is not None:
         batch = batch.taken(order)
-    definition = kinds.reader.definition(batch.channel)
+    hashes = None
+    if kind.is_hashed:
+        payloads = map(batch.payload, range(batch.sizes.size))
+        hashes = np.array([*map(zlib.crc32, payloads)], np.int64)
     table = Table(
         batch.channel,
         batch.log_times,
         batch.publish_times,
         batch.places,
-        definition=definition,
+        left_out={"": kind.reason},
+        payload_hashes=hashes,
+        definition=kind.definition,
     )
-    if kind.is_hashed:
-        hashes = [zlib.crc32(batch.payload(nth)) for nth in range(len(table))]
-        table = replace(table, payload_hashes=np.array(hashes, np.int64))
     if kind.plan is None:
-        return replace(table, left_out={"": kind.reason})
+        return table
     try:
         level = walked(kind.plan, batch)
     except NotWalkedError:
-        return joined(list(_one_by_one(kinds.reader, kind.plan, batch, table)))
+        if reader is None:
+            raise
+        return joined(list(_one_by_one(reader, kind.plan, batch, table)))
     return replace(table, columns=level.columns, elements=level.elements, left_out=level.left_out)
 
 

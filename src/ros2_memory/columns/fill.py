@@ -5,17 +5,26 @@ from __future__ import annotations
 import os
 import time
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.decode import (
+    BagRows,
+    decoded_groups,
+    decoded_together,
+    pieces,
+    with_all_messages,
+)
 from ros2_memory.columns.store import LONG_NS, BagKey
-from ros2_memory.columns.writing import PART_NS, DecodedBag
+from ros2_memory.columns.writing import PART_NS, DecodedBags, ReadBag
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import united
@@ -27,6 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.decode import Piece
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.columns.table import Table
@@ -84,6 +94,24 @@ class Batch(NamedTuple):
 
     bags: Sequence[BagFile]
     whole: bool
+
+
+@dataclass(slots=True)
+class _Found:
+    """Bags of one batch while they are read: the last small ones are decoded together."""
+
+    small: list[tuple[ReadBag, list[Piece]]] = field(default_factory=list)
+    small_bytes: int = 0
+    bags: list[ReadBag] = field(default_factory=list)
+    tables: list[BagRows] = field(default_factory=list)
+    table_bytes: int = 0
+
+    def add(self, bags: Sequence[ReadBag], tables: Sequence[BagRows]) -> None:
+        """Adds bags that were decoded; the tables name them by their order."""
+        before = len(self.bags)
+        self.bags += bags
+        self.tables += [BagRows(table, own + before) for table, own in tables]
+        self.table_bytes += sum(table.memory_bytes for table, _ in tables)
 
 
 class Filling:
@@ -176,20 +204,16 @@ class Filling:
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         bags, whole = batch
-        decoded_bags: list[DecodedBag] = []
-        done = held = 0
+        found = _Found()
+        done = 0
         for bag in sorted(bags, key=in_time):
-            found = self._decoded(bag, hashed=self._is_shared(bag, timeline))
+            done += self._read(bag, found, hashed=self._is_shared(bag, timeline))
             self._large.release()
-            if isinstance(found, bool):
-                done += found
-                continue
-            decoded_bags.append(found)
-            held += sum(table.memory_bytes for table in found.tables)
-            if held > _MOST_HELD:
-                done += self._put(decoded_bags, whole=whole)
-                decoded_bags, held = [], 0
-        return done + self._put(decoded_bags, whole=whole)
+            if found.table_bytes > _MOST_HELD:
+                done += self._put(DecodedBags(found.bags, found.tables), whole=whole)
+                found = _Found(found.small, found.small_bytes)
+        self._decode(found)
+        return done + self._put(DecodedBags(found.bags, found.tables), whole=whole)
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -256,63 +280,96 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _decoded(self, bag: BagFile, *, hashed: bool) -> DecodedBag | bool:
-        """Returns a bag with its messages; or whether it is stored, where that is settled here."""
+    def _read(self, bag: BagFile, found: _Found, *, hashed: bool) -> bool:
+        """Adds a bag to what was found, a small one undecoded; or returns whether it is stored."""
         if not self._is_settled(bag):
             return False
         try:
             if self._is_renewed(bag):
                 return True
-            groups = decoded(self._reader, bag.path, hashed=partial(_is_hashed, everything=hashed))
-            first = next(groups, [])
-            second = next(groups, None)
-            if second is None and bag.end - bag.start <= LONG_NS:
-                tables = self._whole(bag, first)
-                current = partial(self._is_settled, bag)
-                return DecodedBag(self._key(bag), bag, tables, hashed, current)
-            begin = [first] if second is None else [first, second]
-            del first, second
-            return self._put_long(bag, self._released_groups(bag, begin, groups), hashed=hashed)
-        except BagError as error:
-            self._refuse(bag, error.reason)
-        except Exception as error:
-            log.exception("bag_not_stored", path=str(bag.path))
-            self._refuse(bag, type(error).__name__)
+            current = partial(self._is_settled, bag)
+            to_store = ReadBag(self._key(bag), bag, hashed, current)
+            read = pieces(self._reader, bag.path, hashed=partial(_is_hashed, everything=hashed))
+            begin, size = _first_pieces(read)
+            if size > LARGE_BYTES or bag.end - bag.start > LONG_NS:
+                groups = decoded_groups(self._reader, chain(_popped(begin), read))
+                return self._add_large(to_store, groups, found)
+            if found.small_bytes + size > LARGE_BYTES:
+                self._decode(found)
+            found.small.append((to_store, begin))
+            found.small_bytes += size
+        except Exception as error:  # noqa: BLE001 - the next bag may be whole
+            self._not_stored(bag, error)
         return False
 
-    def _put(self, bags: Sequence[DecodedBag], *, whole: bool) -> int:
+    def _add_large(self, to_store: ReadBag, groups: Iterator[list[Table]], found: _Found) -> bool:
+        """Adds a bag of one group to what was found; stores another, and returns whether it did."""
+        bag = to_store.bag
+        first = next(groups, [])
+        second = next(groups, None)
+        if second is None and bag.end - bag.start <= LONG_NS:
+            self._decode(found)  # bags stay in order
+            own = [
+                BagRows(table, np.zeros(len(table), np.int64)) for table in self._whole(bag, first)
+            ]
+            found.add([to_store], own)
+            return False
+        begin = [first] if second is None else [first, second]
+        del first, second
+        return self._put_long(to_store, self._released_groups(bag, begin, groups))
+
+    def _decode(self, found: _Found) -> None:
+        """Decodes the small bags together; where that fails, each alone."""
+        small, found.small, found.small_bytes = found.small, [], 0
+        try:
+            read = [(to_store.bag.path, begin) for to_store, begin in small]
+            found.add([to_store for to_store, _ in small], decoded_together(self._reader, read))
+        except Exception as error:  # noqa: BLE001 - of one of them
+            if len(small) == 1:
+                self._not_stored(small[0][0].bag, error)
+                return
+            for alone in small:
+                found.small = [alone]
+                self._decode(found)
+
+    def _not_stored(self, bag: BagFile, error: Exception) -> None:
+        """Refuses a bag that cannot be read or decoded. Called where the error is caught."""
+        if isinstance(error, BagError):
+            self._refuse(bag, error.reason)
+        else:
+            log.exception("bag_not_stored", path=str(bag.path))  # noqa: LOG004 - caught above
+            self._refuse(bag, type(error).__name__)
+
+    def _put(self, decoded: DecodedBags, *, whole: bool) -> int:
         """Stores bags in parts together; each alone where the database refuses that."""
+        bags = [to_store.bag for to_store in decoded.bags]
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
-        written = self.store.put(bags, whole=whole)
+        written = self.store.put(decoded, whole=whole)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                return sum(self._put([bag], whole=whole) for bag in bags)
-            self._refuse(bags[0].bag, self.store.refused_for or "")
+                alone = (decoded.chosen([nth]) for nth in range(len(bags)))
+                return sum(self._put(one, whole=whole) for one in alone)
+            self._refuse(bags[0], self.store.refused_for or "")
         if written.parts and whole:
-            begin = self._slot(bags[0].bag)[1]
+            begin = self._slot(bags[0])[1]
             self._merged.append((begin, begin + PART_NS))
-            self._whole_parts.append(([*written.parts], [bag.bag for bag in bags]))
+            self._whole_parts.append(([*written.parts], bags))
         if written.bags:
             spent = ms_from_ns(time.perf_counter_ns() - begun)
             log.debug("bags_stored", bags=written.bags, whole=whole, duration_ms=round(spent, 3))
         return written.bags
 
-    def _put_long(self, bag: BagFile, groups: Iterator[list[Table]], *, hashed: bool) -> bool:
+    def _put_long(self, to_store: ReadBag, groups: Iterator[list[Table]]) -> bool:
         """Stores a bag as parts of ten minutes each, group by group."""
+        bag = to_store.bag
         refusals = self.store.refusals
         stored, taken = self.store.merged_bytes()
         left = round(self._limits.max_share * stored) - taken
         self._merged.append((bag.start, bag.end + 1))
-        is_stored = self.store.put_long(
-            self._key(bag),
-            bag,
-            groups,
-            hashed=hashed,
-            budget=self._share([bag]) + max(left, 0),
-            is_current=partial(self._is_settled, bag),
-        )
+        budget = self._share([bag]) + max(left, 0)
+        is_stored = self.store.put_long(to_store, groups, budget=budget)
         if not is_stored and self.store.refusals > refusals:
             self._refuse(bag, self.store.refused_for or "")
         return is_stored
@@ -400,6 +457,26 @@ class Filling:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
+
+
+def _first_pieces(read: Iterator[Piece]) -> tuple[list[Piece], int]:
+    """Returns the pieces until they are no small bag's, or all, and the bytes of their buffers."""
+    found: list[Piece] = []
+    size = 0
+    for piece in read:
+        if not found or piece.batch.buffer is not found[-1].batch.buffer:
+            size += len(piece.batch.buffer)
+        found.append(piece)
+        if size > LARGE_BYTES:
+            break
+    return found, size
+
+
+def _popped(found: list[Piece]) -> Iterator[Piece]:
+    """Yields pieces; each is freed before the next."""
+    found.reverse()
+    while found:
+        yield found.pop()
 
 
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:

@@ -45,6 +45,7 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -82,6 +83,8 @@ _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
 """Steps, as `Step.per_unit`, that values of a relative exactness often have anyway."""
 _SAMPLE: Final = 16
+_LONG_PLANE: Final = 300
+_END_BLOCK: Final = zstandard.COMPRESSOBJ_FLUSH_BLOCK
 
 
 class _Bits(NamedTuple):
@@ -105,6 +108,7 @@ class Packed:
         error: the greatest absolute error of any value once unpacked, as measured; 0.0: exact.
         zone: what is known of the values without unpacking them, before any was rounded.
         data: the bytes, not compressed yet; empty where every value is the zone's least.
+        plane: how many bytes each of the planes has that `data` ends with.
     """
 
     codec: str
@@ -112,6 +116,7 @@ class Packed:
     error: float
     zone: Zone
     data: bytes
+    plane: int = 0
 
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
@@ -192,9 +197,23 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
 
 
-def compressed(data: bytes) -> bytes:
-    """Returns the bytes as a zstd frame that states its size."""
-    return zstandard.ZstdCompressor(level=LEVEL).compress(data)
+def compressed(data: bytes, plane: int = 0) -> bytes:
+    """Returns the bytes as a zstd frame that states its size.
+
+    Args:
+        data: the bytes.
+        plane: `Packed.plane`. Long planes become blocks of their own, with their own codes: a low
+            byte is noise where a high one hardly varies.
+    """
+    compressor = zstandard.ZstdCompressor(level=LEVEL)
+    if plane < _LONG_PLANE or len(data) < 2 * plane:
+        return compressor.compress(data)
+    blocks = compressor.compressobj(size=len(data))
+    ends = range(len(data) % plane + plane, len(data) + 1, plane)
+    found = []
+    for begin, end in pairwise((0, *ends)):
+        found += [blocks.compress(data[begin:end]), blocks.flush(_END_BLOCK)]
+    return b"".join((*found, blocks.flush()))
 
 
 def is_large(data: bytes) -> bool:
@@ -250,7 +269,7 @@ class _InLine:
         """Returns the greatest value of each column; NaN where it has one."""
         return np.maximum.reduceat(values, self.starts)
 
-    def means(self, values: Values) -> Floats:
+    def means(self, values: Numbers) -> Floats:
         """Returns the mean of each column."""
         means: Floats = np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
         return means
@@ -451,24 +470,33 @@ def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
     curve = _differences(steps, lie.starts)
     curve[lie.starts + 1] = 0
     around = (flat - lie.rows(lie.means(flat)), line - lie.rows(lie.means(line)), delta, curve)
-    bits = np.array([lie.means(np.log2(2.0 * np.abs(1.0 * numbers) + 1.0)) for numbers in around])
+    bits = np.array([lie.means(_bits_of(numbers)) for numbers in around])
     line -= lie.rows(np.minimum.reduceat(line, lie.starts))
     numbers = (flat, line, (delta << 1) ^ (delta >> 63), (curve << 1) ^ (curve >> 63))
     most = [np.maximum.reduceat(some.view(np.uint64), lie.starts).tolist() for some in numbers]
     found = []
     for nth, (column, which) in enumerate(zip(columns, bits.argmin(axis=0).tolist(), strict=True)):
         start, stop = int(lie.starts[nth]), int(lie.stops[nth])
+        name, width, head = _ARRANGEMENTS[which], (most[which][nth].bit_length() + 7) // 8, b""
+        left = numbers[which][start + max(0, which - 1) : stop]
         if column.greatest - column.least >= _FAR_APART:
-            arrangement, data = "plain 8", byte_planes(flat[start:stop], 8)
-        else:
-            width = (most[which][nth].bit_length() + 7) // 8
-            arrangement = f"{_ARRANGEMENTS[which]} {width}"
-            first = steps[start + 1] if which == 3 else slopes[nth]
-            data = struct.pack("<q", first) if which else b""
-            data += byte_planes(numbers[which][start + max(0, which - 1) : stop], width)
-        codec = f"{column.form} {arrangement}"
-        found.append(Packed(codec, stop - start, column.error, column.zone, column.head + data))
+            name, width, left = "plain", 8, flat[start:stop]
+        elif which:
+            head = struct.pack("<q", steps[start + 1] if name == "curve" else slopes[nth])
+        codec = f"{column.form} {name} {width}"
+        data = b"".join((column.head, head, byte_planes(left, width)))
+        found.append(Packed(codec, stop - start, column.error, column.zone, data, len(left)))
     return found
+
+
+def _bits_of(numbers: Numbers) -> Numbers:
+    """Returns about how many bits each number takes, with its sign."""
+    # In single precision and in place: the memory of four such arrays is what takes long.
+    sizes = np.abs(numbers.astype(np.float32))
+    sizes *= 2
+    sizes += 1
+    np.log2(sizes, out=sizes)
+    return sizes
 
 
 def _differences(numbers: IntArray, starts: IntArray) -> IntArray:

@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.pack import Packed, compressed, pack, pack_columns
+from ros2_memory.columns.pack import Packed, compressed, pack_columns
+from ros2_memory.columns.steps import EXACT
 from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
 from ros2_memory.columns.table import Zone, joined
 
@@ -73,27 +75,28 @@ class PackedPart:
         return sum(map(len, self.first_of))
 
 
-def packed_part(layout: Layout, tables: Sequence[tuple[int, Table]]) -> PackedPart:
+def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> PackedPart:
     """Returns the rows of some bags as one part.
 
     Args:
         layout: of the topic, type and definition that all these tables are of.
-        tables: each with the number of its bag, and at least one row.
+        tables: each with the number of the bag of each row, of which it has one at least.
     """
-    stops = np.cumsum([len(table) for _, table in tables])
+    if len(tables) == 1:
+        return pack_rows(layout, *tables[0])
+    stops = np.cumsum([len(table) for table, _ in tables])
     # The place of a row becomes its number among all rows: so its bag is known once sorted.
-    is_hashed = any(table.payload_hashes is not None for _, table in tables)
+    is_hashed = any(table.payload_hashes is not None for table, _ in tables)
     numbered = [
         replace(
             table,
             places=np.arange(stop - len(table), stop),
             payload_hashes=_hashes(table) if is_hashed else None,
         )
-        for (_, table), stop in zip(tables, stops.tolist(), strict=True)
+        for (table, _), stop in zip(tables, stops.tolist(), strict=True)
     ]
     whole = joined(numbered)
-    bags = np.array([bag for bag, _ in tables], np.int64)
-    return pack_rows(layout, whole, bags[np.searchsorted(stops, whole.places, side="right")])
+    return pack_rows(layout, whole, np.concatenate([bags for _, bags in tables])[whole.places])
 
 
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
@@ -102,26 +105,30 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     Raises:
         ValueError: the table has other columns than the layout.
     """
-    columns = {LOG_TIME: pack(table.log_times), BAG: pack(bags)}
+    own: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
+    packed: dict[str, Packed] = {}
     if table.payload_hashes is not None:
         is_hashed = table.payload_hashes != UNHASHED
-        columns[PAYLOAD_HASH] = pack(table.payload_hashes)
-        columns[DELAY] = pack(np.where(is_hashed, table.log_times - table.publish_times, 0))
+        own[PAYLOAD_HASH] = table.payload_hashes
+        own[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
         # Those of a table without columns may be log times.
         if is_hashed.all() or "" not in table.left_out:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
-            columns[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
-    steps = [slot.kind.step for slot in layout.slots.values()]
-    packs = pack_columns([*zip(layout.columns_of(table), steps, strict=True)])
-    columns.update(zip(layout.slots, packs, strict=True))
+            packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
+    steps = (slot.kind.step for slot in layout.slots.values())
+    columns = [*own.values(), *layout.columns_of(table)]
+    packs = pack_columns([*zip(columns, chain(repeat(EXACT, len(own)), steps), strict=True)])
+    packed.update(zip((*own, *layout.slots), packs, strict=True))
     return PackedPart(
         int(table.log_times[0]),
         int(table.log_times[-1]),
         len(table),
         tuple(np.unique(bags).tolist()),
         {
-            path: replace(packed, data=compressed(packed.data)) if packed.data else packed
-            for path, packed in columns.items()
+            path: replace(column, data=compressed(column.data, column.plane))
+            if column.data
+            else column
+            for path, column in packed.items()
         },
     )
 

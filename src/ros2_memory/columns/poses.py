@@ -14,6 +14,7 @@ from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.shown import UnknownShapeError
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY
 from ros2_memory.columns.table import Texts
+from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.extract import FRAME, HEADINGS, POSE_FRAMES, UNMAPPED, PlanarPose
 from ros2_memory.messages.fields import Route
 from ros2_memory.storage.base import SEQUENCE, Definition
@@ -294,13 +295,13 @@ def _at_unit_length(turns: Vectors) -> Vectors:
     Rounded where that is their length already: of others rounding would change the rotation more.
     """
     with np.errstate(all="ignore"):
-        off = np.abs((turns * turns).sum(axis=1) - 1)
+        off = np.abs(row_sums(turns * turns) - 1)
         turns = np.where((off < _ABOUT_UNIT)[:, None], rounded(turns, QUATERNION), turns)
-        largest = np.abs(turns).max(axis=1, initial=0.0)
+        largest = row_maxima(np.abs(turns))
         is_turn = np.isfinite(largest) & (largest > 0)
         scaled = turns / largest[:, None]
-        scaled /= np.sqrt((scaled * scaled).sum(axis=1))[:, None]
-        is_unit = np.abs((turns * turns).sum(axis=1) - 1) < _UNIT_TOLERANCE
+        scaled /= np.sqrt(row_sums(scaled * scaled))[:, None]
+        is_unit = np.abs(row_sums(turns * turns) - 1) < _UNIT_TOLERANCE
         return np.where(is_unit[:, None], turns, np.where(is_turn[:, None], scaled, np.nan))
 
 

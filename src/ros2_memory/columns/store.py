@@ -31,9 +31,10 @@ from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
     UNMERGED,
-    DecodedBag,
+    DecodedBags,
     Layouts,
     LongBag,
+    ReadBag,
     bytes_of_topics,
     delete_bags,
     insert_bags,
@@ -524,16 +525,18 @@ class ColumnStore(Database):
 
         return self.listings() == listings or self.write(write)
 
-    def put(self, bags: Sequence[DecodedBag], *, whole: bool) -> Written:
+    def put(self, decoded: DecodedBags, *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
-        One that is in whole parts stays as it is: another program has stored it.
+        One that is in whole parts stays as it is: another program has stored it. One that changed
+        meanwhile is left out.
 
         Args:
-            bags: all messages of each. One that changed meanwhile is left out.
+            decoded: the bags.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
         written = Written(0, ())
+        bags = decoded.bags
 
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
@@ -544,12 +547,12 @@ class ColumnStore(Database):
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = [bag for bag in bags if stored.get(bag.key, -1) < bag.hashed]
-            new = [bag for bag in missing if bag.is_current()]
-            delete_bags(connection, [bag.key.path for bag in new])
+            missing = [nth for nth, bag in enumerate(bags) if stored.get(bag.key, -1) < bag.hashed]
+            new = decoded.chosen([nth for nth in missing if bags[nth].is_current()])
+            delete_bags(connection, [bag.key.path for bag in new.bags])
             parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
-            done = len(bags) - len(missing)
-            written = Written(done + len(new), tuple(self.offset + part for part in parts))
+            done = len(bags) - len(missing) + len(new.bags)
+            written = Written(done, tuple(self.offset + part for part in parts))
 
         return written if self.write(write) else Written(0, ())
 
@@ -578,14 +581,7 @@ class ColumnStore(Database):
         return self.write(write) and kept
 
     def put_long(
-        self,
-        key: BagKey,
-        bag: BagFile,
-        groups: Iterable[Sequence[Table]],
-        *,
-        hashed: bool,
-        budget: int,
-        is_current: Callable[[], bool] = lambda: True,
+        self, to_store: ReadBag, groups: Iterable[Sequence[Table]], *, budget: int
     ) -> bool:
         """Stores a bag as parts, group by group; returns whether it did.
 
@@ -593,15 +589,12 @@ class ColumnStore(Database):
         Its rows go where that is not reached.
 
         Args:
-            key: of the bag.
-            bag: the bag, for its times.
+            to_store: the bag; whether it is current is asked with each group.
             groups: all of its messages, in several goes. What they raise is raised here.
-            hashed: whether all tables have the hashes of their payloads.
             budget: how many bytes the parts may take.
-            is_current: as for `put`, asked with each group.
         """
-        long = LongBag(key, bag, self._definitions, is_current, budget)
-        if not (self.write(partial(long.begin, hashed=hashed)) and long.goes_on):
+        long = LongBag(to_store, self._definitions, budget)
+        if not (self.write(long.begin) and long.goes_on):
             return False
         is_whole = False
         try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.columns.decode import BagRows
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.parts import ALWAYS, DROPPED, ZONE_ALONE, pack_rows, packed_part
 from ros2_memory.columns.table import Zone
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.store import BagKey
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
-    from ros2_memory.storage.base import Schema
+    from ros2_memory.storage.base import IntArray, Schema
 
 PART_NS: Final[Ns] = 600 * NS_PER_S
 """Bags of one recording that begin in the same ten minutes become one part for each topic."""
@@ -31,22 +32,41 @@ _MOST_INTEGER: Final = 2**63 - 1
 _MOST_LAYOUTS: Final = 4_096
 
 
-class DecodedBag(NamedTuple):
+class ReadBag(NamedTuple):
     """A bag to be stored.
 
     Attributes:
         key: of the bag.
         bag: the bag, for its times.
-        tables: all of its messages.
-        hashed: whether these have the hashes of all payloads.
+        hashed: whether tables have the hashes of all its payloads.
         is_current: whether the bag may be stored, asked once nobody else can write.
     """
 
     key: BagKey
     bag: BagFile
-    tables: Sequence[Table]
     hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
+
+
+class DecodedBags(NamedTuple):
+    """Bags of one recording, and tables with all of their messages."""
+
+    bags: Sequence[ReadBag]
+    tables: Sequence[BagRows]
+
+    def chosen(self, places: Sequence[int]) -> DecodedBags:
+        """Returns some of the bags, by their places among these."""
+        if len(places) == len(self.bags):
+            return self
+        new = np.full(len(self.bags), -1)
+        new[places] = np.arange(len(places))
+        tables = [
+            BagRows(table.rows(rows), new[bags[rows]])
+            for table, bags in self.tables
+            for rows in [np.flatnonzero(new[bags] >= 0)]
+            if rows.size
+        ]
+        return DecodedBags([self.bags[place] for place in places], tables)
 
 
 class LongBag:
@@ -56,38 +76,27 @@ class LongBag:
         goes_on: whether it may be written on, as the last transaction found.
 
     Args:
-        key: of the bag.
-        bag: the bag.
+        to_store: the bag.
         definitions: as `ColumnStore` has them.
-        is_current: whether the bag may be stored.
         budget: how many bytes its parts may take.
     """
 
-    def __init__(
-        self,
-        key: BagKey,
-        bag: BagFile,
-        definitions: str,
-        is_current: Callable[[], bool],
-        budget: int,
-    ) -> None:
+    def __init__(self, to_store: ReadBag, definitions: str, budget: int) -> None:
         self.goes_on = False
-        self._key = key
-        self._bag = bag
+        self._bag = to_store
         self._definitions = definitions
-        self._is_current = is_current
-        self._share = budget / max(_messages_of(bag), 1)
+        self._share = budget / max(_messages_of(to_store.bag), 1)
         self._lacks_definitions = False
         self._number = 0
         self._layouts = Layouts()
 
-    def begin(self, connection: sqlite3.Connection, *, hashed: bool) -> None:
+    def begin(self, connection: sqlite3.Connection) -> None:
         """Inserts the bag with a key that none has, in place of what its path was stored with."""
-        self.goes_on = self._is_current()
+        self.goes_on = self._bag.is_current()
         if self.goes_on:
-            delete_bags(connection, [self._key.path])
-            half = self._key._replace(size=-1)
-            self._number = insert_bag(connection, half, self._bag, "", hashed=hashed)
+            key = self._bag.key
+            delete_bags(connection, [key.path])
+            self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
 
     def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> None:
         """Inserts some of its messages, as parts of ten minutes each."""
@@ -110,7 +119,7 @@ class LongBag:
             definitions = self._definitions if self._lacks_definitions else ""
             connection.execute(
                 "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
-                (self._key.size, definitions, self._number),
+                (self._bag.key.size, definitions, self._number),
             )
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
@@ -121,7 +130,7 @@ class LongBag:
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
         # Meanwhile it may have been deleted, or another program may store it.
         row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
-        self.goes_on = row is not None and self._is_current()
+        self.goes_on = row is not None and self._bag.is_current()
         return self.goes_on
 
 
@@ -210,10 +219,9 @@ def _messages_of(bag: BagFile) -> int:
     return sum(topic.count for topic in bag.summary.topics)
 
 
-def insert_bag(
-    connection: sqlite3.Connection, key: BagKey, bag: BagFile, definitions: str, *, hashed: bool
-) -> int:
+def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
     """Inserts a bag; returns its number."""
+    key, bag, hashed, _ = to_store
     summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
     times = (bag.start, bag.end, _messages_of(bag))
     cursor = connection.execute(
@@ -226,22 +234,31 @@ def insert_bag(
 
 def insert_bags(
     connection: sqlite3.Connection,
-    bags: Sequence[DecodedBag],
+    decoded: DecodedBags,
     definitions: str,
     layouts: Layouts,
     *,
     whole: bool,
 ) -> list[int]:
     """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
-    tables: dict[int, list[tuple[int, Table]]] = defaultdict(list)
+    lacking = {
+        place
+        for table, bags in decoded.tables
+        if lacks_definitions([table])
+        for place in np.unique(bags).tolist()
+    }
+    numbers = np.array(
+        [
+            insert_bag(connection, to_store, definitions if place in lacking else "")
+            for place, to_store in enumerate(decoded.bags)
+        ],
+        np.int64,
+    )
+    tables: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
-    for bag in bags:
-        needed = definitions if lacks_definitions(bag.tables) else ""
-        number = insert_bag(connection, bag.key, bag.bag, needed, hashed=bag.hashed)
-        for table in bag.tables:
-            topic, layout_of[topic] = topic_of(connection, table, layouts)
-            if len(table):
-                tables[topic].append((number, table))
+    for table, bags in decoded.tables:
+        topic, layout_of[topic] = topic_of(connection, table, layouts)
+        tables[topic].append((table, numbers[bags]))
     packed = {topic: [packed_part(layout_of[topic], some)] for topic, some in tables.items()}
     return insert_parts(connection, packed, whole=whole)
 

@@ -13,7 +13,28 @@ if TYPE_CHECKING:
 
 Ints: TypeAlias = NDArray[np.int64]
 
+Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+
 _MOST_KEYS: Final = 2**62
+
+
+def row_sums(rows: NDArray[np.float64]) -> Floats:
+    """Returns the sum of each row, added from left to right.
+
+    Of rows of two to four numbers; `sum(axis=1)` takes six times as long for these.
+    """
+    sums: Floats = rows[:, 0].copy()
+    for column in rows.T[1:]:
+        sums += column
+    return sums
+
+
+def row_maxima(rows: NDArray[np.float64]) -> Floats:
+    """Returns the greatest number of each row of a few; NaN where it has one."""
+    greatest: Floats = rows[:, 0].copy()
+    for column in rows.T[1:]:
+        np.maximum(greatest, column, out=greatest)
+    return greatest
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:

@@ -246,7 +246,9 @@ def _farthest_of_each(
     squared = (chords * chords).sum(axis=0)
     # A chord that is too short to divide by is a point, as that of a closed loop.
     scale = np.divide(1.0, squared, out=np.zeros(len(squared)), where=squared > _SHORTEST_SQUARED)
-    chord, here = chords[:, of], columns[:, at] - columns[:, starts][:, of]
+    # `columns[:, at]` would be in the order of `at` in memory, which is slow to add up.
+    chord = chords.take(of, axis=1)
+    here = columns.take(at, axis=1) - columns.take(starts, axis=1).take(of, axis=1)
     along = ((here * chord).sum(axis=0) * scale[of]).clip(0.0, 1.0)
     off = ((here - along * chord) ** 2).sum(axis=0)
     # How far along the points before are, of each interval alone: those of a later interval are

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.columns.decode import GROUP_BYTES, decoded
+import numpy as np
+
+from ros2_memory.columns.decode import GROUP_BYTES, decoded, decoded_together, pieces
 from ros2_memory.columns.table import joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -82,6 +84,15 @@ def decoded_alike(reader: BagReader, path: Path) -> Comparison:
     comparison = compared(reader, path, tables_of(reader, path))
     assert comparison.wrong == []
     return comparison
+
+
+def decoded_together_alike(reader: BagReader, paths: Sequence[Path]) -> None:
+    """Bags that are decoded together have the rows that they have alone, and none is missing."""
+    found = decoded_together(reader, [(path, [*pieces(reader, path)]) for path in paths])
+    for nth, path in enumerate(paths):
+        tables = [table.rows(np.flatnonzero(bags == nth)) for table, bags in found]
+        comparison = compared(reader, path, [table for table in tables if len(table)])
+        assert comparison.wrong == []
 
 
 def bag_of(

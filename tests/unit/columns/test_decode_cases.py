@@ -36,7 +36,13 @@ from tests.support.bags import (
 from tests.support.bags import transform as transform_of
 from tests.support.leaves import Comparison
 from tests.support.mcap_surgery import SMALL, chatter, raw_mcap, spoil_chunk
-from tests.unit.columns.decoded_bags import bag_of, compared, decoded_alike, tables_of
+from tests.unit.columns.decoded_bags import (
+    bag_of,
+    compared,
+    decoded_alike,
+    decoded_together_alike,
+    tables_of,
+)
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
@@ -226,6 +232,20 @@ def two_publishers(path: Path) -> Path:
 def test_two_publishers_of_one_topic_are_one_table(tmp_path: Path) -> None:
     [[table]] = decoded(McapReader(), two_publishers(tmp_path / "a.mcap"))
     assert numbers(table, "level") == list(range(9))
+
+
+def test_bags_that_are_decoded_together_have_the_rows_that_they_have_alone(
+    tmp_path: Path, fallbacks: list[str]
+) -> None:
+    big_endian = struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"
+    broken = b"\x00\x01\x00\x00\xff\xff\xff\x7f"
+    odd = [Msg("/chatter", "std_msgs/msg/String", 20 + nth, big_endian) for nth in range(2)]
+    lost = [text(1, "one"), Msg("/chatter", "std_msgs/msg/String", 2, broken), text(3, "three")]
+    messages = [mixed(40), mixed(3), [*mixed(5), *odd], lost, [text(1, "one", "/t")]]
+    paths = [write_mcap(tmp_path / f"{nth}.mcap", some) for nth, some in enumerate(messages)]
+    paths.append(two_publishers(tmp_path / "two.mcap"))
+    decoded_together_alike(McapReader(), paths)
+    assert set(fallbacks) == {"/chatter"}
 
 
 def test_every_one_of_649_topics_has_its_table(tmp_path: Path) -> None:

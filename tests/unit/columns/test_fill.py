@@ -14,11 +14,11 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import fill
-from ros2_memory.columns.decode import decoded, never
+from ros2_memory.columns.decode import decoded_groups, pieces
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer
 
+    from ros2_memory.columns.decode import Piece
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import BagReader, Channel
 
@@ -213,15 +214,15 @@ def test_nothing_is_stored_while_messages_are_taken_out(
 
     def then_erasing(
         reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
-    ) -> Iterator[list[Table]]:
-        yield from decoded(reader, path, hashed=hashed)
+    ) -> Iterator[Piece]:
+        yield from pieces(reader, path, hashed=hashed)
         erasing.write_text("{}")
 
-    monkeypatch.setattr(fill, "decoded", then_erasing)
+    monkeypatch.setattr(fill, "pieces", then_erasing)
     assert world.fill() == 0
     assert count(world, "bag") == 0
     assert world.fill() == 0
-    monkeypatch.setattr(fill, "decoded", decoded)
+    monkeypatch.setattr(fill, "pieces", pieces)
     erasing.unlink()
     assert world.fill() == 1
 
@@ -330,20 +331,27 @@ def test_a_bag_that_is_larger_than_the_store_may_be_is_not_tried(tmp_path: Path)
 # Long bags
 
 
-def in_groups(
-    reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool] = never
-) -> Iterator[list[Table]]:
+def in_groups(reader: BagReader, read: Iterator[Piece]) -> Iterator[list[Table]]:
     """Decodes a bag in five goes, as one of many gigabytes."""
-    summary = reader.summarize(path)
-    step = (summary.end - summary.start) // 5 + 1
-    for start in range(summary.start, summary.end + 1, step):
-        yield from decoded(reader, path, TimeWindow(start, start + step), hashed=hashed)
+    whole = [*read]
+    first = min(int(piece.batch.log_times.min()) for piece in whole)
+    last = max(int(piece.batch.log_times.max()) for piece in whole)
+    step = (last - first) // 5 + 1
+    for start in range(first, last + 1, step):
+        part = [
+            piece._replace(batch=piece.batch.taken(inside))
+            for piece in whole
+            for inside in [(piece.batch.log_times - start) // step == 0]
+            if inside.any()
+        ]
+        yield from decoded_groups(reader, iter(part))
 
 
 @pytest.fixture
 def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bags are decoded in several goes, however small they are."""
-    monkeypatch.setattr(fill, "decoded", in_groups)
+    monkeypatch.setattr(fill, "decoded_groups", in_groups)
+    monkeypatch.setattr(fill, "LARGE_BYTES", 0)
 
 
 def write_long_bag(bag_dir: Path, rows: int = 60) -> Path:
@@ -449,10 +457,8 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
     world = World.of(tmp_path)
     halves: list[int] = []
 
-    def with_fault(
-        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
-    ) -> Iterator[list[Table]]:
-        for nth, group in enumerate(in_groups(reader, path, hashed=hashed)):
+    def with_fault(reader: BagReader, read: Iterator[Piece]) -> Iterator[list[Table]]:
+        for nth, group in enumerate(in_groups(reader, read)):
             if nth == 3:
                 halves.append(count(world, "part"))
                 assert world.stored() == set()
@@ -462,7 +468,7 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
                 (tmp_path / ERASING_FILE).write_text("{}")
             yield group
 
-    monkeypatch.setattr(fill, "decoded", with_fault)
+    monkeypatch.setattr(fill, "decoded_groups", with_fault)
     world.fill()
     assert halves[0] > 0
     assert (count(world, "part"), count(world, "part_column"), count(world, "bag")) == (0, 0, 0)
@@ -473,15 +479,15 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     write_long_bag(tmp_path)
     one = World.of(tmp_path)
     [bag] = one.memory.index.snapshot().bags
-    groups = in_groups(one.memory.reader, bag.path)
+    groups = in_groups(one.memory.reader, pieces(one.memory.reader, bag.path))
 
     def deleted_meanwhile() -> Iterator[list[Table]]:
         yield next(groups)
         forget(store_file(tmp_path), tmp_path, ["rec/rec_0.mcap"])
         yield from groups
 
-    key = one.filling._key(bag)
-    assert not one.store.put_long(key, bag, deleted_meanwhile(), hashed=False, budget=10**6)
+    to_store = ReadBag(one.filling._key(bag), bag)
+    assert not one.store.put_long(to_store, deleted_meanwhile(), budget=10**6)
     assert (count(one, "part"), count(one, "bag")) == (0, 0)
 
 
@@ -512,11 +518,11 @@ def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
     ]
     names: list[str] = []
 
-    def counting(reader: BagReader, path: Path, **options: object) -> Iterator[list[Table]]:
+    def counting(reader: BagReader, path: Path, **options: object) -> Iterator[Piece]:
         names.append(path.name)
-        return decoded(reader, path, **options)  # type: ignore[arg-type]
+        return pieces(reader, path, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(fill, "decoded", counting)
+    monkeypatch.setattr(fill, "pieces", counting)
     for number, (handover, stored) in enumerate(steps):
         if handover is not None:
             write_handover(folder, handover)

@@ -188,6 +188,17 @@ def test_decimals_in_single_precision_are_exact_and_small() -> None:
     assert len(compressed(packed.data)) < 400
 
 
+@pytest.mark.parametrize("first", [0, 2**62])
+def test_long_planes_are_compressed_apart_and_come_back(first: int) -> None:
+    draw = np.random.default_rng(3)
+    jittered = first + np.arange(2000) * 20_000_000 + draw.integers(0, 400_000, 2000)
+    for column in (jittered, Texts.of([f"word {number % 300}" for number in jittered.tolist()])):
+        packed = pack(column)
+        blob = compressed(packed.data, packed.plane)
+        assert decompressed(blob) == packed.data
+        assert len(blob) < len(compressed(packed.data)) or isinstance(column, Texts)
+
+
 def test_regular_times_take_next_to_nothing() -> None:
     stamps = 1_768_176_000_000_000_000 + np.arange(500) * 20_000_000
     assert len(pack(stamps).data) <= 8

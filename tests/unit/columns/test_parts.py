@@ -67,7 +67,8 @@ def table(rows: int = 40, first: int = 0) -> Table:
 def part(*given: Table) -> StoredTable:
     """The tables as they come back from a part."""
     layout = Layout.of(given[0], None)
-    packed = packed_part(layout, [*enumerate(given)]).columns
+    numbered = [(one, np.full(len(one), number)) for number, one in enumerate(given)]
+    packed = packed_part(layout, numbered).columns
 
     def load(path: str) -> Column:
         one = packed[path]
@@ -151,7 +152,7 @@ def test_a_part_of_one_row_comes_back() -> None:
 def test_a_table_of_another_layout_is_refused() -> None:
     layout = Layout.of(table(), None)
     with pytest.raises(ValueError, match="other columns"):
-        packed_part(Layout(layout.columns, layout.sequences), [(1, table())])
+        packed_part(Layout(layout.columns, layout.sequences), [(table(), np.ones(40, np.int64))])
 
 
 def test_layouts_read_what_they_write() -> None:

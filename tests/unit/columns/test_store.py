@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, NoReturn
 import numpy as np
 import pytest
 
+from ros2_memory.columns.decode import BagRows
 from ros2_memory.columns.pack import FORMAT, decompressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import GoneError
-from ros2_memory.columns.writing import DecodedBag
+from ros2_memory.columns.writing import DecodedBags, ReadBag
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import (
     battery,
@@ -155,8 +156,9 @@ def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
     times = bag.start + np.arange(3)
     channel = Channel("/kinds", "cdr", Schema("a_msgs/msg/Kinds"))
     table = Table(channel, times, times, np.arange(3), numbers)
-    stored = DecodedBag(world.filling._key(bag), bag, [table])
-    assert world.store.put([stored], whole=True).bags == 1
+    to_store = ReadBag(world.filling._key(bag), bag)
+    stored = DecodedBags([to_store], [BagRows(table, np.zeros(3, np.int64))])
+    assert world.store.put(stored, whole=True).bags == 1
     timeline = world.memory.index.snapshot().timeline
     scanner = Scanner(world.store, tmp_path)
     coverage = scanner.coverage(timeline)

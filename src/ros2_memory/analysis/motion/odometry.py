@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.motion.path_length import FEWEST, SPEED_STEPS, End, measured
+from ros2_memory.core.arrays import row_sums
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 
@@ -362,7 +363,7 @@ def measured_path(times: Times, positions: Rows, fastest_mps: float) -> Measured
     """
     motion, parted, steps_m = Motion(fastest_mps), [], np.zeros(len(times) - 1)
     apart = np.diff(times)
-    plain_m = np.sqrt((np.diff(positions, axis=0) ** 2).sum(axis=1))
+    plain_m = np.sqrt(row_sums(np.diff(positions, axis=0) ** 2))
     begin = 0
     for index in _odd_steps(apart, plain_m, fastest_mps):
         sides = (

@@ -34,6 +34,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.core.geometry import distance
 
 if TYPE_CHECKING:
@@ -171,7 +172,7 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
         positions: x, y and z (m) of each as a row; at least one.
     """
     points = positions - positions[0]
-    plain = np.sqrt((np.diff(points, axis=0) ** 2).sum(axis=1))
+    plain = np.sqrt(row_sums(np.diff(points, axis=0) ** 2))
     total = math.fsum(plain.tolist())
     apart = np.diff(seconds)
     if len(points) < FEWEST:
@@ -186,7 +187,7 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
         lengths, as_plain = plain, ~stationary
     x, y, z = positions[0].tolist()
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
-    reach = _LEFT * math.sqrt(2 / averaged) * noise.max(axis=1)
+    reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
     creeps = [
         (begin, end, _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z)))
         for begin, end in _rows(stationary)
@@ -200,7 +201,7 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
     before = next((creep for begin, _, creep in creeps if begin == 0), None)
     after = next((creep for _, end, creep in creeps if end == len(plain)), None)
     inside = [creep.length_m for begin, end, creep in creeps if begin > 0 and end < len(plain)]
-    spread = np.sqrt((noise**2).sum(axis=1))
+    spread = np.sqrt(row_sums(noise**2))
     return Measured(
         total if as_plain.all() else math.fsum([*moved.tolist(), *inside]),
         total,
@@ -223,7 +224,7 @@ def _noise(points: Rows) -> Rows:
 def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, Marks]:
     """Returns the length of each step, whether it is the plain one, and whether it is noise."""
     variance = (noise[1:] ** 2 + noise[:-1] ** 2) / 2
-    whole = variance.sum(axis=1)
+    whole = row_sums(variance)
     lengths = np.zeros(len(plain))
     as_plain = np.zeros(len(plain), dtype=bool)
     unsettled = np.ones(len(plain), dtype=bool)
@@ -232,10 +233,10 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
         if width > len(points) or not unsettled.any():
             break
         slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
-        square = (slopes**2).sum(axis=1)
+        square = row_sums(slopes**2)
         energy = _moving_mean(square[:, None], _SLOPE_SPAN)[:, 0]
         share = 12 / (width * (width * width - 1)) * whole
-        along = (variance * slopes**2).sum(axis=1) / np.where(square > 0, square, 1.0)
+        along = row_sums(variance * slopes**2) / np.where(square > 0, square, 1.0)
         across = 12 / (width * (width * width - 1)) * (whole - along)
         settled = unsettled & (energy >= _CLEAR * share)
         if width == 2:
@@ -255,7 +256,7 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
 def _scatters(points: Rows, places: Rows, noise: Rows) -> Marks:
     """Returns at which steps the positions spread around one place as far as their noise does."""
     spread = _moving_mean(points**2, _MEAN_SPAN) - places**2
-    ratio = spread.sum(axis=1) / np.maximum((noise**2).sum(axis=1), 1e-300)
+    ratio = row_sums(spread) / np.maximum(row_sums(noise**2), 1e-300)
     low, high = _SPREAD
     around: Marks = (low * low <= ratio) & (ratio <= high * high)
     both: Marks = around[1:] & around[:-1]
@@ -294,7 +295,7 @@ def _creep(places: Rows, reach: Numbers, origin: Vector3) -> Creep:
     found = [0]
     while True:
         at = found[-1]
-        off = np.sqrt(((places[at:] - places[at]) ** 2).sum(axis=1)) > reach[at:]
+        off = np.sqrt(row_sums((places[at:] - places[at]) ** 2)) > reach[at:]
         if not off.any():
             break
         found.append(at + int(off.argmax()))

@@ -36,6 +36,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop, speed_drops
+from ros2_memory.core.arrays import row_sums
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -303,7 +304,7 @@ class _Slots:
         inside = slot[2:] == slot[:-2]
         counts = np.maximum(self.counts - 2, 0)
         stops = np.cumsum(counts)
-        return (bends * bends).sum(axis=1)[inside], stops - counts, stops
+        return row_sums(bends * bends)[inside], stops - counts, stops
 
     @cached_property
     def noises(self) -> Floats:
@@ -356,7 +357,7 @@ class _Slots:
 
 
 def _lengths(vectors: Vectors) -> Floats:
-    found: Floats = np.sqrt((vectors * vectors).sum(axis=1))
+    found: Floats = np.sqrt(row_sums(vectors * vectors))
     return found
 
 

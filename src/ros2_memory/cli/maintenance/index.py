@@ -117,7 +117,7 @@ def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None =
         def show(progress: Progress) -> None:
             bar.update(task, completed=progress.stored, total=progress.closed)
 
-        return fill_store(backfill, show)
+        return _filled(backfill, show)
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -126,7 +126,7 @@ def _fill_for_server(settings: Settings, server: int) -> None:
     configure_logging(
         settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
     )
-    fill_store(_low_priority_backfill(settings))
+    _filled(_low_priority_backfill(settings))
 
 
 def _low_priority_backfill(settings: Settings) -> Backfill:
@@ -140,6 +140,15 @@ def _low_priority_backfill(settings: Settings) -> Backfill:
 def _cache_mb(settings: Settings) -> int:
     """Returns what a cache may take, in MiB: little, since each bag is read and unpacked once."""
     return min(_CACHE_MB, settings.reader.chunk_cache_mb)
+
+
+def _filled(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:
+    """Fills the store, and closes it, so that nothing stays in its write-ahead log."""
+    try:
+        return fill_store(backfill, show)
+    finally:
+        if backfill.filling is not None:
+            backfill.filling.store.close()
 
 
 def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:
