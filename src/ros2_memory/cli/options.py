@@ -391,9 +391,8 @@ def day_of(memory: "Memory", day: str | None) -> TimeWindow:
     now = present(memory) if day is not None or newest is None else newest
     at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
     date = datetime.fromtimestamp(at).astimezone().date()
-    begin, end = (
-        datetime.combine(each, time.min).timestamp() for each in (date, date + timedelta(days=1))
-    )
+    days = (date, date + timedelta(days=1))
+    begin, end = (datetime.combine(day, time.min).timestamp() for day in days)
     return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
 
 
@@ -423,13 +422,13 @@ class Bags:
         others = self.words or []
         if not Path(first).exists() or any(map(is_folder, others)):
             return first, self
-        topic = next((each for each in others if "=" not in each), None)
+        topic = next((word for word in others if "=" not in word), None)
         if topic is None:
             kind = "folder" if Path(first).is_dir() else "file"
             raise InvalidArgumentsError(
                 f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
             )
-        return topic, replace(self, words=[first, *(each for each in others if each != topic)])
+        return topic, replace(self, words=[first, *(word for word in others if word != topic)])
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -182,11 +182,9 @@ def plot_path(
     bags: Bags,
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
-    _check(out)
+    asked = _asked(out, bags, times)
     from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = bags.memory()
-    asked = opened(memory, times.window(memory))
     with spinner("looking for the path"):
         path = path_in(asked, topic, frame)
         stops = path.stops(asked.recap())
@@ -214,12 +212,10 @@ def plot_signal(
     bags: Bags,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
-    _check(out)
     topic, bags = bags.with_topic(topic, "plot signal")
+    asked = _asked(out, bags, times)
     from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = bags.memory()
-    asked = opened(memory, times.window(memory))
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         total, signals, notes = signals_of(asked, name, field or ())
@@ -233,11 +229,9 @@ def plot_signal(
 @as_command("plot timeline")
 def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
-    _check(out)
+    asked = _asked(out, bags, times)
     from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
 
-    memory = bags.memory()
-    asked = opened(memory, times.window(memory))
     with spinner("looking what was recorded when"):
         found = asked.recap()
         rows = [*event_rows(asked, found), *topic_rows(asked)]
@@ -265,13 +259,11 @@ def plot_recap(
     bags: Bags,
 ) -> None:
     """Draw a day in one picture: where the robot drove, what happened, what was recorded."""
-    _check(out)
-    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
-
-    memory = bags.memory()
     if day is not None and times != Times():
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
-    asked = opened(memory, day_of(memory, day) if times == Times() else times.window(memory))
+    asked = _asked(out, bags, times if times != Times() else day)
+    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
+
     with spinner("recalling the day"):
         found = asked.recap()
         rows = event_rows(asked, found)
@@ -286,8 +278,8 @@ def plot_recap(
     _finish(out, () if found is None else found.notes, as_json=as_json)
 
 
-def _check(out: Path) -> None:
-    """Checks that a picture of that name can be drawn.
+def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
+    """Returns what is asked for, in a window or on a day; checks that it can be drawn.
 
     Raises:
         ConfigError: the optional dependency is missing.
@@ -300,6 +292,8 @@ def _check(out: Path) -> None:
     if out.suffix.lower() not in FORMATS:
         kinds = ", ".join(FORMATS)
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
+    memory = bags.memory()
+    return opened(memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when))
 
 
 def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:

@@ -212,20 +212,22 @@ def _write(
 
     Returns how many; collects types without a definition.
     """
-    profile = profile_of(view, [*spans], TimeWindow.everything(), ())
-
-    def written(path: Path, messages: Iterator[StoredMessage]) -> int:
-        return write_mcap(path, with_definitions(messages, view.memory.reader, undefined), profile)
-
-    if path.suffix == ".mcap":
-        return written(path, _messages(view, spans, TimeWindow.everything()))
-    count = 0
-    for nth, (recording, window) in enumerate(parts):
-        folder = path / recording.relative_to(view.memory.index.bag_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        found = (at for at in _messages(view, spans, window) if at.bag.recording == recording)
+    profile, count = profile_of(view, [*spans], TimeWindow.everything(), ()), 0
+    whole = [(None, TimeWindow.everything())]
+    for nth, (recording, window) in enumerate(whole if path.suffix == ".mcap" else parts):
+        file = path
+        if recording is not None:
+            folder = path / recording.relative_to(view.memory.index.bag_dir)
+            folder.mkdir(parents=True, exist_ok=True)
+            file = folder / f"{recording.name}_{nth}.mcap"
+        found = (
+            stored
+            for stored in _messages(view, spans, window)
+            if recording in (None, stored.bag.recording)
+        )
         with suppress(NoDataError):  # all that it has, another recording has too
-            count += written(folder / f"{recording.name}_{nth}.mcap", found)
+            defined = with_definitions(found, view.memory.reader, undefined)
+            count += write_mcap(file, defined, profile)
     return count
 
 

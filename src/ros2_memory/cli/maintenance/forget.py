@@ -112,12 +112,12 @@ def forget(
         if problem := memory.index.snapshot().problem:
             raise RecorderError(problem)
         window = times.window(memory)
-        work = _Forget(settings, memory, asks=not yes, dry_run=dry_run)
+        work = _Forget(settings, memory, dry_run=dry_run)
         work.finish_erasure()
         if topic or where is not None:
-            work.erase(work.wanted(window, topic or (), where))
+            work.erase(work.wanted(window, topic or (), where), asks=not yes)
         else:
-            work.delete_bags(window)
+            work.delete_bags(window, asks=not yes)
         return work.leaves_some
 
 
@@ -127,18 +127,16 @@ class _Forget:
     Args:
         settings: of this deployment.
         memory: over its bags.
-        asks: whether the user is asked before something is deleted.
         dry_run: whether it only reports what it would do.
 
     Attributes:
         leaves_some: whether something stays that was to go.
     """
 
-    def __init__(self, settings: Settings, memory: Memory, *, asks: bool, dry_run: bool) -> None:
+    def __init__(self, settings: Settings, memory: Memory, *, dry_run: bool) -> None:
         self.leaves_some = False
         self._settings = settings
         self._memory = memory
-        self._asks = asks
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
         self._reader = build_reader(settings)  # reads files as they are
@@ -175,9 +173,7 @@ class _Forget:
             ends = TimeWindow(begun.windows[0][0], begun.windows[-1][1]).asked()
             topics, span = listed(begun.topics), _span(*ends)
             print_line(f"an earlier forget was interrupted: {topics} {span}")
-            asks, self._asks = self._asks, False
-            self.erase(begun)
-            self._asks = asks
+            self.erase(begun, asks=False)
 
     def wanted(self, window: TimeWindow, globs: Sequence[str], where: str | None) -> Erasure:
         """Returns which messages are to go, and prints which of those asked for stay.
@@ -216,8 +212,8 @@ class _Forget:
             topics -= latched
         return Erasure.of(topics, windows, topics & latched)
 
-    def erase(self, erasure: Erasure) -> None:
-        """Takes messages out of bags, after asking."""
+    def erase(self, erasure: Erasure, *, asks: bool) -> None:
+        """Takes messages out of bags; `asks`: whether the user is asked before."""
         survey = Survey((), ())
         if erasure.topics and erasure.windows:
             with spinner("looking which bags hold some"):
@@ -234,7 +230,7 @@ class _Forget:
             f"rewriting {counted(len(survey.holders), 'bag')} ({size / MB:.1f} MB)"
         )
         rows = [f"{topic}: {counted(count, 'message')}" for topic, count in sorted(counts.items())]
-        if not self._confirmed(what, rows):
+        if not self._confirmed(what, rows, asks=asks):
             return
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             if recorder is not None and self._recorder is None:
@@ -249,8 +245,8 @@ class _Forget:
         for note in result.notes:
             print_line(note)
 
-    def delete_bags(self, window: TimeWindow) -> None:
-        """Deletes the bags that lie inside a window, after asking."""
+    def delete_bags(self, window: TimeWindow, *, asks: bool) -> None:
+        """Deletes the bags that lie inside a window; `asks` as above."""
         going, kept = self._planned(window)
         self._stays([*kept, *self._kept_elsewhere(going, window)])
         if not going:
@@ -265,15 +261,15 @@ class _Forget:
         first, last = min(bag.start for bag in going), max(bag.end for bag in going)
         size = sum(bag.size for bag in going)
         what = f"{counted(len(going), 'bag')}, {size / MB:.1f} MB, {_span(first, last)}"
-        if self._confirmed(what, map(self._name, going) if self._dry_run else ()):
+        if self._confirmed(what, map(self._name, going) if self._dry_run else (), asks=asks):
             self._delete(going)
 
-    def _confirmed(self, what: str, rows: Iterable[str]) -> bool:
+    def _confirmed(self, what: str, rows: Iterable[str], *, asks: bool) -> bool:
         """Prints what is to go, and returns whether it goes."""
         print_line(f"{'would' if self._dry_run else 'to'} be deleted: {what}")
         for row in rows:
             print_line(f"  {row}")
-        if self._asks and not self._dry_run:
+        if asks and not self._dry_run:
             typer.confirm("Delete them? This cannot be undone.", abort=True)
         return not self._dry_run
 
