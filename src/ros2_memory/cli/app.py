@@ -58,7 +58,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         {0: "there are bags", 1: "there are none"},
     ),
     "recordings": CommandEntry(
-        "listing.recordings.recordings",
+        "listing.info.recordings",
         "every recording: start, length, size, storage, maker",
         {0: "recordings are listed", 1: "there are none"},
     ),
@@ -71,7 +71,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         },
     ),
     "plot": CommandEntry(
-        "plot.commands.plot",
+        "plot.plot",
         "draw the path, a signal, the timeline or the recap of a day",
         {0: "the picture is written", 2: "it is not (stderr gives the reason)"},
     ),
@@ -210,7 +210,7 @@ class LazyCommand(TyperCommand):
         if parent is not None and parent.params.get("verbose") and _takes(command, "verbose"):
             args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
-            args = [TOOL_HELP if each in _HELP else each for each in args]
+            args = [TOOL_HELP if word in _HELP else word for word in args]
         if self._name == "plot" and args and args[0] not in _PICTURES and Path(args[0]).exists():
             picture = args.pop(1) if args[1:] and args[1] in _PICTURES else _PICTURES[0]
             args = [picture, *args]
@@ -235,7 +235,7 @@ def _takes(command: "Command", option: str) -> bool:
     """Returns whether a command has an option; of a group, whether its commands have it."""
     commands = getattr(command, "commands", None)
     of_all = [*commands.values()] if commands else [command]
-    return all(any(each.name == option for each in one.params) for one in of_all)
+    return all(option in [parameter.name for parameter in one.params] for one in of_all)
 
 
 def epilog(command: str) -> str:
@@ -296,22 +296,14 @@ def demo(
     as_json: Annotated[
         bool, typer.Option("--json", help="Print a line of JSON for each question.")
     ] = False,
-) -> None:
+) -> int:
     """Simulate a robot, record it, and ask the server questions about it.
 
     Every answer is checked against what the robot did. Needs no ROS and no configuration.
     """
     # Imported here, so that no other command waits for the demo's libraries.
-    from ros2_memory.cli.options import print_line  # noqa: PLC0415
+    from ros2_memory.cli.output import print_line  # noqa: PLC0415
     from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
 
-    options = DemoOptions(
-        once=once,
-        port=port,
-        bag_dir=bag_dir,
-        duration_s=duration,
-        verbose=verbose,
-        as_json=as_json,
-    )
-    code = run_demo(options, print_line)
-    raise typer.Exit(code)
+    options = DemoOptions(once, port, bag_dir, duration, verbose, as_json)
+    return run_demo(options, print_line)

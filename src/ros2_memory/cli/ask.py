@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Final
@@ -13,7 +14,6 @@ from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.app import TOOL_HELP
 from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
     AsJson,
     BagDir,
     Recording,
@@ -26,11 +26,8 @@ from ros2_memory.cli.options import (
     parse_duration,
     parse_time,
     present,
-    print_line,
-    spinner,
-    stdout_console,
 )
-from ros2_memory.cli.output import print_reply
+from ros2_memory.cli.output import print_line, print_reply, spinner, stdout_console
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -50,7 +47,6 @@ _SETTING: Final = re.compile(
 """A word that sets a setting; no argument of a tool is named so."""
 _MOST_ROWS: Final = 10
 """Waypoints that text shows."""
-_RECAP: Final = "recap"
 _TIMES_OF_RECAP: Final = ("last_s", "start", "end", "around")
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
@@ -85,7 +81,7 @@ def ask(
     settings: Sets = None,
     verbose: Verbose = False,
     tool_help: Annotated[bool, typer.Option(TOOL_HELP, hidden=True)] = False,
-) -> None:
+) -> bool:
     """Call any tool of the query server, without a server.
 
     Values are read as JSON if they are JSON (seconds_ago=10, value=true), else as text. You can
@@ -94,32 +90,31 @@ def ask(
     """
     if tool is not None and tool_help:
         _print_help(tool)
-        return
-    words = [*(given or ())]
-    if tool is not None and _SETTING.fullmatch(tool):
-        tool, words = None, [tool, *words]
-    if tool is not None and is_folder(tool) and tool not in complete(tool):
-        path, (tool, *words) = tool, words or [None]
-        words.append(path)
-    of_settings = [each for each in words if _SETTING.fullmatch(each) or is_folder(each)]
-    loaded = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
+        return False
+    words = [word for word in (tool, *(given or ())) if word is not None]
+    of_settings = [
+        word
+        for word in words
+        if _SETTING.fullmatch(word)
+        or (is_folder(word) and not (word == tool and word in complete(word)))
+    ]
+    name, *rest = [word for word in words if word not in of_settings] or [None]
+    loaded, _ = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
-    tools = {each.name: each for each in dispatcher.tools}
-    if tool is None:
-        rows: list[JsonValue] = [_tool_row(each) for each in dispatcher.tools]
+    tools = {known.name: known for known in dispatcher.tools}
+    if name is None:
+        rows = [_tool_row(known) for known in dispatcher.tools]
         if as_json:
             print_line(json.dumps(rows))
         else:
             print_reply(stdout_console(), rows)
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
-        return
-    arguments = question_for(
-        memory, tool, tools.get(tool), [each for each in words if each not in of_settings]
-    )
-    with spinner(f"asking {tool}"):
-        (reply,) = call_tools(dispatcher, {tool: arguments})
+        return False
+    arguments = question_for(memory, name, tools.get(name), [word for word in rest if word])
+    with spinner(f"asking {name}"):
+        (reply,) = call_tools(dispatcher, {name: arguments})
     answer: JsonValue = json.loads(reply.text)
     if as_json:
         print_line(reply.text)
@@ -127,10 +122,9 @@ def ask(
         print_line(NEVER)
     else:
         print_reply(stdout_console(), _without_waypoints(answer), unix_from_ns(present(memory)))
-    if tool not in tools:
-        typer.echo(f"tools: {', '.join(tools)}", err=True)
-    if reply.is_error or is_error(answer):
-        raise typer.Exit(EXIT_NEGATIVE)
+    if name not in tools:
+        print(f"tools: {', '.join(tools)}", file=sys.stderr)
+    return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
 def question_for(
@@ -138,20 +132,17 @@ def question_for(
 ) -> dict[str, object]:
     """Returns the arguments for a tool, from the words of the command line.
 
+    A `recap` without a time is that of the newest day.
+
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
     """
     known = {} if tool is None else tool.arguments
     arguments = with_times(parse_arguments(words, known), known, unix_from_ns(present(memory)))
-    return arguments | _newest_day(memory, name, arguments)
-
-
-def _newest_day(memory: Memory, tool: str, arguments: Mapping[str, object]) -> dict[str, object]:
-    """Returns the time of a `recap` that was asked without one: the newest day."""
-    if tool != _RECAP or not arguments.keys().isdisjoint(_TIMES_OF_RECAP):
-        return {}
-    start, end = day_of(memory, None).asked()
-    return {"start": unix_from_ns(start), "end": unix_from_ns(end)}
+    if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
+        first, last = day_of(memory, None).asked()
+        arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
+    return arguments
 
 
 def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]) -> list[Reply]:
@@ -164,11 +155,6 @@ def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]
         return anyio.run(replies)
     finally:
         dispatcher.stop()
-
-
-def is_error(reply: JsonValue) -> bool:
-    """Returns whether a reply only says why there is no answer."""
-    return isinstance(reply, dict) and "error" in reply
 
 
 def parse_arguments(given: Sequence[str], known: Mapping[str, JsonObject]) -> dict[str, object]:
@@ -216,7 +202,7 @@ def _in_seconds(value: object, schema: object, now: float) -> object:
         schema.get(key) if isinstance(schema, dict) else None for key in ("type", "items")
     )
     if isinstance(value, list):
-        return [_in_seconds(each, items, now) for each in value]
+        return [_in_seconds(inner, items, now) for inner in value]
     if isinstance(value, str) and kind == "array":
         return _in_seconds(value, items, now)
     if isinstance(value, str) and kind == "number":
@@ -240,7 +226,7 @@ def _from_json(text: str, otherwise: str | None) -> JsonValue:
 def _takes_text(schema: JsonObject) -> bool:
     several = schema.get("anyOf")
     forms = several if isinstance(several, list) else []
-    kinds = [each.get("type") for each in forms if isinstance(each, dict)]
+    kinds = [form.get("type") for form in forms if isinstance(form, dict)]
     # A list in place of one text is read from its JSON by the argument itself.
     return schema.get("type") == "string" or kinds == ["string", "array"]
 
@@ -248,17 +234,12 @@ def _takes_text(schema: JsonObject) -> bool:
 def _without_waypoints(answer: JsonValue) -> JsonValue:
     """Returns a reply with the number of its waypoints in their place, if they are many."""
     waypoints = answer.get("waypoints") if isinstance(answer, dict) else None
-    if not isinstance(answer, dict) or not isinstance(waypoints, list):
-        return answer
-    if len(waypoints) <= _MOST_ROWS:
-        return answer
-    first, *_, last = waypoints
-    shown: dict[str, JsonValue] = {
-        "first_waypoint": first,
-        "last_waypoint": last,
-        "more_waypoints": f"{len(waypoints) - 2} (--json prints them, `plot path` draws them)",
-    }
-    return {key: each for key, each in answer.items() if key != "waypoints"} | shown
+    if isinstance(answer, dict) and isinstance(waypoints, list) and len(waypoints) > _MOST_ROWS:
+        rest = {key: value for key, value in answer.items() if key != "waypoints"}
+        more = f"{len(waypoints) - 2} (--json prints them, `plot path` draws them)"
+        ends = {"first_waypoint": waypoints[0], "last_waypoint": waypoints[-1]}
+        return rest | ends | {"more_waypoints": more}
+    return answer
 
 
 def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:
@@ -284,7 +265,7 @@ def _print_help(name: str) -> None:
     Raises:
         InvalidArgumentsError: there is no such tool.
     """
-    tools = {each.name: each for each in build_tools(QuerySettings(), writing=True)}
+    tools = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
     if name not in tools:
         raise InvalidArgumentsError(f"there is no tool {name}; the tools are {', '.join(tools)}")
     tool = tools[name]

@@ -3,7 +3,8 @@
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -11,14 +12,8 @@ import typer
 import yaml
 
 from ros2_memory.cli.app import epilog
-from ros2_memory.cli.options import (
-    AsJson,
-    BagDir,
-    Words,
-    as_command,
-    load_given,
-    print_line,
-)
+from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_given
+from ros2_memory.cli.output import leaves, print_line
 from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.errors import ConfigError
@@ -44,27 +39,23 @@ def config_show(
     Names of sections or keys, such as server or server.port, show those alone. A comment shows
     whether the server has a token, never the token itself.
     """
-    given = words or []
-    named = [each for each in given if re.fullmatch(r"[a-z_][\w.]*", each)]
-    rest = [each for each in given if each not in named]
-    settings, source = load_given(bag_dir, rest)
-    values = _chosen(dict(_keys(plain_values(settings))), named)
+    named = [word for word in words or () if re.fullmatch(r"[a-z_][\w.]*", word)]
+    settings, source = load_given(bag_dir, [word for word in words or () if word not in named])
+    values = _chosen(dict(leaves(plain_values(settings))), named)
     if as_json:
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
         print_line(json.dumps(rows if sources else values))
-        return
-    if sources:
-        for line in _lines_with_sources(values, source, with_groups=not named):
-            print_line(line)
-        return
-    sections: dict[str, dict[str, JsonValue]] = {}
-    for key, value in values.items():
-        section, _, name = key.partition(".")
-        sections.setdefault(section, {})[name] = value
-    print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
-    for name in () if named else ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
-        if os.environ.get(name):
-            print_line(f"# {name} is set: {_MASK}")
+    elif sources:
+        _print_sources(values, source, () if named else GROUPS)
+    else:
+        sections: dict[str, dict[str, JsonValue]] = {}
+        for key, value in values.items():
+            section, _, name = key.partition(".")
+            sections.setdefault(section, {})[name] = value
+        print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
+        for name in () if named else ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
+            if os.environ.get(name):
+                print_line(f"# {name} is set: {_MASK}")
 
 
 def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[str, JsonValue]:
@@ -73,49 +64,36 @@ def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[st
     Raises:
         ConfigError: there is no such section or key.
     """
-    for name in named:
-        if not any(f"{key}.".startswith(f"{name}.") for key in values):
+    if not named:
+        return values
+    of_name = {name: [key for key in values if f"{key}.".startswith(f"{name}.")] for name in named}
+    for name, keys in of_name.items():
+        if not keys:
             sections = ", ".join(dict.fromkeys(key.partition(".")[0] for key in values))
             raise ConfigError(
                 f"{name}: there is no such section or key; the sections are {sections} "
                 "(to change a setting, write key=value)"
             )
-    return {
-        key: value
-        for key, value in values.items()
-        if not named or any(f"{key}.".startswith(f"{name}.") for name in named)
-    }
+    chosen = {*chain(*of_name.values())}
+    return {key: value for key, value in values.items() if key in chosen}
 
 
-def _lines_with_sources(
-    values: Mapping[str, JsonValue], source: Sources, *, with_groups: bool
-) -> Iterator[str]:
-    """Yields a line for each group's choice and for each key: its name, who set it, its value.
+def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Iterable[str]) -> None:
+    """Prints a line for each group's choice and for each key: its name, who set it, its value.
 
     A key of a group that only takes over another key's value names that one as its source.
     """
-    yield f"# files are those of {source.folder}"
-    rows: list[tuple[str, str, str]] = []
-    for group in GROUPS if with_groups else ():
-        option, who = source.choice(group)
-        rows.append((group, _shortened_source(who, source.folder), option or "null"))
+    print_line(f"# files are those of {source.folder}")
+    found = [(group, *source.choice(group)) for group in groups]
+    rows = [(group, who, option or "null") for group, option, who in found]
     for key, value in values.items():
-        who = _shortened_source(source(key), source.folder)
-        rows.append((key, who, value if isinstance(value, str) else json.dumps(value)))
-    key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))
-    for key, who, text in rows:
-        yield f"{key:<{key_width}}  {who:<{source_width}}  {text}"
+        rows.append((key, source(key), value if isinstance(value, str) else json.dumps(value)))
+    shown = [(key, _shortened_source(who, source.folder), text) for key, who, text in rows]
+    key_width, source_width = (max(len(row[column]) for row in shown) for column in (0, 1))
+    for key, who, text in shown:
+        print_line(f"{key:<{key_width}}  {who:<{source_width}}  {text}")
 
 
 def _shortened_source(who: str, folder: Path) -> str:
     file, link, other = who.partition(", as ")
     return f"as {other}" if link else file.replace(f"in {folder}/", "")
-
-
-def _keys(section: Mapping[str, JsonValue], prefix: str = "") -> Iterator[tuple[str, JsonValue]]:
-    """Yields every key with its value. None is a secret: the configuration holds no token."""
-    for name, value in section.items():
-        if isinstance(value, dict):
-            yield from _keys(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -17,7 +17,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
 from ros2_memory.bootstrap_lake import lake_location
-from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
+from ros2_memory.cli.findings import Examined, Finding, error, ok, warning
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import ConfigError, LakeError
 from ros2_memory.core.model import BagState
@@ -48,11 +48,12 @@ def check_shipping(robot: Examined) -> Iterator[Finding]:
         yield error(seen, "correct its permissions: until then no bag is shipped")
         return
     closed = [
-        (relative(bag.file, str(bag_dir)), bag)
+        (name, bag)
         for bag in snapshot.bags
         if bag.state is BagState.CLOSED and not is_carried(bag.path)
+        for name in [relative(bag.file, str(bag_dir))]
+        if not name.startswith(f"{MOMENTS_FOLDER}/")
     ]
-    closed = [each for each in closed if not each[0].startswith(f"{MOMENTS_FOLDER}/")]
     waiting = [bag for name, bag in closed if not is_shipped(receipts, name, bag.size)]
     newest = max((each.at for each in receipts.values()), default=None)
     count = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
@@ -124,5 +125,5 @@ def _check_receipts(name: str, bag_dir: Path) -> Iterator[Finding]:
                     "retention.require_shipped can never work on that robot"
                 )
                 do = "mount it writable for the user of ros2-memory ship, or do not require it"
-                yield Finding(Level.WARNING, "robot", seen, do)
+                yield warning(seen, do, about="robot")
             return

@@ -1,8 +1,8 @@
 """`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from itertools import chain, islice
@@ -11,14 +11,8 @@ from typing import Annotated, Final
 
 import typer
 
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    AsJson,
-    Bags,
-    Times,
-    print_line,
-)
-from ros2_memory.cli.output import progress_bar, with_local_times
+from ros2_memory.cli.options import AsJson, Bags, Times
+from ros2_memory.cli.output import print_done, progress_bar
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,
@@ -76,7 +70,7 @@ def export(
     ] = None,
     as_json: AsJson = False,
     bags: Bags,
-) -> None:
+) -> bool:
     """Copy a time window to MCAP or Parquet, each message once.
 
     MCAP keeps the original messages, definitions, log and publish times. Parquet has one row for
@@ -89,43 +83,35 @@ def export(
     window = times.window(memory)
     topics = _topics(view, topic or ())
     note_unread(view, window)
-    with _progress(view, window) as report:
-        with_latched = mcap is not None if latched is None else latched
-        earlier = _latched_before(view, topics, window.start) if with_latched else []
-        within = view.stream.messages(topics, window)
-        first = list(islice(within, 1))
-        if latched is None and not first and not view.snapshot.timeline.overlapping(window):
-            earlier = []  # alone they would look like an answer
-        if earlier:
-            copied = counted(len(earlier), "latched message is", "latched messages are")
-            view.notes.add(
-                f"{copied} copied from before the window, with the original time: the file begins "
-                f"at {unix_text(earlier[0].time)}"
-                + ("" if first else "; no message is in the window")
-            )
-        messages = _reported(chain(earlier, first, within), report)
+    with_latched = mcap is not None if latched is None else latched
+    earlier = _latched_before(view, topics, window.start) if with_latched else []
+    within = view.stream.messages(topics, window)
+    first = [*islice(within, 1)]
+    if latched is None and not first and not view.snapshot.timeline.overlapping(window):
+        earlier = []  # alone they would look like an answer
+    if earlier:
+        copied = counted(len(earlier), "latched message is", "latched messages are")
+        begins = f"the file begins at {unix_text(earlier[0].time)}"
+        none = "" if first else "; no message is in the window"
+        view.notes.add(
+            f"{copied} copied from before the window, with the original time: {begins}{none}"
+        )
+    messages = _with_progress(chain(earlier, first, within), view, window)
+    files, lacking = 1, ""
+    if mcap is not None:
         undefined: list[str] = []
-        lacking = ""
-        if mcap is not None:
-            messages = with_definitions(messages, memory.reader, undefined)
-            path, files = mcap, None
-            count = write_mcap(mcap, messages, profile_of(view, topics, window, earlier))
-            lacking = describe_undefined(undefined)
-        elif parquet is not None:
-            path = parquet
-            count, files, lacking = _write_parquet(parquet, messages, memory, robot)
+        profile = profile_of(view, topics, window, earlier)
+        count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined), profile)
+        lacking, where = describe_undefined(undefined), f"in {mcap}"
+    elif parquet is not None:
+        count, files, lacking = _write_parquet(parquet, messages, memory, robot)
+        where = f"in {counted(files, 'file')} below {parquet}"
     if lacking:
         view.notes.add(lacking)
-    if as_json:
-        done = {"path": str(path), "messages": count, "files": files or 1}
-        print_line(json.dumps(done | {"notes": [*view.notes.sentences()]}))
-    else:
-        where = f"in {path}" if files is None else f"in {counted(files, 'file')} below {path}"
-        print_line(f"{counted(count, 'message')} {where}")
-    for note in view.notes.sentences():
-        typer.echo(f"note: {with_local_times(note)}", err=True)
-    if lacking or not view.notes.complete or lost_in(view.snapshot, window):
-        raise typer.Exit(EXIT_NEGATIVE)
+    notes = view.notes.sentences()
+    done = {"path": str(mcap or parquet), "messages": count, "files": files, "notes": [*notes]}
+    print_done(json.dumps(done) if as_json else f"{counted(count, 'message')} {where}", notes)
+    return bool(lacking or not view.notes.complete or lost_in(view.snapshot, window))
 
 
 def _topics(view: View, globs: Sequence[str]) -> list[str]:
@@ -148,33 +134,31 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     These are the newest of each topic; of transforms the newest for each child frame, since every
     broadcaster publishes only its own.
     """
-    before = TimeWindow(MIN_NS, start)
+    before, snapshot = TimeWindow(MIN_NS, start), view.snapshot
     latching = view.memory.limits.latching
     valid: dict[tuple[str, str], StoredMessage] = {}
     for topic in topics:
-        if not latching.may_hold(view.snapshot, topic):
+        if not latching.may_hold(snapshot, topic):
             continue
-        if any(each.endswith("/TFMessage") for each in view.snapshot.timeline.types_of(topic)):
-            if latching.is_latched(view.snapshot, topic):
-                for each in view.stream.messages([topic], before):
-                    frames = _child_frames(view.memory, each)
-                    valid.update(((topic, frame), each) for frame in frames)
-            continue
-        newest = view.stream.newest(topic, before)
-        if newest is not None and latching.holds(view.snapshot, newest):
+        if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
+            if latching.is_latched(snapshot, topic):
+                for stored in view.stream.messages([topic], before):
+                    frames = _child_frames(view.memory, stored)
+                    valid.update(((topic, frame), stored) for frame in frames)
+        elif (newest := view.stream.newest(topic, before)) and latching.holds(snapshot, newest):
             valid[topic, ""] = newest
     # A message is valid for several frames, and is exported once.
-    once = {id(each): each for each in valid.values()}
-    return sorted(once.values(), key=lambda each: each.time)
+    once = {id(stored): stored for stored in valid.values()}
+    return sorted(once.values(), key=lambda stored: stored.time)
 
 
 def _child_frames(memory: Memory, stored: StoredMessage) -> set[str]:
     """Returns the child frames of a TFMessage; none if it cannot be decoded."""
-    try:
+    with suppress(UndecodableError):
         message = memory.reader.decode(stored.record)
-    except UndecodableError:
-        return set()
-    return {edge.child for edge in memory.extractor.transforms(message, stored.time, static=True)}
+        edges = memory.extractor.transforms(message, stored.time, static=True)
+        return {edge.child for edge in edges}
+    return set()
 
 
 def profile_of(
@@ -184,7 +168,7 @@ def profile_of(
     chosen = frozenset(topics)
     within = view.snapshot.timeline.overlapping(window)
     bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
-    bags.update(each.bag.path for each in earlier)
+    bags.update(stored.bag.path for stored in earlier)
     profiles: set[str] = set()
     for path in bags:
         # A bag that cannot be read is reported when its messages are read.
@@ -210,19 +194,19 @@ def with_definitions(
         text = definition.text().encode()
         return replace(channel, schema=replace(schema, encoding="ros2msg", text=text))
 
-    for each in messages:
-        yield each._replace(record=each.record._replace(channel=defined(each.record.channel)))
+    for stored in messages:
+        record = stored.record
+        yield stored._replace(record=record._replace(channel=defined(record.channel)))
 
 
 def describe_undefined(types: Sequence[str]) -> str:
     """Returns the sentence on types that an MCAP file has no definition of; empty without any."""
-    if not types:
-        return ""
-    return (
-        f"{', '.join(types)} {'has' if len(types) == 1 else 'have'} no definition in the bags, in "
-        "reader.custom_msg_paths or among the standard types, and none in the file: other "
-        "programs cannot read such messages"
+    has = "has" if len(types) == 1 else "have"
+    lacking = (
+        f"{', '.join(types)} {has} no definition in the bags, in reader.custom_msg_paths or among "
+        "the standard types, and none in the file: other programs cannot read such messages"
     )
+    return lacking if types else ""
 
 
 def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> int:
@@ -244,9 +228,9 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS
 
     def records() -> Iterator[Record]:
         nonlocal written
-        for each in chain((first,), messages):
+        for stored in chain((first,), messages):
             written += 1
-            yield each.record
+            yield stored.record
 
     temporary = path.with_name(f".{path.name}.tmp")
     try:
@@ -277,32 +261,21 @@ def _write_parquet(
         ) from error
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
-    lacking = ""
-    if dataset.undecoded:
-        types = ", ".join(sorted(dataset.undecoded))
-        lacking = (
-            f"messages of {types} cannot be decoded: their rows have no value, and `undecodable` "
-            "says why"
-        )
-    return dataset.rows, dataset.files, lacking
+    types = ", ".join(sorted(dataset.undecoded))
+    lacking = f"messages of {types} cannot be decoded: their rows have no value, and "
+    return dataset.rows, dataset.files, f"{lacking}`undecodable` says why" if types else ""
 
 
-def _reported(
-    messages: Iterator[StoredMessage], report: Callable[[Ns], None]
+def _with_progress(
+    messages: Iterator[StoredMessage], view: View, window: TimeWindow
 ) -> Iterator[StoredMessage]:
-    """Yields the messages, and reports the time of every so many."""
-    for number, each in enumerate(messages):
-        if number % _REPORT_EVERY == 0:
-            report(each.time)
-        yield each
-
-
-@contextmanager
-def _progress(view: View, window: TimeWindow) -> Iterator[Callable[[Ns], None]]:
-    """Shows a progress bar along the window; yields what takes the time that is reached."""
+    """Yields the messages, and shows a progress bar along the window."""
     bags = view.snapshot.timeline.overlapping(window)
     first = max(window.start, min((bag.start for bag in bags), default=0))
     last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
     with progress_bar() as bar:
         task = bar.add_task("exporting", total=max(last - first, 1))
-        yield lambda time: bar.update(task, completed=max(time - first, 0))
+        for number, stored in enumerate(messages):
+            if number % _REPORT_EVERY == 0:
+                bar.update(task, completed=max(stored.time - first, 0))
+            yield stored

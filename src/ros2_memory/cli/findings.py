@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.config import NullRecorderNode
+
 if TYPE_CHECKING:
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.config import Settings
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
@@ -22,6 +25,17 @@ class Examined(NamedTuple):
     snapshot: Snapshot
     now: Ns
 
+    @property
+    def records(self) -> bool:
+        """Whether bags are recorded there."""
+        return not isinstance(self.settings.recorder, NullRecorderNode)
+
+    @property
+    def live(self) -> Heartbeat | None:
+        """The heartbeat of a recorder that is at work."""
+        heartbeat = read_heartbeat(self.settings.recording.bag_dir).heartbeat
+        return heartbeat if heartbeat and heartbeat.is_live(self.now) else None
+
 
 class Level(IntEnum):
     """How bad a finding is; its value is the exit code."""
@@ -31,19 +45,18 @@ class Level(IntEnum):
     ERROR = 2
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+class Finding(NamedTuple):
     """What was seen, and what to do about it; nothing where all is in order.
 
     `about` is empty where it is the concern of the check.
     """
 
     level: Level
-    about: str
     seen: str
     do: str | None = None
+    about: str = ""
 
 
-ok: Final = partial(Finding, Level.OK, "")
-warning: Final = partial(Finding, Level.WARNING, "")
-error: Final = partial(Finding, Level.ERROR, "")
+ok: Final = partial(Finding, Level.OK)
+warning: Final = partial(Finding, Level.WARNING)
+error: Final = partial(Finding, Level.ERROR)

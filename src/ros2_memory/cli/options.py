@@ -9,22 +9,22 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
 from functools import wraps
 from inspect import Signature, signature
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias
 
 import typer
-from rich.console import Console
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
-from ros2_memory.cli.output import with_local_times
+from ros2_memory.cli.output import print_line, spinner, with_local_times
 from ros2_memory.config import (
     NullRecorderNode,
     Settings,
@@ -55,6 +55,8 @@ EXIT_NEGATIVE: Final = 1
 EXIT_CANNOT_RUN: Final = 2
 """Exit code: it could not run, and stderr says why."""
 MB: Final = 1_000_000
+STAYS: Final = "stays: "
+"""Begins a line on what a command left as it is."""
 
 TIMES: Final = (
     "Unix seconds (1795163910.5), ISO 8601 (2026-11-20T08:30), a time of day (14:05), "
@@ -69,9 +71,6 @@ _LARGEST_UNIX_S: Final = 1e11
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
-
-_PIPE_WIDTH: Final = 160
-"""Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
 
 BagDir = Annotated[
     Path | None,
@@ -109,7 +108,7 @@ Verbose = Annotated[
     bool,
     typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
 ]
-Command: TypeAlias = Callable[..., None]  # type: ignore[explicit-any]  # each its own options
+Command: TypeAlias = Callable[..., int | None]  # type: ignore[explicit-any]  # each its own options
 LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
@@ -144,9 +143,7 @@ Last = Annotated[
 ]
 
 
-def load_with_sources(
-    bag_dir: Path | None, overrides: Sequence[str] | None
-) -> tuple[Settings, Sources]:
+def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> tuple[Settings, Sources]:
     """Loads the configuration as the server does, and who set each key; `--bag-dir` wins.
 
     It is about one robot, so there is no fleet then.
@@ -161,26 +158,15 @@ def load_with_sources(
     return settings, sources
 
 
-def load_for(bag_dir: Path | None, overrides: Sequence[str] | None) -> Settings:
-    """Loads the configuration as `load_with_sources` does, without the sources."""
-    return load_with_sources(bag_dir, overrides)[0]
-
-
 def load_given(bag_dir: Path | None, words: Sequence[str] | None) -> tuple[Settings, Sources]:
-    """Loads the configuration as the server does, or where a PATH is given as `load_to_look` does.
-
-    Raises:
-        ConfigError: the configuration is refused.
-        InvalidArgumentsError: there is no such file or folder, or more than one is named.
-    """
-    if any(map(_is_path, words or ())):
-        return _load_to_look(bag_dir, words)
-    return load_with_sources(bag_dir, words)
+    """Loads the configuration as the server does, or where a PATH is given as `load_to_look`."""
+    load = load_to_look if any(map(_is_path, words or ())) else load_for
+    return load(bag_dir, words)
 
 
 def load_to_look(
-    bag_dir: Path | None, words: Sequence[str] | None = None, recording: str | None = None
-) -> Settings:
+    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
+) -> tuple[Settings, Sources]:
     """Loads the configuration for a command that only looks; a PATH among its words wins.
 
     Bags that this deployment does not record are read whatever kind they are, and no recorder is
@@ -190,20 +176,14 @@ def load_to_look(
         ConfigError: the configuration is refused.
         InvalidArgumentsError: there is no such file or folder, or more than one is named.
     """
-    return _load_to_look(bag_dir, words, recording)[0]
-
-
-def _load_to_look(
-    bag_dir: Path | None, words: Sequence[str] | None, recording: str | None = None
-) -> tuple[Settings, Sources]:
     named, given = settings_to_look(bag_dir, words, recording)
-    loaded = load_with_sources(named, given)
-    by_words = any(each.partition("=")[0] in GROUPS for each in given)
+    loaded = load_for(named, given)
+    by_words = any(word.partition("=")[0] in GROUPS for word in given)
     of_path = named if bag_dir is None else None
     is_chosen = is_deployment_chosen(given)
     if by_words or not _is_of_others(loaded[0], of_path, is_chosen=is_chosen):
         return loaded
-    return load_with_sources(named, [*LOOKING, *given])
+    return load_for(named, [*LOOKING, *given])
 
 
 def settings_to_look(
@@ -218,48 +198,43 @@ def settings_to_look(
         ConfigError: a variable or a setting is refused.
         InvalidArgumentsError: there is no such file or folder, or more than one is named.
     """
-    path, given = _path_and_settings(words or ())
-    if path is not None and bag_dir is not None:
-        raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
-    if path is not None and path.is_file():
-        path, recording = _folder_of(path, recording)
-    named = bag_dir if path is None else path
-    if named is not None and not is_deployment_chosen(given) and not _is_recorded_now(named):
+    paths = [word for word in words or () if _is_path(word)]
+    given = [word for word in words or () if word not in paths]
+    if len(paths) > 1:
+        raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
+    for path in map(Path, paths):
+        if not path.exists():
+            raise InvalidArgumentsError(
+                f"{path}: there is no such file or folder; name a bag or a folder of bags, or "
+                "write a setting as key=value"
+            )
+        if bag_dir is not None:
+            raise InvalidArgumentsError(f"give {path} or --bag-dir {bag_dir}, not both")
+        bag_dir = path
+        if path.is_file():
+            bag_dir, recording = _folder_of(path, recording)
+    if bag_dir is not None and not is_deployment_chosen(given) and not _is_recorded_now(bag_dir):
         given = [*LOOKING, *given]
     if recording is not None:
         given.append(f"data.recording={quoted(recording)}")
-    return named, given
-
-
-def _path_and_settings(words: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Returns the one word that is a path, and the others."""
-    paths = [each for each in words if _is_path(each)]
-    if len(paths) > 1:
-        raise InvalidArgumentsError(f"one file or folder at a time: {' and '.join(paths)}")
-    if paths and not Path(paths[0]).exists():
-        raise InvalidArgumentsError(
-            f"{paths[0]}: there is no such file or folder; name a bag or a folder of bags, or "
-            "write a setting as key=value"
-        )
-    return (Path(paths[0]) if paths else None), [each for each in words if each not in paths]
+    return bag_dir, given
 
 
 def _is_path(word: str) -> bool:
     """Returns whether a word is a path: no setting has a slash in its name."""
     key, equals, _ = word.partition("=")
-    if not equals or "/" in key:
-        return True
-    try:
-        return Path(word).exists()
-    except OSError:  # a long setting
-        return False
+    return not equals or "/" in key or _exists(word)
 
 
 def is_folder(word: str) -> bool:
     """Returns whether a word is a bag or a folder: a path that is there, and no JSON."""
+    return "=" not in word and _exists(word)
+
+
+def _exists(word: str) -> bool:
     try:
-        return "=" not in word and Path(word).exists()
-    except (OSError, ValueError):
+        return Path(word).exists()
+    except (OSError, ValueError):  # a long setting
         return False
 
 
@@ -283,9 +258,8 @@ def _is_of_others(settings: Settings, path: Path | None, *, is_chosen: bool) -> 
         if is_chosen or has_recorded(bag_dir) or not bag_dir.is_dir():
             return False
         return next(folders_with_bags(bag_dir), None) is not None
-    if path.absolute() == load_for(None, None).recording.bag_dir.absolute():
-        return False
-    return not _is_recorded_now(bag_dir)
+    configured = load_for(None, None)[0].recording.bag_dir
+    return path.absolute() != configured.absolute() and not _is_recorded_now(bag_dir)
 
 
 def _is_recorded_now(bag_dir: Path) -> bool:
@@ -417,9 +391,8 @@ def day_of(memory: "Memory", day: str | None) -> TimeWindow:
     now = present(memory) if day is not None or newest is None else newest
     at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
     date = datetime.fromtimestamp(at).astimezone().date()
-    begin, end = (
-        datetime.combine(each, time.min).timestamp() for each in (date, date + timedelta(days=1))
-    )
+    days = (date, date + timedelta(days=1))
+    begin, end = (datetime.combine(day, time.min).timestamp() for day in days)
     return TimeWindow(ns_from_unix(begin), ns_from_unix(end))
 
 
@@ -434,7 +407,7 @@ class Bags:
 
     def settings(self, *more: str) -> Settings:
         """Loads the configuration as `load_to_look` does; `more` are further settings."""
-        return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)
+        return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)[0]
 
     def memory(self) -> "Memory":
         """Opens the memory of these bags as `open_memory` does."""
@@ -449,13 +422,13 @@ class Bags:
         others = self.words or []
         if not Path(first).exists() or any(map(is_folder, others)):
             return first, self
-        topic = next((each for each in others if "=" not in each), None)
+        topic = next((word for word in others if "=" not in word), None)
         if topic is None:
             kind = "folder" if Path(first).is_dir() else "file"
             raise InvalidArgumentsError(
                 f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
             )
-        return topic, replace(self, words=[first, *(each for each in others if each != topic)])
+        return topic, replace(self, words=[first, *(word for word in others if word != topic)])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -489,15 +462,16 @@ class Times:
 def as_command(name: str) -> Callable[[Command], Command]:
     """Returns what makes a function a command that reports its errors under a name.
 
-    Its parameters of the types `Bags` and `Times` become the options of these, in their place.
+    Its parameters of the types `Bags` and `Times` become the options of these, in their place. It
+    returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
     """
 
     def made(command: Command) -> Command:
         parameters = signature(command).parameters
         groups = {
-            each.name: each.annotation
-            for each in parameters.values()
-            if each.annotation in (Bags, Times)
+            name: parameter.annotation
+            for name, parameter in parameters.items()
+            if parameter.annotation in (Bags, Times)
         }
 
         @wraps(command)
@@ -505,17 +479,18 @@ def as_command(name: str) -> Callable[[Command], Command]:
             for group, kind in groups.items():
                 own = {option: given.pop(option) for option in signature(kind).parameters}
                 given[group] = kind(**own)
-            command(**given)
+            with reported_errors(name):
+                raise typer.Exit(int(command(**given) or 0))
 
         options = [
             option.replace(kind=option.KEYWORD_ONLY)
-            for each in parameters.values()
+            for name, parameter in parameters.items()
             for option in (
-                signature(each.annotation).parameters.values() if each.name in groups else [each]
+                signature(groups[name]).parameters.values() if name in groups else [parameter]
             )
         ]
         run.__signature__ = Signature(options)  # type: ignore[attr-defined]  # typer reads it
-        return reported_errors(name)(run)
+        return run
 
     return made
 
@@ -524,7 +499,7 @@ def as_command(name: str) -> Callable[[Command], Command]:
 def reported_errors(command: str) -> Iterator[None]:
     """Prints an error of the block as one line on stderr, and exits with code 2.
 
-    Also prints how many warnings were logged and not shown, and the lines of `collect_lines`.
+    Also prints how many warnings were logged and not shown.
     """
     try:
         yield
@@ -537,7 +512,6 @@ def reported_errors(command: str) -> Iterator[None]:
         print(f"ros2-memory {command}: {lines}", file=sys.stderr)
         raise typer.Exit(EXIT_CANNOT_RUN) from None
     finally:
-        _print_collected()
         if events := withheld_warnings():
             names = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
             advice = "" if command == "doctor" else ", `ros2-memory doctor` says what to do"
@@ -547,33 +521,8 @@ def reported_errors(command: str) -> Iterator[None]:
             )
 
 
-def spinner(activity: str) -> AbstractContextManager[object]:
-    """Shows on a terminal, and nowhere else, what the block is doing."""
-    console = Console(stderr=True)
-    return console.status(activity) if console.is_terminal else nullcontext()
-
-
-def stdout_console() -> Console:
-    """Returns the console for answers; where it is no terminal, lines are not cut."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal and "COLUMNS" not in os.environ:
-        console = Console(highlight=False, markup=False, emoji=False, width=_PIPE_WIDTH)
-    return console
-
-
-def print_line(line: str) -> None:
-    """Prints a line on stdout, and flushes it, unless lines are being collected."""
-    if _collected:
-        _collected[-1].append(line)
-    else:
-        print(line, flush=True)
-
-
-_collected: Final[list[list[str]]] = []
-_STAYS: Final = "stays: "
-
-
-def collect_lines(as_json: bool, *, is_answered: bool) -> None:
+@contextmanager
+def lines_as_json(as_json: bool, *, is_answered: bool) -> Iterator[None]:
     """Has a command with --json print its lines at its end, as one JSON object.
 
     `stays` are those on what it left as it is, `lines` all others.
@@ -581,16 +530,16 @@ def collect_lines(as_json: bool, *, is_answered: bool) -> None:
     Raises:
         InvalidArgumentsError: the command would have to ask.
     """
-    if as_json and not is_answered:
-        raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
-    if as_json:
-        _collected.append([])
-
-
-def _print_collected() -> None:
-    if not _collected:
+    if not as_json:
+        yield
         return
-    lines = _collected.pop()
-    stays = [each.removeprefix(_STAYS) for each in lines if each.startswith(_STAYS)]
-    others = [each for each in lines if not each.startswith(_STAYS)]
-    print(json.dumps({"lines": others, "stays": stays}), flush=True)
+    if not is_answered:
+        raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
+    try:
+        with redirect_stdout(StringIO()) as printed:
+            yield
+    finally:
+        lines = printed.getvalue().splitlines()
+        stays = [line.removeprefix(STAYS) for line in lines if line.startswith(STAYS)]
+        others = [line for line in lines if not line.startswith(STAYS)]
+        print_line(json.dumps({"lines": others, "stays": stays}))

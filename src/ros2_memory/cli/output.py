@@ -6,11 +6,16 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 from __future__ import annotations
 
 import math
+import os
 import re
+import sys
+from contextlib import nullcontext
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -18,12 +23,15 @@ from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
 
     from rich.progress import Progress
 
     from ros2_memory.core.model import JsonValue
 
+_PIPE_WIDTH: Final = 160
+"""Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
 _EARLIEST_TIME: Final = 1e9
 _LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
@@ -33,7 +41,8 @@ _DAYS_FROM_S: Final = 172_800.0
 _NO_AGE_BELOW_S: Final = 0.05
 _MAX_FLATTENED_KEYS: Final = 8
 _MAX_COLUMNS: Final = 9
-_COLUMN_GAP: Final = 2
+_ENDLESS: Final = 10_000
+"""Characters of a terminal that is wide enough for any table."""
 _TIME_OF_DAY_WIDTH: Final = 15
 _MIN_TEXT_WIDTH: Final = 16
 """Columns that a text keeps where a table is wider than the terminal."""
@@ -54,14 +63,45 @@ _WITH_TOOLS: Final = frozenset({"problems", "doubts"})
 _TOOL_IN_NOTE: Final = re.compile(rf"(?<![\w/])(?:{'|'.join(_COMMANDS)})\b")
 
 
+def print_line(line: str) -> None:
+    """Prints a line on stdout, and flushes it."""
+    print(line, flush=True)
+
+
+def print_done(line: str, notes: Iterable[str] = ()) -> None:
+    """Prints what a command did as a line on stdout, and notes on stderr."""
+    print_line(line)
+    print_notes(notes)
+
+
+def print_notes(notes: Iterable[str]) -> None:
+    """Prints notes on stderr, with times in this machine's zone."""
+    for note in notes:
+        print(f"note: {with_local_times(note)}", file=sys.stderr, flush=True)
+
+
+def stdout_console() -> Console:
+    """Returns the console for answers; where it is no terminal, lines are not cut."""
+    console = Console(highlight=False, markup=False, emoji=False)
+    if not console.is_terminal and "COLUMNS" not in os.environ:
+        console.width = _PIPE_WIDTH
+    return console
+
+
+def spinner(activity: str) -> AbstractContextManager[object]:
+    """Shows on a terminal, and nowhere else, what the block is doing."""
+    console = Console(stderr=True)
+    return console.status(activity) if console.is_terminal else nullcontext()
+
+
 def print_reply(console: Console, value: JsonValue, now: float | None = None) -> None:
     """Prints any reply. The ages of times count from `now` (Unix s), or from the reply's own."""
     value = with_level_names(value)
     if isinstance(value, dict):
         stated = value.get("now")
         _print_object(console, value, stated if isinstance(stated, float) else now)
-    elif isinstance(value, list) and value and all(isinstance(each, dict) for each in value):
-        _print_rows(console, [each for each in value if isinstance(each, dict)])
+    elif isinstance(value, list) and (rows := _objects(value)):
+        _print_rows(console, rows)
     else:
         console.print(Text(format_value(value) if value else "none"))
 
@@ -71,17 +111,16 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
     lines = Table.grid(padding=(0, 2))
     lines.add_column(style="bold", no_wrap=True)
     lines.add_column(overflow="fold")
-    for key, each in _flattened(_with_named_cells(value)).items():
-        rows = [row for row in each if isinstance(row, dict)] if isinstance(each, list) else []
-        if isinstance(each, list) and rows and len(rows) == len(each):
+    for key, inner in _flattened(_with_named_cells(value)).items():
+        if isinstance(inner, list) and (rows := _objects(inner)):
             lists[key] = rows
-        elif key == "notes" and isinstance(each, list):
-            for note in each:
+        elif key == "notes" and isinstance(inner, list):
+            for note in inner:
                 lines.add_row("note", Text(with_local_times(str(note))))
-        elif key == "detail" and isinstance(each, str):  # why there is no answer
-            lines.add_row(key, Text(with_local_times(each)))
+        elif key == "detail" and isinstance(inner, str):  # why there is no answer
+            lines.add_row(key, Text(with_local_times(inner)))
         else:
-            line = _format_line(key, each, now)
+            line = _format_line(key, inner, now)
             lines.add_row(
                 Text(escape(key)), Text(with_commands(line) if key in _WITH_TOOLS else line)
             )
@@ -90,6 +129,12 @@ def _print_object(console: Console, value: Mapping[str, JsonValue], now: float |
     for key, rows in lists.items():
         console.print(Text(f"\n{escape(key)}", style="bold"))
         _print_rows(console, rows)
+
+
+def _objects(values: Sequence[JsonValue]) -> list[dict[str, JsonValue]]:
+    """Returns the values where all are objects; else none."""
+    rows = [row for row in values if isinstance(row, dict)]
+    return rows if len(rows) == len(values) else []
 
 
 def with_local_times(sentence: str) -> str:
@@ -106,39 +151,45 @@ def with_commands(sentence: str) -> str:
 
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
-    """Returns a reply with an object for each row of its table, if it has one."""
+    """Returns a reply with an object for each row of its table, if it has one.
+
+    Of a time that stands in a row twice the exact one is shown, once.
+    """
     names = "columns" if "columns" in value else "fields"
-    fields, rows = value.get(names), value.get("rows")
+    fields, rows, every = value.get(names), value.get("rows"), value.get(_ALL)
     if not isinstance(fields, list) or not isinstance(rows, list):
         return value
-    every = value.get(_ALL)
+    shown = {key: inner for key, inner in value.items() if key not in (names, "rows")}
     if isinstance(every, list):  # a row of its own, without its name
+        del shown[_ALL]
         rows = [*rows, [_ALL, *every]]
-    names_of_cells = [*map(str, fields)]
-    named: list[JsonValue] = [
-        _cells(dict(zip(names_of_cells, row, strict=False)))
-        for row in rows
-        if isinstance(row, list)
+    named = [
+        dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
     ]
-    shown = {names, "rows", _ALL} if isinstance(every, list) else {names, "rows"}
-    return {key: each for key, each in value.items() if key not in shown} | {"rows": named}
-
-
-def _cells(row: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
-    """Returns the cells of a row; of a time that stands there twice the exact one, once."""
-    return {
-        name: row.get(f"{name}_unix", cell)
-        for name, cell in row.items()
-        if not name.endswith("_unix")
+    return shown | {
+        "rows": [
+            {
+                name: row.get(f"{name}_unix", cell)
+                for name, cell in row.items()
+                if not name.endswith("_unix")
+            }
+            for row in named
+        ]
     }
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
     """Prints a table, or one object after the other where it is wider than the terminal."""
-    table = _table(rows, console.width)
-    if table is not None:
-        console.print(table)
-        return
+    flattened = [_flattened(row) for row in rows]
+    if len(_all_keys(flattened)) > _MAX_COLUMNS:
+        flattened = [{**row} for row in rows]
+    endless = console.options.update_width(_ENDLESS)
+    for breaks_times in (False, True):
+        table = _table(flattened, breaks_times=breaks_times)
+        needed = Measurement.get(console, endless, table)
+        if (needed.minimum if breaks_times else needed.maximum) <= console.width:
+            console.print(table)
+            return
     for row in rows:
         console.print()
         _print_object(console, row, None)
@@ -174,58 +225,36 @@ def _format_for_key(key: str, value: JsonValue) -> str:
     return format_value(value)
 
 
-def _table(rows: Sequence[Mapping[str, JsonValue]], width: int) -> Table | None:
+def _table(rows: Sequence[Mapping[str, JsonValue]], *, breaks_times: bool) -> Table:
     """Returns objects as rows; their keys, in order of appearance, are the columns.
-
-    None if the table does not fit into `width` characters.
-    """
-    flattened = [_flattened(row) for row in rows]
-    if len(_all_keys(flattened)) > _MAX_COLUMNS:
-        flattened = [{**row} for row in rows]
-    keys = _all_keys(flattened)
-    columns = [_Column(key, [row.get(key) for row in flattened]) for key in keys]
-    if sum(each.min_width + _COLUMN_GAP for each in columns) > width:
-        return None
-    is_narrow = sum(each.width + _COLUMN_GAP for each in columns) > width
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
-    for each in columns:
-        table.add_column(
-            Text(escape(each.key)),
-            justify="right" if each.is_numeric else "left",
-            overflow="fold",
-            no_wrap=each.is_numeric,
-            min_width=each.min_width,
-            max_width=each.min_width if is_narrow and each.has_times else None,
-        )
-    for row in flattened:
-        cells = [_format_for_key(key, row.get(key)) for key in keys]
-        if is_narrow:  # times take two lines
-            cells = [
-                cell.replace("T", "\n") if _is_time(row.get(key)) else cell
-                for key, cell in zip(keys, cells, strict=True)
-            ]
-        table.add_row(*map(Text, cells))
-    return table
-
-
-class _Column:
-    """A column's content, and the characters that it takes: `width`, or at least `min_width`.
 
     A time may break between its date and its time of day.
     """
-
-    def __init__(self, key: str, values: Sequence[JsonValue]) -> None:
-        self.key = key
-        self.has_times = any(_is_time(each) for each in values)
-        self.is_numeric = all(
-            isinstance(each, int | float) and not isinstance(each, bool) and not _is_time(each)
-            for each in values
-            if each is not None
+    table = Table(box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
+    columns = []
+    for key in _all_keys(rows):
+        values = [row.get(key) for row in rows]
+        has_times = any(map(_is_time, values))
+        is_numeric = not has_times and all(
+            isinstance(value, int | float) and not isinstance(value, bool)
+            for value in values
+            if value is not None
         )
-        self.width = max(len(key), *(len(_format_for_key(key, each)) for each in values))
-        self.min_width = self.width if self.is_numeric else min(self.width, _MIN_TEXT_WIDTH)
-        if self.has_times:
-            self.min_width = _TIME_OF_DAY_WIDTH
+        cells = [_format_for_key(key, value) for value in values]
+        if has_times and breaks_times:
+            cells = [cell.replace("T", "\n") for cell in cells]
+        width = max(map(len, (key, *chain(*map(str.split, cells)))))
+        table.add_column(
+            Text(escape(key)),
+            justify="right" if is_numeric else "left",
+            overflow="fold",
+            no_wrap=is_numeric,
+            min_width=_TIME_OF_DAY_WIDTH if has_times else min(width, _MIN_TEXT_WIDTH),
+        )
+        columns.append(map(Text, cells))
+    for row in zip(*columns, strict=True):
+        table.add_row(*row)
+    return table
 
 
 def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
@@ -247,6 +276,15 @@ def _flattened(value: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
         else:
             flat.update((f"{key}.{inner}", item) for inner, item in _flattened(each).items())
     return flat
+
+
+def leaves(value: JsonValue, name: str = "") -> Iterator[tuple[str, JsonValue]]:
+    """Yields what an object holds, however deep, by dot-paths; of any other value itself."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from leaves(inner, f"{name}.{key}" if name else key)
+    else:
+        yield name, value
 
 
 def _is_vector(value: Mapping[str, JsonValue]) -> bool:
@@ -285,10 +323,10 @@ def _format_object(value: Mapping[str, JsonValue]) -> str:
     if value.keys() == {"value"}:
         return format_value(value["value"])
     return "; ".join(
-        f"{escape(key)} ({format_value(each)})"
-        if isinstance(each, dict)
-        else f"{escape(key)}: {format_value(each)}"
-        for key, each in value.items()
+        f"{escape(key)} ({format_value(inner)})"
+        if isinstance(inner, dict)
+        else f"{escape(key)}: {format_value(inner)}"
+        for key, inner in value.items()
     )
 
 

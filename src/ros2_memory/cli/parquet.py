@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import json
 from collections import OrderedDict
-from contextlib import ExitStack
 from datetime import UTC, datetime
-from itertools import chain
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 from urllib.parse import quote
 
@@ -26,10 +26,8 @@ from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-    from pathlib import Path
+    from collections.abc import Collection, Iterable
 
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
@@ -55,38 +53,28 @@ _NO_POSE: Final = (None,) * 7
 _MAX_OPEN_FILES: Final = 16
 """Messages come in time order, so few recordings are written at a time."""
 
-_COLUMNS: Final = tuple(SCHEMA.names)
 Row = tuple[object, ...]
 """The values of a message, in the order of the columns."""
 
 
 class _PartFile:
-    """One file being written, under a temporary name until the dataset is complete."""
+    """One file being written; messages are buffered for a row group."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.temporary = path.with_name(f".{path.name}.tmp")
-        self._rows: list[Row] = []
-        self.temporary.unlink(missing_ok=True)  # or a link there would be written through
-        self.writer = pq.ParquetWriter(self.temporary, SCHEMA, compression="zstd")
+        self.rows: list[Row] = []
+        self._writer = pq.ParquetWriter(path, SCHEMA, compression="zstd")
 
-    def add(self, row: Row) -> None:
-        """Takes the row of the next message."""
-        self._rows.append(row)
-        if len(self._rows) >= _GROUP_ROWS:
-            self._flush()
+    def flush(self) -> None:
+        """Writes what is buffered as a row group."""
+        if self.rows:
+            columns = dict(zip(SCHEMA.names, zip(*self.rows, strict=True), strict=True))
+            self._writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
+            self.rows.clear()
 
     def close(self) -> None:
         """Writes what is buffered, and ends the file."""
-        self._flush()
-        self.writer.close()
-
-    def _flush(self) -> None:
-        """Writes what is buffered as a row group."""
-        if self._rows:
-            columns = dict(zip(_COLUMNS, zip(*self._rows, strict=True), strict=True))
-            self.writer.write_table(pa.Table.from_pydict(columns, schema=SCHEMA))
-            self._rows.clear()
+        self.flush()
+        self._writer.close()
 
 
 class Dataset:
@@ -110,10 +98,6 @@ class Dataset:
         self._root = root if robot is None else root / f"robot={quote(robot, safe=' ')}"
         self._reader = reader
         self._extractor = extractor
-        self._open: OrderedDict[Path, _PartFile] = OrderedDict()
-        self._parts: dict[Path, list[_PartFile]] = {}
-        self._newest: tuple[BagFile, Ns, _PartFile] | None = None
-        self._cleanup = ExitStack()
         self.rows = 0
         self.files = 0
         self.undecoded: set[str] = set()
@@ -124,52 +108,40 @@ class Dataset:
         Raises:
             InvalidArgumentsError: the partition of a message existed before.
         """
-        with self._cleanup:
-            for each in messages:
-                self._add(each)
-            for part in self._open.values():
+        parts: OrderedDict[tuple[str, Ns], _PartFile] = OrderedDict()
+        made: dict[Path, Path] = {}
+        self._root.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(dir=self._root, prefix=".") as temporary:
+            for stored in messages:
+                key = stored.bag.recording.name, stored.time // _DAY_NS
+                if key not in parts:
+                    made_here = Path(temporary) / str(len(made))
+                    made[self._new_file(*key, made)] = made_here
+                    parts[key] = _PartFile(made_here)
+                    if len(parts) > _MAX_OPEN_FILES:
+                        parts.popitem(last=False)[1].close()
+                parts.move_to_end(key)
+                parts[key].rows.append(self._row(stored.record))
+                self.rows += 1
+                if len(parts[key].rows) >= _GROUP_ROWS:
+                    parts[key].flush()
+            for part in parts.values():
                 part.close()
-            for part in chain.from_iterable(self._parts.values()):
-                part.temporary.replace(part.path)
-                self.files += 1
+            for path, written in made.items():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                written.replace(path)
+        self.files = len(made)
 
-    def _add(self, stored: StoredMessage) -> None:
-        self._part_for(stored).add(self._row(stored.record))
-        self.rows += 1
-
-    def _part_for(self, stored: StoredMessage) -> _PartFile:
-        """Returns the file of a message's partition."""
-        day = stored.time // _DAY_NS
-        if self._newest is None or self._newest[0] is not stored.bag or self._newest[1] != day:
-            self._newest = (stored.bag, day, self._part_of(stored))
-        return self._newest[2]
-
-    def _part_of(self, stored: StoredMessage) -> _PartFile:
-        """Opens that file, if need be, and closes the one that was unused for longest."""
-        date = datetime.fromtimestamp(stored.time // NS_PER_S, tz=UTC).date()
-        name = quote(stored.bag.recording.name, safe=" ")
-        folder = self._root / f"recording={name}" / f"date={date}"
-        if folder not in self._open:
-            self._open[folder] = self._new_part(folder)
-        self._open.move_to_end(folder)
-        if len(self._open) > _MAX_OPEN_FILES:
-            _, oldest = self._open.popitem(last=False)
-            oldest.close()
-        return self._open[folder]
-
-    def _new_part(self, folder: Path) -> _PartFile:
-        folder.mkdir(parents=True, exist_ok=True)
-        if folder not in self._parts and any(folder.glob("*.parquet")):
+    def _new_file(self, recording: str, day: int, made: Collection[Path]) -> Path:
+        """Returns the path of a further file of a partition."""
+        date = datetime.fromtimestamp(day * _DAY_NS // NS_PER_S, tz=UTC).date()
+        folder = self._root / f"recording={quote(recording, safe=' ')}" / f"date={date}"
+        if any(folder.glob("*.parquet")):
             raise InvalidArgumentsError(
                 f"{folder} has rows already, which would be there twice; export whole days (UTC)"
                 ", name another folder, or delete this one"
             )
-        parts = self._parts.setdefault(folder, [])
-        part = _PartFile(folder / f"part-{len(parts)}.parquet")
-        self._cleanup.callback(part.temporary.unlink, missing_ok=True)
-        self._cleanup.enter_context(part.writer)
-        parts.append(part)
-        return part
+        return folder / f"part-{sum(path.parent == folder for path in made)}.parquet"
 
     def _row(self, record: Record) -> Row:
         """Returns the row of a message."""

@@ -3,6 +3,7 @@
 import json
 import re
 import shlex
+import sys
 from bisect import bisect_right
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -16,17 +17,8 @@ import typer
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_tools, question_for
 from ros2_memory.cli.export import describe_undefined, profile_of, with_definitions, write_mcap
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    LOOKING,
-    AsJson,
-    Bags,
-    is_folder,
-    load_to_look,
-    open_memory,
-    print_line,
-    spinner,
-)
+from ros2_memory.cli.options import LOOKING, AsJson, Bags, is_folder, load_to_look, open_memory
+from ros2_memory.cli.output import print_line, print_notes, spinner
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
@@ -40,15 +32,12 @@ from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
 
-_LONG: Final = "server.call_timeout_s=600"
-"""Bags are read without a store of columns, which takes longer."""
 _BESIDE: Final = frozenset(
     {"notes", "bags", "incomplete", "damaged", "unread", "silences", "doubts", "budget"}
 )
 """Keys that say how things lie in the files, which other files need not have."""
 _NEVER: Final[JsonObject] = {"timestamp": None, "value": None}
 """What a reply of null says where it has notes."""
-_EVER: Final = [(MIN_NS, MAX_NS)]
 
 
 def prove(
@@ -70,7 +59,7 @@ def prove(
     ],
     as_json: AsJson = False,
     bags: Bags,
-) -> None:
+) -> bool:
     """Write the messages that an answer rests on, so that others can look at them.
 
     The same question is then asked over these alone, and both answers are compared. An answer on
@@ -78,9 +67,9 @@ def prove(
     """
     if output.exists() or not output.parent.is_dir():
         raise InvalidArgumentsError(f"{output} must be new, in a folder that is there")
-    others = [each for each in bags.words or () if not is_folder(each)]
-    words = _words(question)
-    loaded = bags.settings(*LOOKING, _LONG)
+    words, looking = _words(question), (*LOOKING, "server.call_timeout_s=600")  # without a store
+    others = [word for word in bags.words or () if not is_folder(word)]
+    loaded = bags.settings(*looking)
     memory = open_memory(loaded, verbose=bags.verbose)
     reads = _Reads(memory.reader)
     with spinner("asking"):
@@ -95,30 +84,26 @@ def prove(
             path = Path(folder) / str(nth) / output.name
             path.parent.mkdir()
             count = _write(path, view, spans, parts, undefined)
-            settings = load_to_look(None, [str(path), *LOOKING, _LONG, *others])
+            settings, _ = load_to_look(None, [str(path), *looking, *others])
             found = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
             beside, differing = _differing(expected, found)
             if not differing:
                 break
         path.replace(output)
-    if as_json:
-        done = {"path": str(output), "messages": count, "same": not differing}
-        print_line(json.dumps({**done, "differing": differing, "beside": beside}))
-    else:
-        print_line(f"{counted(count, 'message')} in {output}")
+    done = {"path": str(output), "messages": count, "same": not differing, "differing": differing}
+    written = json.dumps({**done, "beside": beside})
+    print_line(written if as_json else f"{counted(count, 'message')} in {output}")
     if beside:
-        typer.echo(f"note: only the bags themselves give the same {listed(beside)}", err=True)
+        print_notes([f"only the bags themselves give the same {listed(beside)}"])
+    said = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
     if differing:
-        apart = len(parts) > 1 and output.suffix == ".mcap"
-        hint = f"; -o {output.with_suffix('')} keeps recordings apart" if apart else ""
-        typer.echo(f"over {output} the answer differs in {listed(differing)}{hint}", err=True)
-    else:
-        same = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
-        typer.echo(same, err=True)
-    if lacking := describe_undefined(undefined):
-        typer.echo(f"note: {lacking}", err=True)
-    if differing or lacking:
-        raise typer.Exit(EXIT_NEGATIVE)
+        said = f"over {output} the answer differs in {listed(differing)}"
+        if len(parts) > 1 and output.suffix == ".mcap":
+            said += f"; -o {output.with_suffix('')} keeps recordings apart"
+    print(said, file=sys.stderr)
+    lacking = describe_undefined(undefined)
+    print_notes([lacking] if lacking else [])
+    return bool(differing or lacking)
 
 
 class _Reads:
@@ -158,12 +143,7 @@ class _Reads:
         return record
 
     def batches(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        bare: Collection[str] = (),
+        self, path: Path, topics: Collection[str], window: TimeWindow, **more: Collection[str]
     ) -> Iterator[Batch]:
         """As above."""
         call = self._call()
@@ -172,7 +152,7 @@ class _Reads:
             _widen(call, batch.channel.topic, batch.log_times.tolist())
             return batch
 
-        return map(noted, self._reader.batches(path, topics, window, bare=bare))
+        return map(noted, self._reader.batches(path, topics, window, **more))
 
     def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
         """As above."""
@@ -215,10 +195,9 @@ def _more_and_more(
     """
     ends = [(at, at + 1) for _, window in parts for at in (window.start, window.stop - 1)]
     every = view.snapshot.timeline.topics()
-    between: dict[str, Spans] = {
-        topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()
-    }
-    for found in (read, between, dict.fromkeys(read, _EVER), dict.fromkeys(every, _EVER)):
+    between = {topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()}
+    ever = [(MIN_NS, MAX_NS)]
+    for found in (read, between, dict.fromkeys(read, ever), dict.fromkeys(every, ever)):
         yield {topic: united([*found.get(topic, ()), *ends]) for topic in every}
 
 
@@ -233,20 +212,22 @@ def _write(
 
     Returns how many; collects types without a definition.
     """
-    profile = profile_of(view, [*spans], TimeWindow.everything(), ())
-
-    def written(path: Path, messages: Iterator[StoredMessage]) -> int:
-        return write_mcap(path, with_definitions(messages, view.memory.reader, undefined), profile)
-
-    if path.suffix == ".mcap":
-        return written(path, _messages(view, spans, TimeWindow.everything()))
-    count = 0
-    for nth, (recording, window) in enumerate(parts):
-        folder = path / recording.relative_to(view.memory.index.bag_dir)
-        folder.mkdir(parents=True, exist_ok=True)
-        found = (each for each in _messages(view, spans, window) if each.bag.recording == recording)
+    profile, count = profile_of(view, [*spans], TimeWindow.everything(), ()), 0
+    whole = [(None, TimeWindow.everything())]
+    for nth, (recording, window) in enumerate(whole if path.suffix == ".mcap" else parts):
+        file = path
+        if recording is not None:
+            folder = path / recording.relative_to(view.memory.index.bag_dir)
+            folder.mkdir(parents=True, exist_ok=True)
+            file = folder / f"{recording.name}_{nth}.mcap"
+        found = (
+            stored
+            for stored in _messages(view, spans, window)
+            if recording in (None, stored.bag.recording)
+        )
         with suppress(NoDataError):  # all that it has, another recording has too
-            count += written(folder / f"{recording.name}_{nth}.mcap", found)
+            defined = with_definitions(found, view.memory.reader, undefined)
+            count += write_mcap(file, defined, profile)
     return count
 
 
@@ -260,18 +241,18 @@ def _messages(
             for topic, some in spans.items()
             if any(start < window.stop and window.start < stop for start, stop in some)
         ]
-        for each in view.stream.messages(topics, window) if topics else ():
-            some = spans[each.record.channel.topic]
-            nth = bisect_right(some, (each.time, MAX_NS)) - 1
-            if nth >= 0 and each.time < some[nth][1]:
-                yield each
+        for stored in view.stream.messages(topics, window) if topics else ():
+            some = spans[stored.record.channel.topic]
+            nth = bisect_right(some, (stored.time, MAX_NS)) - 1
+            if nth >= 0 and stored.time < some[nth][1]:
+                yield stored
 
 
 def _words(question: str) -> list[str]:
     """Returns the tool and its arguments: one JSON object, or `key=value` each."""
     tool, _, rest = question.strip().partition(" ")
     given = [rest] if rest.lstrip().startswith("{") else re.split(r"\s+(?=\w+=)", rest.strip())
-    return [tool, *(each for each in given if each)]
+    return [tool, *filter(None, given)]
 
 
 def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonValue:
@@ -290,7 +271,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
 
 def _differing(one: JsonValue, other: JsonValue) -> tuple[list[str], list[str]]:
     """Returns the keys in which two replies differ: those on files, and the others."""
-    one, other = (_NEVER if each is None else each for each in (one, other))
+    one, other = (_NEVER if reply is None else reply for reply in (one, other))
     if not isinstance(one, dict) or not isinstance(other, dict):
         return [], [] if one == other else ["all"]
     keys = [key for key in dict.fromkeys((*one, *other)) if one.get(key) != other.get(key)]

@@ -1,31 +1,32 @@
-"""`ros2-memory up`: proposes what to record on a robot, and records and serves it."""
+"""`ros2-memory up`: proposes what to record on a robot, and records and serves it.
+
+The recorder and the server are its children; it shows what comes in.
+"""
 
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import time
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
 import typer
+from rich.live import Live
 
 from ros2_memory.bag_dir.durable_write import write_durably
+from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.bag_dir.layout import ROS_LOG_DIR
 from ros2_memory.bootstrap import build_reader
-from ros2_memory.cli.options import (
-    MB,
-    BagDir,
-    Overrides,
-    load_with_sources,
-    print_line,
-    spinner,
-)
-from ros2_memory.cli.output import escape
-from ros2_memory.cli.programs import run_programs
+from ros2_memory.cli.options import MB, BagDir, Overrides, load_for
+from ros2_memory.cli.output import escape, format_duration, print_line, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import WallClock, unix_from_ns
+from ros2_memory.recorder.process.child import Child, Patience, end_all
 from ros2_memory.recorder.process.environment import (
     advice_on_rmw,
     advice_on_silence,
@@ -54,6 +55,12 @@ from ros2_memory.retention.policy import GB
 
 SECONDS: Final = 5.0
 """How long topics are measured."""
+EVERY_S: Final = 10.0
+"""Without a terminal, a line is printed so often, and when the state changes."""
+_TICK_S: Final = 0.2
+_PATIENCE: Final = Patience(interrupt_s=40.0, terminate_s=5.0)
+"""The recorder waits for children of its own."""
+_LOGGING: Final = ("logging.level=warning", "logging.format=pretty")
 
 
 class _Robot(NamedTuple):
@@ -78,7 +85,7 @@ def up(
     install: Annotated[
         bool, typer.Option("--install", help="Install as services, instead of starting here.")
     ] = False,
-) -> None:
+) -> bool:
     """Record this robot and answer questions about it, in one line, until Ctrl-C.
 
     Finds ROS 2, measures what its topics bring, proposes a topics.yaml beside the bags, and asks.
@@ -86,7 +93,7 @@ def up(
     """
     script = _install_script() if install else None
     words = [*([] if is_deployment_chosen(words or []) else ["deployment=robot"]), *(words or [])]
-    settings, sources = load_with_sources(bag_dir, words)
+    settings, sources = load_for(bag_dir, words)
     if isinstance(settings.recorder, NullRecorderNode) or settings.server.transport == "stdio":
         raise ConfigError(
             "`up` records, and serves over HTTP: choose deployment=robot, or recorder=ros2bag and "
@@ -118,7 +125,7 @@ def up(
         _propose(robot, found, disk, yes=yes)
     if script is not None:
         _hand_over(script, robot)
-    raise typer.Exit(run_programs(robot.words, robot.bag_dir))
+    return _run_programs(robot.words, robot.bag_dir)
 
 
 def _find_robot(
@@ -281,3 +288,71 @@ def _hand_over(script: Path, robot: _Robot) -> None:
     argv = [program, f"PYTHON={sys.executable}", str(script), "--topics", str(robot.list_file)]
     print_line(" ".join(argv))
     os.execvp(program, argv)  # noqa: S606 - there is nothing for a shell to do
+
+
+def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
+    """Records and serves until Ctrl-C, and returns whether a program ended itself, or did not end.
+
+    Whatever happens, both are ended, and waited for.
+    """
+    # A shell that starts this in the background has it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    programs: dict[str, Child] = {}
+    died = ""
+    modules = {"recorder": ["recorder"], "server": ["server", "--page", "print"]}
+    try:
+        for name, (module, *options) in modules.items():
+            argv = ["-m", f"ros2_memory.{module}", *options, *words, *_LOGGING]
+            programs[name] = Child.start([sys.executable, *argv], os.environ, patience=_PATIENCE)
+        died = _watch(programs, bag_dir)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        # A second Ctrl-C would leave them behind; how long they may take is bounded.
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        left = end_all(programs.values())
+    if died:
+        print(f"ros2-memory up: {died}", file=sys.stderr)
+    elif not left:
+        print_line(f"recorder and server have ended; the bags are in {bag_dir}")
+    return bool(left or died)
+
+
+def _watch(programs: Mapping[str, Child], bag_dir: Path) -> str:
+    """Shows what comes in, until a program ends; returns which one, and its last words."""
+    console = stdout_console()
+    before, due_s = "", 0.0
+    last = dict.fromkeys(programs, "it gave no reason")
+    with Live(console=console, auto_refresh=False) as live:
+        while True:
+            for name, child in programs.items():
+                status = child.exit_status()
+                for line in filter(None, map(escape, child.take_lines())):
+                    if "http://" not in line:  # the address of the page is no reason
+                        last[name] = line
+                    console.print(f"{name}: {line}", soft_wrap=True)
+                if status is not None:
+                    return f"the {name} ended with status {status}: {last[name]}"
+            beat = read_heartbeat(bag_dir).heartbeat
+            state, line = "starting", "recorder: starting"
+            if beat is not None and beat.pid == programs["recorder"].pid:
+                state, line = _line_of(beat)
+            if console.is_terminal:
+                live.update(escape(line), refresh=True)
+            elif state != before or time.monotonic() >= due_s:
+                before, due_s = state, time.monotonic() + EVERY_S
+                print_line(escape(line))
+            time.sleep(_TICK_S)
+
+
+def _line_of(beat: Heartbeat) -> tuple[str, str]:
+    """Returns the recorder's state, and a line on it with what comes in."""
+    heard = len({*beat.subscribed} - {*beat.silent})
+    for_s = unix_from_ns(WallClock().now() - beat.since)
+    line = f"recorder: {beat.state} for {format_duration(for_s)}, {counted(heard, 'topic')}"
+    why = beat.waiting_for or (None if beat.recovered else beat.last_error)
+    if beat.silent:
+        line += f", silent: {listed(beat.silent)}"
+    line += f", {beat.bytes_written / MB:.1f} MB{f'; {why}' if why else ''}"
+    return f"{beat.state} {heard}", line

@@ -3,8 +3,8 @@
 import itertools
 import json
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
@@ -17,13 +17,15 @@ from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.cli.listing.info import usual_rate
-from ros2_memory.cli.options import (
-    AsJson,
-    Bags,
+from ros2_memory.cli.options import AsJson, Bags
+from ros2_memory.cli.output import (
+    escape,
+    format_duration,
+    format_time,
     print_line,
     stdout_console,
+    with_commands,
 )
-from ros2_memory.cli.output import escape, format_duration, format_time, with_commands
 from ros2_memory.core.errors import BagError, InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
@@ -92,34 +94,28 @@ class Observation:
     rates: tuple[TopicRate, ...]
     live: bool
 
-    @property
-    def recorder(self) -> str:
-        """The recorder's state."""
-        status = self.status
-        if status.recorder is None:
-            return "none"
+    def head(self, gap: str) -> str:
+        """Returns the recorder's state, and behind a gap how old the newest data is."""
+        status, latest = self.status, self.status.latest
         times = f", restarted {counted(status.restarts, 'time')}" if status.restarts else ""
-        return f"{status.recorder}{times}"
+        recorder = "none" if status.recorder is None else f"{status.recorder}{times}"
+        if latest is None:
+            newest = "no data"
+        elif status.now == latest != self.now:
+            newest = f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
+        else:
+            age_s = unix_from_ns(status.now - (status.heard or latest))
+            newest = f"{format_duration(age_s)} old"
+            if age_s < 0:
+                newest = f"dated {format_duration(-age_s)} ahead of the clock"
+        return f"recorder: {recorder}{gap}newest: {newest}"
 
     @property
     def problems(self) -> list[str]:
         """Why answers may be incomplete."""
         missing = self.status.missing if self.status.live else ()
         unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
-        return [escape(with_commands(each)) for each in (*unoffered, *self.status.problems)]
-
-    @property
-    def newest(self) -> str:
-        """How old the newest data is."""
-        latest = self.status.latest
-        if latest is None:
-            return "no data"
-        if self.status.now == latest != self.now:
-            return f"{format_time(unix_from_ns(latest))}, which is now (data.now=latest)"
-        age_s = unix_from_ns(self.status.now - (self.status.heard or latest))
-        if age_s < 0:
-            return f"dated {format_duration(-age_s)} ahead of the clock"
-        return f"{format_duration(age_s)} old"
+        return [escape(with_commands(line)) for line in (*unoffered, *self.status.problems)]
 
     @property
     def not_live(self) -> str:
@@ -145,147 +141,121 @@ def watch(
     words = ["reader.include_active=true", *(bags.words or ())]
     memory = replace(bags, words=words).memory()
     console = stdout_console()
-    try:
-        if as_json:
-            for each in _observations(memory, every, count):
-                print_line(json.dumps(as_object(each)))
-        elif console.is_terminal:
-            with Live(console=console, auto_refresh=False) as live:
-                for each in _observations(memory, every, count):
-                    live.update(Group(*as_screen(each)), refresh=True)
-        else:
-            for each in _observations(memory, every, count):
-                print_line(as_line(each))
-    except KeyboardInterrupt:
-        raise typer.Exit from None
+    is_screen = console.is_terminal and not as_json
+    screen = Live(console=console, auto_refresh=False) if is_screen else nullcontext()
+    with suppress(KeyboardInterrupt), screen as live:
+        for number in itertools.count(1):
+            seen = _observed(memory)
+            if live is not None:
+                live.update(_screen(seen), refresh=True)
+            else:
+                print_line(json.dumps(_as_object(seen)) if as_json else _line(seen))
+            if number == count:
+                break
+            time.sleep(every)
+            memory.index.refresh()
 
 
-def _observations(memory: Memory, every_s: float, count: int | None) -> Iterator[Observation]:
-    """Yields the current state, now and every so many seconds."""
-    for number in itertools.count(1):
-        snapshot, wall = memory.index.snapshot(), memory.clock.now()
-        status = memory_status(memory, Call())
-        live = _is_live(memory, snapshot, status, wall)
-        yield Observation(wall, status, tuple(_rates(memory, snapshot)), live)
-        if number == count:
-            return
-        time.sleep(every_s)
-        memory.index.refresh()
+def _observed(memory: Memory) -> Observation:
+    """Returns the current state.
 
-
-def _is_live(memory: Memory, snapshot: Snapshot, status: Status, wall: Ns) -> bool:
-    """Returns whether the newest data is what is being recorded.
-
-    With `data.now=latest`, as in a simulation, its age says nothing: a live recorder does, or a
-    file that grows.
+    Where `data.now=latest`, as in a simulation, the age of the newest data says nothing on whether
+    it is live: a live recorder does, or a file that grows.
     """
-    latest = snapshot.dating.latest
-    if latest is None:
-        return False
+    snapshot, wall = memory.index.snapshot(), memory.clock.now()
+    status, latest = memory_status(memory, Call()), snapshot.dating.latest
+    splits = ns_from_unix(LIVE_SPLITS * memory.limits.split_duration_s)
+    live = latest is not None and abs(wall - latest) <= max(splits, LIVE_NS)
     if memory.limits.now == "latest":
         is_recording = status.live and status.recorder == RecorderState.RECORDING
-        return is_recording or bool(snapshot.active)
-    splits = ns_from_unix(LIVE_SPLITS * memory.limits.split_duration_s)
-    return abs(wall - latest) <= max(splits, LIVE_NS)
+        live = latest is not None and (is_recording or bool(snapshot.active))
+    rates = () if latest is None else tuple(_rates(memory, snapshot, latest))
+    return Observation(wall, status, rates, live)
 
 
-def _rates(memory: Memory, snapshot: Snapshot) -> Iterator[TopicRate]:
+def _rates(memory: Memory, snapshot: Snapshot, latest: Ns) -> Iterator[TopicRate]:
     """Yields the rate of every topic that is not latched.
 
     Without a usual rate for logs, and for topics whose last messages were deleted by request.
     """
-    latest = snapshot.dating.latest
-    if latest is None:
-        return
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
-    latching = memory.limits.latching
-    for topic in snapshot.timeline.topics():
+    timeline, latching = snapshot.timeline, memory.limits.latching
+    for topic in timeline.topics():
         if latching.is_latched(snapshot, topic):
             continue
-        last = max(each.last for each in snapshot.timeline.totals(topic).values())
-        rate = _count(memory, snapshot, topic, window) / unix_from_ns(WINDOW_NS)
-        age_s = max(unix_from_ns(latest - last), 0.0)
+        count = 0
+        for bag in dict.fromkeys(bag for bag, *_ in timeline.extents(topic, window)):
+            # Of a bag that was deleted, or is not complete yet, the next observation sees more.
+            with suppress(BagError):
+                count += len(memory.reader.log_times(bag.path, topic, window))
+        last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)
-        if snapshot.timeline.is_log(topic) or was_forgotten(memory.index.bag_dir, topic, since):
+        if timeline.is_log(topic) or was_forgotten(memory.index.bag_dir, topic, since):
             usual = None
-        yield TopicRate(topic, rate, usual, age_s)
+        age_s = max(unix_from_ns(latest - last), 0.0)
+        yield TopicRate(topic, count / unix_from_ns(WINDOW_NS), usual, age_s)
 
 
-def _count(memory: Memory, snapshot: Snapshot, topic: str, window: TimeWindow) -> int:
-    """Counts the messages of a topic in a window, as far as they can be read."""
-    count = 0
-    for bag in dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window)):
-        # Of a bag that was deleted, or is not complete yet, the next observation sees more.
-        with suppress(BagError):
-            count += len(memory.reader.log_times(bag.path, topic, window))
-    return count
-
-
-def as_object(seen: Observation) -> dict[str, JsonValue]:
+def _as_object(seen: Observation) -> dict[str, JsonValue]:
     """Returns an observation for programs: times in Unix seconds, rates in Hz, ages in seconds."""
     status = seen.status
-    latest = status.latest
     return {
         "now": unix_from_ns(seen.now),
         "recorder": status.recorder,
         "recorder_alive": status.live,
-        "latest": None if latest is None else unix_from_ns(latest),
+        "latest": None if status.latest is None else unix_from_ns(status.latest),
         "is_live": seen.live,
         "topics": [
             {
-                "topic": each.topic,
-                "rate_hz": round(each.rate, 3),
-                "usual_hz": each.usual,
-                "age_s": round(each.age_s, 3),
-                "assessment": each.assessment if seen.live else None,
+                "topic": rate.topic,
+                "rate_hz": round(rate.rate, 3),
+                "usual_hz": rate.usual,
+                "age_s": round(rate.age_s, 3),
+                "assessment": rate.assessment if seen.live else None,
             }
-            for each in seen.rates
+            for rate in seen.rates
         ],
         "problems": [*seen.problems],
     }
 
 
-def as_line(seen: Observation) -> str:
+def _line(seen: Observation) -> str:
     """Returns an observation in one line, for logs; it names the topics that are not as usual."""
-    parts: list[str] = []
+    parts = [seen.not_live] if seen.rates else []
     if seen.live:
-        unusual = [each for each in seen.rates if each.assessment != AS_USUAL]
-        usual = counted(len(seen.rates) - len(unusual), "topic")
+        unusual = [rate for rate in seen.rates if rate.assessment != AS_USUAL]
+        usual = len(seen.rates) - len(unusual)
         parts = [
-            f"{usual} at {'its' if len(seen.rates) - len(unusual) == 1 else 'their'} usual rate",
-            *(f"{escape(each.topic)} {each}" for each in unusual),
+            f"{counted(usual, 'topic')} at {'its' if usual == 1 else 'their'} usual rate",
+            *(f"{escape(rate.topic)} {rate}" for rate in unusual),
         ]
-    elif seen.rates:
-        parts = [seen.not_live]
-    head = f"recorder: {seen.recorder}; newest: {seen.newest}"
+    head = seen.head("; ")
     return f"{format_time(unix_from_ns(seen.now))} {'; '.join([head, *parts, *seen.problems])}"
 
 
-def as_screen(seen: Observation) -> Sequence[Text | Table]:
+def _screen(seen: Observation) -> Group:
     """Returns an observation as a screen: a headline, a table of topics, and problems."""
     budget = seen.status.budget
     most = "" if budget.most is None else f" of {budget.most / GB:.3g}"
     head = Text.assemble(
         (format_time(unix_from_ns(seen.now)), "bold"),
-        f"  recorder: {seen.recorder}  newest: {seen.newest}  "
-        f"used: {budget.used / GB:.3g}{most} GB",
+        f"  {seen.head('  ')}  used: {budget.used / GB:.3g}{most} GB",
     )
-    table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    table.add_column("topic")
+    table = Table("topic", box=SIMPLE_HEAD, pad_edge=False)
     for name in ("Hz", "usually", "last"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("")
-    for each in seen.rates:
+    for rate in seen.rates:
         table.add_row(
-            Text(escape(each.topic)),
-            f"{each.rate:.1f}",
-            "-" if each.usual is None else f"{each.usual:.1f}",
-            f"{each.age_s:.1f} s",
-            Text(each.assessment, style=_STYLES[each.assessment]) if seen.live else Text(""),
+            Text(escape(rate.topic)),
+            f"{rate.rate:.1f}",
+            "-" if rate.usual is None else f"{rate.usual:.1f}",
+            f"{rate.age_s:.1f} s",
+            Text(rate.assessment, style=_STYLES[rate.assessment]) if seen.live else Text(""),
         )
-    problems = [Text(each, style="red") for each in seen.problems]
+    problems = [Text(line, style="red") for line in seen.problems]
     if seen.rates and not seen.live:
         note = f"{seen.not_live}; the rates are those of the last 10 s of data"
         problems.insert(0, Text(note, style="yellow"))
-    return (head, table, *problems)
+    return Group(head, table, *problems)

@@ -7,10 +7,11 @@ is the right one, and returns the answer as a sentence. It raises `WrongAnswerEr
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, ns_from_unix
-from ros2_memory.demo import published_topics, robot
+from ros2_memory.demo import robot
 from ros2_memory.demo.answer_checks import (
     METRES,
     CallContext,
@@ -26,17 +27,26 @@ from ros2_memory.demo.answer_checks import (
     within,
 )
 from ros2_memory.demo.floor_plan import room_at
-from ros2_memory.demo.messages import description
-from ros2_memory.demo.published_topics import STREAMS
+from ros2_memory.demo.messages import description, listed_in_words
+from ros2_memory.demo.published_topics import (
+    BATTERY,
+    ODOM,
+    PATH_CLEAR,
+    SCENE_DESCRIPTION,
+    SCENE_OBJECTS,
+    STREAMS,
+)
 from ros2_memory.demo.robot import Planar
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.demo.published_topics import Message
 
 Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
+Tell: TypeAlias = "Callable[[JsonValue, Message, str], str]"
+"""Checks what a reply has of a message, and returns the answer in words, with its time in words."""
 
 NEAR_M: Final = 0.5
 """The radius of a place: the server's default `data.position_tolerance_m`."""
@@ -45,7 +55,6 @@ _MPS: Final = 1e-3
 _SHARE_OF_PATH: Final = 1e-3
 _INTERPOLATED_M: Final = 5e-3
 _BY_TOPIC: Final = {stream.topic: stream for stream in STREAMS}
-_ODOM: Final = _BY_TOPIC[published_topics.ODOM]
 
 
 def in_odom(place: Planar) -> Planar:
@@ -81,94 +90,116 @@ def topics(reply: JsonValue, call: CallContext) -> str:
         counts[stream.topic] = call.timeline.count(stream, newest.log_time)
         same(f"count of {stream.topic}", number(row, "count"), counts[stream.topic])
     total = sum(counts.values())
-    of_odom = counts[published_topics.ODOM]
+    of_odom = counts[ODOM]
     return f"{total:,} messages on {len(counts)} topics, {of_odom:,} on /odom."
 
 
-def position(seconds_ago: float) -> Judge:
-    """Judges the pose of `/odom` so long ago."""
+def _ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
+    """Judges the message of a topic so long ago; `tell` checks what it holds."""
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        message = match_time(number(reply, "timestamp"), call.ago(_ODOM, seconds_ago))
-        return f"{_at_place(reply, message)}, facing {_facing(reply, message.t)}."
+        candidates = call.ago(_BY_TOPIC[topic], seconds_ago)
+        return tell(reply, match_time(number(reply, "timestamp"), candidates), "")
 
     return judge
 
 
-def velocity(seconds_ago: float) -> Judge:
-    """Judges the twist of `/odom` so long ago."""
+def _pose(reply: JsonValue, message: Message, _when: str) -> str:
+    same("frame", text(reply, "frame_id"), "odom")
+    yaw = number(reply, "yaw_deg")
+    near_angle("yaw", yaw, robot.pose(message.t).yaw)
+    return f"{_at_place(reply, message)}, facing {yaw:.0f} degrees."
+
+
+def _twist(reply: JsonValue, message: Message, _when: str) -> str:
+    forward, turning = robot.twist(message.t)
+    near("forward speed", number(reply, "linear", "x"), forward, _MPS)
+    near("turning rate", number(reply, "angular", "z"), turning, _MPS)
+    way, rate = "backwards" if forward < 0 else "forwards", math.degrees(turning)
+    turn = f"turning {'left' if rate > 0 else 'right'} at {abs(rate):.0f} degrees/s"
+    return f"{abs(forward):.2f} m/s {way}, {turn if abs(rate) >= 1 else 'straight on'}."
+
+
+def _charge(reply: JsonValue, message: Message, _when: str) -> str:
+    charge = number(reply, "value", "percentage")
+    near("charge", charge, robot.battery(message.t), 1e-6)
+    return f"{charge:.1%}."
+
+
+position: Final = partial(_ago, ODOM, _pose)
+velocity: Final = partial(_ago, ODOM, _twist)
+battery: Final = partial(_ago, BATTERY, _charge)
+
+
+def _last(topic: str, holds: Callable[[float], bool], tell: Tell, then: str | None = None) -> Judge:
+    """Judges when something last was so in the messages of a topic.
+
+    `tell` checks what the reply has of that message, or of the one of the topic `then` at or before
+    it.
+    """
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        message = match_time(number(reply, "timestamp"), call.ago(_ODOM, seconds_ago))
-        forward, turning = robot.twist(message.t)
-        near("forward speed", number(reply, "linear", "x"), forward, _MPS)
-        near("turning rate", number(reply, "angular", "z"), turning, _MPS)
-        return f"{abs(forward):.2f} m/s {_way(forward)}, {_turn(turning)}."
+        moment = number(reply, "timestamp")
+        found = match_time(moment, call.last_where(_BY_TOPIC[topic], holds))
+        if then is not None:
+            newest = call.timeline.newest(_BY_TOPIC[then], found.log_time)
+            found = match_time(number(reply, "value_timestamp"), [newest] if newest else [])
+        return tell(reply, found, f"at {call.when(moment)}")
 
     return judge
+
+
+def _labels(reply: JsonValue, message: Message) -> str:
+    """Checks the objects in view, and returns their names for a sentence."""
+    labels = [text(found, "label") for found in items(reply, "value", "detections")]
+    same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
+    return listed_in_words(labels)
 
 
 def seen_near(place: Planar) -> Judge:
     """Judges what the camera saw when the robot last was at a place."""
-    spot = in_odom(place)
 
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = number(reply, "timestamp")
-        match = match_time(moment, call.last_where(_ODOM, _near(spot)))
-        then = _message_at(reply, call, published_topics.SCENE_OBJECTS, match)
-        labels = [text(found, "label") for found in items(reply, "value", "detections")]
-        same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(then.t)))
-        return f"{_listed(labels).capitalize()}, at {call.when(moment)}."
+    def tell(reply: JsonValue, message: Message, when: str) -> str:
+        return f"{_labels(reply, message).capitalize()}, {when}."
 
-    return judge
+    return _last(ODOM, _near(place), tell, SCENE_OBJECTS)
 
 
 def last_near(place: Planar) -> Judge:
     """Judges when the robot last was at a place."""
-    spot = in_odom(place)
 
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = number(reply, "timestamp")
-        message = match_time(moment, call.last_where(_ODOM, _near(spot)))
+    def tell(reply: JsonValue, message: Message, when: str) -> str:
         _at_place(at(reply, "value", "position"), message)
-        return f"At {call.when(moment)}."
+        return f"{when.capitalize()}."
 
-    return judge
+    return _last(ODOM, _near(place), tell)
 
 
-def path_clear(reply: JsonValue, call: CallContext) -> str:
-    """Judges when the path was last clear."""
-    moment = number(reply, "timestamp")
-    match_time(moment, call.last_where(_BY_TOPIC[published_topics.PATH_CLEAR], robot.path_clear))
+def _clear(reply: JsonValue, _message: Message, when: str) -> str:
     same("value", at(reply, "value", "value"), expected=True)
-    return f"At {call.when(moment)}."
+    return f"{when.capitalize()}."
+
+
+path_clear: Final = _last(PATH_CLEAR, robot.path_clear, _clear)
 
 
 def last_seen(label: str) -> Judge:
     """Judges when an object was last seen."""
 
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = number(reply, "timestamp")
-        sighting = call.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
-        message = match_time(moment, sighting)
-        same("topic", text(reply, "topic"), published_topics.SCENE_OBJECTS)
-        labels = [text(found, "label") for found in items(reply, "value", "detections")]
-        same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
-        return f"At {call.when(moment)}; in view: {_listed(labels)}."
+    def tell(reply: JsonValue, message: Message, when: str) -> str:
+        same("topic", text(reply, "topic"), SCENE_OBJECTS)
+        return f"{when.capitalize()}; in view: {_labels(reply, message)}."
 
-    return judge
+    return _last(SCENE_OBJECTS, _sees(label), tell)
 
 
 def where_seen(label: str) -> Judge:
     """Judges where the robot was when it last saw an object."""
 
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        moment = number(reply, "timestamp")
-        sighting = call.last_where(_BY_TOPIC[published_topics.SCENE_OBJECTS], _sees(label))
-        message = _message_at(reply, call, published_topics.ODOM, match_time(moment, sighting))
-        return f"{_at_place(at(reply, 'value', 'position'), message)}, at {call.when(moment)}."
+    def tell(reply: JsonValue, message: Message, when: str) -> str:
+        return f"{_at_place(at(reply, 'value', 'position'), message)}, {when}."
 
-    return judge
+    return _last(SCENE_OBJECTS, _sees(label), tell, ODOM)
 
 
 def driven(seconds: float) -> Judge:
@@ -176,17 +207,19 @@ def driven(seconds: float) -> Judge:
     window = ns_from_unix(seconds)
 
     def judge(reply: JsonValue, call: CallContext) -> str:
+        stream = _BY_TOPIC[ODOM]
         start, end = number(reply, "start"), number(reply, "end")
-        last = match_time(end, call.newest_known(_ODOM))
-        begun = (call.before - window, call.after - window + _ODOM.period + NS_PER_MS)
+        last = match_time(end, call.newest_known(stream))
+        begun = (call.before - window, call.after - window + stream.period + NS_PER_MS)
         within("start", start, begun)
-        newest = call.timeline.newest(_ODOM, ns_from_unix(start) + NS_PER_MS)
+        newest = call.timeline.newest(stream, ns_from_unix(start) + NS_PER_MS)
         first = match_time(start, [newest] if newest else [])
         expected = robot.driven(last.t) - robot.driven(first.t)
         near("distance", number(reply, "distance_m"), expected, METRES + _SHARE_OF_PATH * expected)
         near("duration", number(reply, "duration_s"), end - start, 2e-3)
         near("mean speed", number(reply, "avg_speed"), expected / (end - start), _MPS)
-        fastest = max(_speeds(call, first, last))
+        between = (call.timeline.message(stream, k).t for k in range(first.k, last.k + 1))
+        fastest = max(abs(robot.twist(t)[0]) for t in between)
         near("top speed", number(reply, "max_speed"), fastest, _MPS)
         return (
             f"{expected:.2f} m, at up to {fastest:.2f} m/s, in the {end - start:.1f} s of it that "
@@ -206,9 +239,9 @@ def camera_in_map(seconds_ago: float) -> Judge:
         t = (ns_from_unix(moment) - call.timeline.t0) / NS_PER_S
         truth = robot.pose_in_map(t).then(Planar(robot.CAMERA[0], robot.CAMERA[1], 0.0))
         x, y, z = (number(reply, "translation", axis) for axis in "xyz")
-        near("x", x, truth.x, _INTERPOLATED_M)
-        near("y", y, truth.y, _INTERPOLATED_M)
-        near("z", z, robot.CAMERA[2], _INTERPOLATED_M)
+        expected = truth.x, truth.y, robot.CAMERA[2]
+        for axis, got, right in zip("xyz", (x, y, z), expected, strict=True):
+            near(axis, got, right, _INTERPOLATED_M)
         near_angle("yaw", number(reply, "yaw_deg"), truth.yaw, tolerance_deg=0.2)
         return (
             f"In the {room_at(x)}, {x:.2f} m east and {y:.2f} m north of the flat's corner, "
@@ -232,25 +265,12 @@ def frames(reply: JsonValue, _call: CallContext) -> str:
     return "map > odom > base_link > camera and laser; only base_link moves."
 
 
-def battery(seconds_ago: float) -> Judge:
-    """Judges the charge so long ago."""
-
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        stream = _BY_TOPIC[published_topics.BATTERY]
-        message = match_time(number(reply, "timestamp"), call.ago(stream, seconds_ago))
-        charge = number(reply, "value", "percentage")
-        near("charge", charge, robot.battery(message.t), 1e-6)
-        return f"{charge:.1%}."
-
-    return judge
-
-
 def descriptions(seconds: float, at_most: int) -> Judge:
     """Judges the descriptions of the last seconds, thinned to a few samples."""
     window = ns_from_unix(seconds)
 
     def judge(reply: JsonValue, call: CallContext) -> str:
-        stream = _BY_TOPIC[published_topics.SCENE_DESCRIPTION]
+        stream = _BY_TOPIC[SCENE_DESCRIPTION]
         samples = items(reply, "samples")
         total = int(number(reply, "total"))
         same("samples", len(samples), min(total, at_most))
@@ -279,7 +299,9 @@ def nothing_on(topic: str) -> Judge:
     return judge
 
 
-def _near(spot: Planar) -> Callable[[float], bool]:
+def _near(place: Planar) -> Callable[[float], bool]:
+    spot = in_odom(place)
+
     def holds(t: float) -> bool:
         here = robot.pose(t)
         return math.hypot(here.x - spot.x, here.y - spot.y) <= NEAR_M
@@ -291,47 +313,11 @@ def _sees(label: str) -> Callable[[float], bool]:
     return lambda t: any(thing.label == label for thing in robot.seen(t))
 
 
-def _message_at(reply: JsonValue, call: CallContext, topic: str, match: Message) -> Message:
-    """Returns the message of a topic at or before the match, which must be that of the reply."""
-    newest = call.timeline.newest(_BY_TOPIC[topic], match.log_time)
-    return match_time(number(reply, "value_timestamp"), [newest] if newest else [])
-
-
 def _at_place(point: JsonValue, message: Message) -> str:
     """Checks a position in `odom`, and returns where in the flat it is."""
     truth = robot.pose(message.t)
-    x, y = number(point, "x"), number(point, "y")
-    near("x", x, truth.x, METRES)
-    near("y", y, truth.y, METRES)
-    near("z", number(point, "z"), 0.0, METRES)
+    x, y, z = (number(point, axis) for axis in "xyz")
+    for axis, got, expected in (("x", x, truth.x), ("y", y, truth.y), ("z", z, 0.0)):
+        near(axis, got, expected, METRES)
     there = robot.MAP_TO_ODOM.then(Planar(x, y, 0.0))
     return f"In the {room_at(there.x)}, at x {x:.2f} m, y {y:.2f} m in odom"
-
-
-def _facing(reply: JsonValue, t: float) -> str:
-    same("frame", text(reply, "frame_id"), "odom")
-    yaw = number(reply, "yaw_deg")
-    near_angle("yaw", yaw, robot.pose(t).yaw)
-    return f"{yaw:.0f} degrees"
-
-
-def _way(forward: float) -> str:
-    return "backwards" if forward < 0 else "forwards"
-
-
-def _turn(turning: float) -> str:
-    rate = math.degrees(turning)
-    side = "left" if rate > 0 else "right"
-    return f"turning {side} at {abs(rate):.0f} degrees/s" if abs(rate) >= 1 else "straight on"
-
-
-def _speeds(call: CallContext, first: Message, last: Message) -> list[float]:
-    moments = (call.timeline.message(_ODOM, k).t for k in range(first.k, last.k + 1))
-    return [abs(robot.twist(t)[0]) for t in moments]
-
-
-def _listed(names: Sequence[str]) -> str:
-    """Formats names for a sentence."""
-    if not names:
-        return "nothing"
-    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)

@@ -64,8 +64,14 @@ def definition(type_name: str) -> str:
 def description(t: float) -> str:
     """Returns the robot's description of what it sees: "In the hall I see shoes and umbrella."."""
     labels = [thing.label for thing in robot.seen(t)]
-    listed = " and ".join([", ".join(labels[:-1]), labels[-1]] if labels[1:] else labels)
-    return f"In the {robot.place(t)} I see {listed or 'nothing'}."
+    return f"In the {robot.place(t)} I see {listed_in_words(labels)}."
+
+
+def listed_in_words(names: Sequence[str]) -> str:
+    """Returns names for a sentence: `shoes, plant and umbrella`."""
+    if not names:
+        return "nothing"
+    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
 
 
 @cache

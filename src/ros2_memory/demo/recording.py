@@ -10,7 +10,9 @@ after the next one was opened.
 from __future__ import annotations
 
 import threading
-from typing import IO, TYPE_CHECKING, Final, Self
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import IO, TYPE_CHECKING, Final
 
 import yaml
 from mcap.writer import CompressionType, Writer
@@ -21,9 +23,7 @@ from ros2_memory.demo.messages import definition, payload
 from ros2_memory.demo.published_topics import STREAMS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
-    from types import TracebackType
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Clock
@@ -34,65 +34,29 @@ _FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}
 _STOP_WITHIN_S: Final = 10.0
 
 
-class SplitWriter:
-    """Writes one MCAP file; `first` and `last` are log times, None while empty."""
+@dataclass(slots=True)
+class _Split:
+    """One MCAP file that is being written; `first` and `last` are log times."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.first: Ns | None = None
-        self.last: Ns | None = None
-        self.count = 0
-        self._file: IO[bytes] = path.open("xb")
-        self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="ros2-memory demo")
-        schemas = {
-            name: self._writer.register_schema(name, "ros2msg", definition(name).encode())
-            for name in dict.fromkeys(stream.type for stream in STREAMS)
-        }
-        self._channels = {
-            stream.topic: self._writer.register_channel(
-                stream.topic,
-                "cdr",
-                schemas[stream.type],
-                {"offered_qos_profiles": yaml.safe_dump([_qos(stream)], sort_keys=False)},
-            )
-            for stream in STREAMS
-        }
-
-    def full(self, log_time: Ns, duration: Ns) -> bool:
-        """Returns whether a message of this log time belongs into the next split."""
-        return self.first is not None and log_time - self.first > duration
-
-    def add(self, message: Message) -> None:
-        """Appends one message."""
-        self._writer.add_message(
-            self._channels[message.stream.topic],
-            message.log_time,
-            payload(message),
-            message.publish_time,
-            self.count,
-        )
-        self.first = message.log_time if self.first is None else self.first
-        self.last = message.log_time
-        self.count += 1
-
-    def flush(self) -> None:
-        """Passes every finished chunk to the operating system."""
-        self._file.flush()
-
-    def close(self) -> None:
-        """Writes the last chunk, the summary and the footer."""
-        try:
-            self._writer.finish()
-        finally:
-            self._file.close()
+    file: IO[bytes]
+    writer: Writer
+    channels: dict[str, int]
+    first: Ns
+    last: Ns
+    count: int = 0
 
 
-class DemoRecorder:
+class DemoRecorder(AbstractContextManager["DemoRecorder"]):
     """Writes a `MessageSchedule` into `directory`: at once up to now, then as time passes.
 
     The directory must not exist (as with `ros2 bag record`); its name is the recording's. As a
     context manager it stops at the end of the block, and leaves a cleanly closed recording.
+
+    Attributes:
+        directory: of the recording.
+        timeline: what is recorded.
+        splits: the number of files; all but the last are closed, and `stop` closes that.
+        failure: the error that ended the live recording early, such as a full disk.
     """
 
     def __init__(
@@ -106,36 +70,19 @@ class DemoRecorder:
         directory.mkdir(parents=True)
         self.directory = directory
         self.timeline = timeline
+        self.splits = 0
+        self.failure: OSError | None = None
         self._duration = ns_from_unix(split_duration_s)
         self._clock = clock or WallClock()
-        self._due: Iterator[Message] = timeline.everything()
+        self._due = timeline.everything()
         self._next = next(self._due)
-        self._splits: list[SplitWriter] = []
+        self._split: _Split | None = None
         self._closed: list[tuple[Ns, Ns]] = []
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._failure: OSError | None = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
-
-    @property
-    def failure(self) -> OSError | None:
-        """The error that ended the live recording early, such as a full disk."""
-        return self._failure
-
-    @property
-    def splits(self) -> int:
-        """The number of files; all but the last are closed, and `stop` closes that."""
-        return len(self._splits)
 
     def closed_ends(self, since: Ns, until: Ns) -> tuple[Ns, ...]:
         """Returns the ends of closed splits: the log times of their last messages.
@@ -143,7 +90,7 @@ class DemoRecorder:
         First the end of the newest split that was closed by the wall-clock time `since` (if there
         was one), then that of each that was closed after it up to `until`.
         """
-        closed = list(self._closed)
+        closed = [*self._closed]
         before = [end for at, end in closed if at <= since]
         return (*before[-1:], *(end for at, end in closed if since < at <= until))
 
@@ -156,8 +103,8 @@ class DemoRecorder:
         while self._next.log_time <= now:
             self._write(self._next)
             self._next = next(self._due)
-        if self._splits:
-            self._splits[-1].flush()
+        if self._split is not None:
+            self._split.file.flush()
 
     def start(self) -> None:
         """Continues as time passes, in a thread of its own, until `stop`."""
@@ -174,10 +121,9 @@ class DemoRecorder:
         if self._thread is not None:
             self._thread.join(_STOP_WITHIN_S)
             self._thread = None
-        still_open = self._splits[len(self._closed) :]
-        for split in still_open:
-            self._close(split)
-        if still_open:
+        if self._split is not None:
+            self._close(self._split)
+            self._split = None
             build_repairer().correct_metadata(self.directory)
 
     def _live(self) -> None:
@@ -185,20 +131,43 @@ class DemoRecorder:
             while not self._ending.wait(unix_from_ns(self._next.log_time - self._clock.now())):
                 self.write_until(self._clock.now())
         except OSError as error:
-            self._failure = error
+            self.failure = error
 
     def _write(self, message: Message) -> None:
-        if not self._splits or self._splits[-1].full(message.log_time, self._duration):
-            name = f"{self.directory.name}_{len(self._splits)}.mcap"
-            self._splits.append(SplitWriter(self.directory / name))
-            if len(self._splits) > 1:
-                self._close(self._splits[-2])
-        self._splits[-1].add(message)
+        split, at = self._split, message.log_time
+        if split is None or at - split.first > self._duration:
+            before, self._split = split, self._opened(at)
+            split = self._split
+            if before is not None:
+                self._close(before)
+        channel = split.channels[message.stream.topic]
+        split.writer.add_message(channel, at, payload(message), message.publish_time, split.count)
+        split.last = at
+        split.count += 1
 
-    def _close(self, split: SplitWriter) -> None:
+    def _opened(self, first: Ns) -> _Split:
+        """Returns the next split, with all channels."""
+        file = (self.directory / f"{self.directory.name}_{self.splits}.mcap").open("xb")
+        self.splits += 1
+        writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        writer.start(profile="ros2", library="ros2-memory demo")
+        types = dict.fromkeys(stream.type for stream in STREAMS)
+        schemas = {
+            name: writer.register_schema(name, "ros2msg", definition(name).encode())
+            for name in types
+        }
+        channels: dict[str, int] = {}
+        for stream in STREAMS:
+            qos = {"offered_qos_profiles": yaml.safe_dump([_qos(stream)], sort_keys=False)}
+            schema = schemas[stream.type]
+            channels[stream.topic] = writer.register_channel(stream.topic, "cdr", schema, qos)
+        return _Split(file, writer, channels, first, first)
+
+    def _close(self, split: _Split) -> None:
         # Noted first: who sees the footer must find the split among the closed ones.
-        self._closed.append((self._clock.now(), split.last or self.timeline.start))
-        split.close()
+        self._closed.append((self._clock.now(), split.last))
+        with split.file:
+            split.writer.finish()
 
 
 def _qos(stream: Stream) -> dict[str, JsonValue]:

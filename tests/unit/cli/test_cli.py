@@ -14,14 +14,12 @@ import pytest
 import yaml
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.cli.app import COMMANDS, epilog
-from ros2_memory.cli.ask import complete, parse_arguments
+from ros2_memory.cli.ask import complete
 from ros2_memory.cli.listing.info import describe_budget
-from ros2_memory.cli.output import escape, format_value
-from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
+from tests.support.housekeepers import later, recording_now
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -160,28 +158,6 @@ class TestAsk:
         assert complete("get_pos") == ["get_position_at", "get_position_seconds_ago"]
 
 
-class TestArguments:
-    def test_values_are_json_where_they_read_so_and_text_elsewhere(self) -> None:
-        given = ["a=1", "b=true", "c=scissors", 'd={"x": 1}', "e=null", "f=1=2", "g="]
-        assert parse_arguments(given, {}) == {
-            "a": 1,
-            "b": True,
-            "c": "scissors",
-            "d": {"x": 1},
-            "e": None,
-            "f": "1=2",
-            "g": "",
-        }
-
-    def test_what_a_tool_takes_as_text_stays_text(self) -> None:
-        assert parse_arguments(["topic=7"], {"topic": {"type": "string"}}) == {"topic": "7"}
-
-    @pytest.mark.parametrize("given", [["{]"], ["=1"], ["seconds"]])
-    def test_anything_else_is_refused(self, given: list[str]) -> None:
-        with pytest.raises(InvalidArgumentsError):
-            parse_arguments(given, {})
-
-
 class TestTopics:
     def test_rates_do_not_count_the_time_between_bags(self, exits: Program) -> None:
         rows = {row["topic"]: row for row in exits(0, "topics", "--json").json}
@@ -245,22 +221,7 @@ class TestInfo:
     def test_where_something_is_it_says_for_how_long_the_budget_lasts(
         self, bag_dir: Path, exits: Program
     ) -> None:
-        now = time.time_ns()
-        write_heartbeat(
-            bag_dir,
-            Heartbeat(
-                pid=os.getpid(),
-                updated=now,
-                state=RecorderState.RECORDING,
-                recordings=("rec",),
-                since=now,
-                bytes_written=0,
-                subscribed=(),
-                silent=(),
-                last_error=None,
-                interval_s=2.0,
-            ),
-        )
+        recording_now(bag_dir, "rec", clock=later(0))
         shown = exits(0, "info", "deployment=robot", "retention.max_total_gb=2.0").out
         assert "of 2 GB: bags 0" in shown
         assert "what is stored beside them 0" in shown
@@ -370,11 +331,6 @@ class TestTheProgram:
         assert "/chatter" in done.stdout
         assert done.stderr == ""
         assert "\x1b" not in done.stdout
-
-    def test_control_characters_are_spelled(self) -> None:
-        assert escape("a\x07\u202eb ß") == "a\\x07\\u202eb ß"
-        assert format_value([1.5, "x"]) == "1.5, x"
-        assert format_value([]) == format_value(None) == "-"
 
 
 @pytest.mark.parametrize("words", [["-h"], ["info", "-h"], ["config", "show", "-h"]])

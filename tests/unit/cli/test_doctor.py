@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.column_worlds import World
+from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -356,8 +357,7 @@ def lay(robot: Path, name: str, content: bytes) -> None:
     path = robot / name / f"{name}_0.mcap"
     path.parent.mkdir()
     path.write_bytes(content)
-    hour_ago = time.time() - 3600
-    os.utime(path, (hour_ago, hour_ago))
+    left(path)
 
 
 def test_bags_that_a_crash_cut_lead_to_recover(robot: Path, examined: Examined) -> None:
@@ -420,8 +420,7 @@ def test_files_that_metadata_lists_and_are_not_there_are_counted(
     text = f"rosbag2_bagfile_information:\n  version: 4\n  relative_file_paths:\n{names}"
     metadata = robot / "rec" / "metadata.yaml"
     metadata.write_text(f"{text}  message_count: 300\n")
-    hour_ago = time.time() - 3600
-    os.utime(metadata, (hour_ago, hour_ago))
+    left(metadata)
     wrong = examined(1)
     assert wrong["bags"][0]["seen"] == (
         "metadata.yaml of rec lists 12 missing files and 250 messages that no file here contains"

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sys
-import time
 from collections import Counter
 from datetime import datetime
 from pathlib import Path
@@ -43,6 +42,7 @@ from tests.support.bags import (
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
+from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -80,12 +80,6 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "replay")
     return folder
-
-
-def left(path: Path) -> None:
-    """Nobody has written to the file for an hour."""
-    hour_ago = time.time() - 3600
-    os.utime(path, (hour_ago, hour_ago))
 
 
 def read(path: Path) -> list[Row]:
@@ -205,14 +199,6 @@ class TestMcap:
         assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
         assert "no message is in the window" in capsys.readouterr().err
 
-    def test_a_folder_that_is_missing_is_named(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        assert (
-            f"there is no folder {tmp_path / 'gone'}"
-            in exits(2, "export", "--mcap", tmp_path / "gone" / "out.mcap").err
-        )
-
     def test_only_the_topics_that_were_asked_for(
         self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
@@ -314,13 +300,6 @@ class TestMcap:
         assert {profile_of(out)} == profiles
         if readable_by_rosbags and profiles == {"ros2"}:
             assert Counter(topic for topic, _, _ in read(out)) == expected
-
-    def test_sqlite_bags_become_mcap(self, tmp_path: Path) -> None:
-        left(write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", driven(T0, 0)))
-        out = tmp_path / "out.mcap"
-        words = ["export", "--mcap", str(out), "--bag-dir", str(tmp_path / "bags")]
-        assert cli.main([*words, "deployment=replay"]) == 0
-        assert len(read(out)) == 110
 
     @pytest.mark.parametrize("kind", ["db3", "mcap"])
     def test_definitions_that_the_bag_lacks_are_written(self, tmp_path: Path, kind: str) -> None:
@@ -487,6 +466,7 @@ class TestWindows:
             ["--mcap", "a", "--start", "noon"],
             ["--mcap", "a", "--start", "2", "--end", "1"],
             ["--mcap", "a", "--topic", "/nothing"],
+            ["--mcap", "gone/out.mcap"],
         ],
     )
     def test_what_makes_no_sense_is_refused(

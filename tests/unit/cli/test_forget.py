@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sqlite3
-import time
 from contextlib import closing
 from typing import TYPE_CHECKING
 
@@ -24,7 +23,8 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import OURS, embedding, made_moment, own_all
+from tests.support.housekeepers import OURS, embedding, made_moment, own_all, recording_now
+from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -36,13 +36,6 @@ if TYPE_CHECKING:
 
 T0 = 1_700_000_000 * NS_PER_S
 Capture = pytest.CaptureFixture[str]
-
-
-def left(path: Path) -> Path:
-    """Nobody has written to the file for an hour."""
-    hour_ago = time.time() - 3600
-    os.utime(path, (hour_ago, hour_ago))
-    return path
 
 
 @pytest.fixture
@@ -517,12 +510,5 @@ class TestMetadata:
     def test_that_of_a_recording_that_is_being_written_is_its_recorders(
         self, bag_dir: Path, forget: Forget
     ) -> None:
-        now = time.time_ns()
-        beat = Heartbeat(1, now, RecorderState.RECORDING, ("rec_0",), now, 0, (), (), None, 2.0)
-        write_heartbeat(bag_dir, beat)
+        recording_now(bag_dir, "rec_0")
         assert "rec_0/metadata.yaml will list deleted bags" in forget(0, 20, 35, "--yes").out
-
-    def test_a_dry_run_leaves_it(self, metadata: Path, forget: Forget) -> None:
-        before = metadata.read_text()
-        forget(0, 0, 15, "--dry-run")
-        assert metadata.read_text() == before

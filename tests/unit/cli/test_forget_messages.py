@@ -12,7 +12,6 @@ import os
 import shutil
 import sqlite3
 import subprocess
-import time
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -51,6 +50,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import made_moment, own_all
+from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -76,13 +76,6 @@ def messages(number: int) -> list[Msg]:
         found += [odom(at, number + n / 10, 0.0), boolean(at + 5, n % 2 == 0)]
         found += [text(at + 7, f"{SAID} {number} {n}", CAMERA), text(at + 9, f"hum {n}", MIC)]
     return found
-
-
-def left(path: Path) -> Path:
-    """Nobody has written to the file for an hour."""
-    hour_ago = time.time() - 3600
-    os.utime(path, (hour_ago, hour_ago))
-    return path
 
 
 LAYOUTS = {

@@ -10,7 +10,6 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
-from datetime import datetime
 from typing import TYPE_CHECKING
 
 import pytest
@@ -410,20 +409,6 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
     }
     with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
         with_times({"start": "soon"}, known, 1_700_000_000.0)
-
-
-def test_a_text_time_is_left_to_the_tool_that_knows_what_its_last_decimal_is() -> None:
-    known: dict[str, JsonObject] = {"start": {"type": ["number", "string"]}}
-    asked: dict[str, object] = {"start": "2026-11-20T14:05:03.745"}
-    assert with_times(asked, known, 1_700_000_000.0) == asked
-
-
-def test_one_parser_reads_all_times_and_knows_nanoseconds() -> None:
-    now = datetime(2026, 11, 20, 15, 0).astimezone().timestamp()
-    for written, ago_s in (("now", 0), ("30s ago", 30), ("2 hours ago", 7200), ("14:59:59.5", 0.5)):
-        assert parse_time(written, now) == now - ago_s
-    with pytest.raises(InvalidArgumentsError, match=r"in seconds it is 1795163910\.500"):
-        parse_time("1795163910500000000", now)
 
 
 @pytest.mark.parametrize("words", [["cat"], ["plot", "signal", "-o", "x.svg"]])

@@ -113,12 +113,6 @@ def test_what_there_is_not_is_reported_in_words() -> None:
     assert shown([]) == "none"
 
 
-def test_a_table_for_which_there_is_room_has_a_row_for_each() -> None:
-    rows: JsonValue = [{"topic": "/odom", "last": T0, "count": n} for n in range(3)]
-    output = shown({"topics": rows})
-    assert output.count(format_time(T0)) == 3
-
-
 def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
     output = shown(rows)

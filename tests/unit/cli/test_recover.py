@@ -161,13 +161,6 @@ def counted(recording: Path) -> dict[str, int]:
     return stated
 
 
-def test_a_single_file_is_repaired_whatever_its_name(tmp_path: Path) -> None:
-    path = left_open(tmp_path / "field trip.bag")
-    outcome, _ = recovered(path)
-    assert outcome.repaired == 1
-    assert McapReader().summarize(path).complete
-
-
 def test_a_whole_file_is_reported_to_be(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
     outcome, printed = recovered(path)
@@ -297,18 +290,16 @@ class TestTheProgram:
         own_all(tmp_path)
         exits(0, "recover", tmp_path, "--force")
 
-    def test_exits_0_where_nothing_is_left_unfinished(self, tmp_path: Path, exits: Program) -> None:
-        left_open(tmp_path / "a_0.mcap")
-        assert "1 repaired" in exits(0, "recover", tmp_path, "--force", "--yes").out
-
-    def test_exits_1_where_a_file_could_not_be_repaired(
-        self, tmp_path: Path, exits: Program
+    @pytest.mark.parametrize(
+        ("name", "code", "said"),
+        [("a_0.mcap", 1, ""), ("gone", 2, "ros2-memory recover: "), ("whole.mcap", 0, "")],
+    )
+    def test_exit_codes_say_whether_all_is_whole(
+        self, tmp_path: Path, exits: Program, name: str, code: int, said: str
     ) -> None:
+        write_mcap(tmp_path / "whole.mcap", MESSAGES)
         (tmp_path / "a_0.mcap").write_bytes(b"a letter")
-        exits(1, "recover", tmp_path)
-
-    def test_exits_2_where_there_is_nothing(self, tmp_path: Path, exits: Program) -> None:
-        assert "ros2-memory recover: " in exits(2, "recover", tmp_path / "gone").err
+        assert said in exits(code, "recover", tmp_path / name).err
 
 
 @needs_recorded

@@ -14,7 +14,6 @@ import pytest
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Loss, append_losses
-from ros2_memory.cli.output import format_duration
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap
@@ -144,18 +143,3 @@ class TestOldData:
         output = capsys.readouterr().out
         assert "which is now (data.now=latest); no new data" in output
         assert "days old" not in output
-
-
-@pytest.mark.parametrize(
-    ("seconds", "output"),
-    [
-        (0.04, "0.0 s"),
-        (119.0, "119.0 s"),
-        (600.0, "10 min"),
-        (18_000.0, "5.0 h"),
-        (864_000.0, "10 days"),
-        (-30.0, "-30.0 s"),
-    ],
-)
-def test_a_duration_has_the_unit_that_suits_it(seconds: float, output: str) -> None:
-    assert format_duration(seconds) == output

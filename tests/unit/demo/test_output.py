@@ -34,11 +34,6 @@ def test_the_call_is_shown_as_it_was_made() -> None:
     ]
 
 
-def test_a_wrong_answer_is_called_wrong() -> None:
-    wrong = format_exchange(1, Exchange(QUESTIONS[0], "null", "expected a number", right=False))
-    assert "=> WRONG: expected a number" in wrong
-
-
 def test_a_short_reply_is_shown_to_the_letter() -> None:
     reply = REPLY[:250]
     lines = format_exchange(1, Exchange(QUESTIONS[0], reply, "Yes.", right=True)).splitlines()[3:]
@@ -53,11 +48,3 @@ def test_a_long_reply_is_cut_and_says_so() -> None:
 def test_the_invitation_can_be_pasted_into_a_brain() -> None:
     text = connection_hints("http://127.0.0.1:9203")
     assert '- name: episodic\n      transport: sse\n      url: "http://127.0.0.1:9203/sse"' in text
-
-
-def test_the_page_and_streamable_http_come_first() -> None:
-    [page, client] = [
-        line for line in connection_hints("http://x:1").splitlines() if "http" in line
-    ][:2]
-    assert page.split()[-1] == "http://x:1/"
-    assert "http://x:1/mcp" in client

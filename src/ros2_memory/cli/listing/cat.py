@@ -7,16 +7,12 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from itertools import islice
-from typing import Annotated, Final, NamedTuple
+from typing import Annotated, TypeAlias
 
 import typer
 
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    Bags,
-    Times,
-)
-from ros2_memory.cli.output import format_time, format_value, with_local_times
+from ros2_memory.cli.options import Bags, Times
+from ros2_memory.cli.output import format_time, format_value, leaves, print_notes
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
@@ -28,14 +24,8 @@ from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
 from ros2_memory.messages.levels import with_level_names
 
-_TIME: Final = "time"
-
-
-class Row(NamedTuple):
-    """One message: its log time and its extracted value."""
-
-    time: Ns
-    value: JsonValue
+Row: TypeAlias = tuple[Ns, JsonValue]
+"""The log time of a message, and its extracted value."""
 
 
 def cat(
@@ -65,7 +55,7 @@ def cat(
         bool, typer.Option("--json", help="Print JSON lines: time (Unix s), time_ns, value.")
     ] = False,
     bags: Bags,
-) -> None:
+) -> bool:
     """Print the messages of a topic in a time window, each once, by log time.
 
     By default it prints the fields that the tools' replies show (`describe_type`); --field selects
@@ -78,7 +68,12 @@ def cat(
     topic, bags = bags.with_topic(topic, "cat")
     memory = bags.memory()
     view = View(memory, Call())
-    name = _one_topic(view, topic)
+    timeline = view.snapshot.timeline
+    if any(mark in topic for mark in "*?[") and topic not in timeline.types:
+        matched = match_topics(timeline.topics(), topic)
+        some = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
+        raise InvalidArgumentsError(f"cat prints one topic, and {topic} is a pattern; {some}")
+    name = resolve_topic(view, topic)
     window = times.window(memory)
     messages = view.stream.messages([name], window, newest_first=tail is not None)
     chosen = islice(messages, limit if tail is None else tail)
@@ -90,31 +85,14 @@ def cat(
         print(line)
     sys.stdout.flush()
     note_unread(view, window)
-    for note in view.notes.sentences():
-        typer.echo(f"note: {with_local_times(note)}", err=True)
+    print_notes(view.notes.sentences())
     if not count:
-        typer.echo(
+        print(
             f"no message of {name} to show {_described(window)}; "
             "`ros2-memory topics` says when there are some",
-            err=True,
+            file=sys.stderr,
         )
-    if not count or not view.notes.complete:
-        raise typer.Exit(EXIT_NEGATIVE)
-
-
-def _one_topic(view: View, name: str) -> str:
-    """Returns the recorded topic of a name.
-
-    Raises:
-        InvalidArgumentsError: it is a glob.
-        NoDataError: there is none.
-    """
-    timeline = view.snapshot.timeline
-    if any(mark in name for mark in "*?[") and name not in timeline.types:
-        matched = match_topics(timeline.topics(), name)
-        some = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
-        raise InvalidArgumentsError(f"cat prints one topic, and {name} is a pattern; {some}")
-    return resolve_topic(view, name)
+    return not count or not view.notes.complete
 
 
 def _described(window: TimeWindow) -> str:
@@ -135,21 +113,20 @@ def _extracted(
     """
     extractor, left_out = view.memory.extractor, 0
     is_checked = False
-    for each in messages:
-        message, type_name = view.bags.decode(each), each.record.channel.type
+    for stored in messages:
+        message, type_name = view.bags.decode(stored), stored.record.channel.type
         if message is None:
             left_out += 1
             continue
         if not is_checked or not exact:  # `exact_at` does not report which fields there are
             shown = extractor.shown(message, type_name, fields).value
             is_checked = True
-        if not exact:
-            yield Row(each.time, with_level_names(shown, type_name))
-        elif fields:
-            found = {path: extractor.exact_at(message, type_name, path) for path in fields}
-            yield Row(each.time, found)
-        else:
-            yield Row(each.time, extractor.exact(message, type_name))
+        value = with_level_names(shown, type_name)
+        if exact and fields:
+            value = {path: extractor.exact_at(message, type_name, path) for path in fields}
+        elif exact:
+            value = extractor.exact(message, type_name)
+        yield stored.time, value
     if left_out:
         view.notes.complete = False
         what = counted(left_out, "message")
@@ -174,9 +151,9 @@ def _finite(value: JsonValue) -> JsonValue:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, list):
-        return [_finite(each) for each in value]
+        return [_finite(inner) for inner in value]
     if isinstance(value, dict):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: _finite(inner) for key, inner in value.items()}
     return value
 
 
@@ -188,25 +165,22 @@ def _csv(rows: Iterable[Row]) -> Iterator[str]:
         cells = dict(_cells(value))
         if columns is None:
             columns = [*cells]
-            yield _csv_line([_TIME, *columns])
+            yield _csv_line(["time", *columns])
         beside.update(cells.keys() - columns)
         seconds, rest = divmod(time, NS_PER_S)
-        yield _csv_line([f"{seconds}.{rest:09d}", *(cells.get(each, "") for each in columns)])
+        yield _csv_line([f"{seconds}.{rest:09d}", *(cells.get(name, "") for name in columns)])
     if beside:
         names = listed(sorted(beside))
-        typer.echo(f"note: no column, as the first message has no such field: {names}", err=True)
+        print_notes([f"no column, as the first message has no such field: {names}"])
 
 
-def _cells(value: JsonValue, name: str = "") -> Iterator[tuple[str, str]]:
+def _cells(value: JsonValue) -> Iterator[tuple[str, str]]:
     """Yields the columns of a value: an object's under names with dots, a list as JSON."""
-    if isinstance(value, dict):
-        for key, each in value.items():
-            yield from _cells(each, f"{name}.{key}" if name else key)
-    elif isinstance(value, list):
-        yield name or "value", json.dumps(_finite(value), ensure_ascii=False)
-    else:
-        shown = "" if value is None else value if isinstance(value, str) else json.dumps(value)
-        yield name or "value", shown
+    for name, inner in leaves(value):
+        cell = inner if isinstance(inner, str) else json.dumps(inner)
+        if isinstance(inner, list):
+            cell = json.dumps(_finite(inner), ensure_ascii=False)
+        yield name or "value", "" if inner is None else cell
 
 
 def _csv_line(cells: Sequence[str]) -> str:

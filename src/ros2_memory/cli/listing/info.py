@@ -1,32 +1,24 @@
-"""`ros2-memory topics` and `info`: what is recorded, and how much of it."""
+"""`ros2-memory topics`, `info` and `recordings`: what is recorded, how much of it, and by whom."""
 
 import json
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
-import typer
-
-from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    MB,
-    AsJson,
-    Bags,
-    open_memory,
-    print_line,
-    stdout_console,
-)
-from ros2_memory.cli.output import format_value, print_reply
+from ros2_memory.cli.options import MB, AsJson, Bags, open_memory
+from ros2_memory.cli.output import format_value, print_line, print_reply, stdout_console
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.errors import NoDataError, RecorderError
+from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
@@ -34,7 +26,7 @@ from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.history.view import View
-from ros2_memory.index.recordings import recordings_of
+from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
@@ -42,8 +34,6 @@ from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import TopicRow
 from ros2_memory.tools.replies import Replies
 
-_WHOLE_REPLY: Final = "server.max_reply_chars=1000000000"
-"""A planner's context is short; a person's screen scrolls."""
 _TOLD_TWICE: Final = frozenset(
     {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics"}
 )
@@ -52,15 +42,12 @@ _MOST_ROWS: Final = 5
 _MOST_SILENT: Final = 30
 _OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
+_OTHERS: Final = "another recorder"
 _SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
-def topics(
-    as_json: AsJson = False,
-    *,
-    bags: Bags,
-) -> None:
+def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     """List every recorded topic: type, messages, usual rate, first and last message.
 
     The rate is that of the topic's newest hour, from its first to its last message in each bag;
@@ -69,27 +56,25 @@ def topics(
     memory = bags.memory()
     rows: list[JsonObject] = []
     try:
-        rows += [_topic_row(memory, each) for each in list_recorded_topics(memory, Call())]
+        rows += [_topic_row(memory, known) for known in list_recorded_topics(memory, Call())]
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
     if as_json:
         print_line(text)
     elif rows:
-        console = stdout_console()
         listed_topics, notes = _notes_apart(rows)
-        print_reply(console, listed_topics)
+        print_reply(stdout_console(), listed_topics)
         if notes:
-            print_reply(console, {"notes": notes})
+            print_reply(stdout_console(), {"notes": notes})
     elif text != "[]":
         print_reply(stdout_console(), json.loads(text))
     else:
         print_line(f"nothing is recorded in {memory.index.bag_dir}")
         snapshot = memory.index.snapshot()
-        for each in (*snapshot.damaged, *snapshot.unread):
-            print_line(f"  {each.path.name}: {each.reason}")
-    if not rows:
-        raise typer.Exit(EXIT_NEGATIVE)
+        for aside in (*snapshot.damaged, *snapshot.unread):
+            print_line(f"  {aside.path.name}: {aside.reason}")
+    return not rows
 
 
 def _topic_row(memory: Memory, known: TopicRow) -> JsonObject:
@@ -144,86 +129,36 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     return round(intervals / unix_from_ns(duration), 2)
 
 
-def info(
-    as_json: AsJson = False,
-    *,
-    bags: Bags,
-) -> None:
+def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
-    settings = bags.settings(_WHOLE_REPLY, "server.tools=all")
+    # A planner's context is short; a person's screen scrolls.
+    settings = bags.settings("server.max_reply_chars=1000000000", "server.tools=all")
     robots = settings.fleet.robots
-    if not robots:
-        report = _report(settings, verbose=bags.verbose)
-        if as_json:
-            print_line(json.dumps(report.as_json()))
-        else:
-            report.show()
-        are_bags = report.are_bags
-    else:
-        every = {
-            name: _report(
-                robot_settings(settings, name), verbose=bags.verbose, setting=ROBOTS_SETTING
-            )
-            for name in robots
-        }
-        if as_json:
-            print_line(json.dumps({name: each.as_json() for name, each in every.items()}))
-        else:
-            for name, each in every.items():
-                stdout_console().rule(name, align="left")
-                each.show()
-        are_bags = any(each.are_bags for each in every.values())
-    if not are_bags:
-        raise typer.Exit(EXIT_NEGATIVE)
+    reports: dict[str, JsonValue] = {}
+    are_bags = False
+    for name in robots or ("",):
+        own = robot_settings(settings, name) if robots else settings
+        setting = ROBOTS_SETTING if robots else None
+        memory = open_memory(own, verbose=bags.verbose, setting=setting)
+        reports[name] = report = _report(own, memory)
+        are_bags |= bool(memory.index.snapshot().bags)
+        if robots and not as_json:
+            stdout_console().rule(name, align="left")
+        if not as_json:
+            _show(memory, report)
+    if as_json:
+        print_line(json.dumps(reports if robots else reports[""]))
+    return not are_bags
 
 
-class _Report(NamedTuple):
-    """What is recorded in one bag directory.
-
-    Attributes:
-        empty: the sentence where it has no files.
-        are_bags: whether some bag answers.
-        held: how much is recorded.
-        replies: those of the tools, by name.
-        lists: what may confuse; each may be empty.
-        summed: what is printed in place of long lists of the replies.
-    """
-
-    empty: str | None
-    are_bags: bool
-    held: dict[str, JsonValue]
-    replies: dict[str, JsonValue]
-    lists: dict[str, list[JsonValue]]
-    summed: dict[str, JsonValue]
-
-    def as_json(self) -> dict[str, JsonValue]:
-        """Returns all of it."""
-        return {**self.replies, "held": self.held, **self.lists}
-
-    def show(self) -> None:
-        """Prints it for people."""
-        if self.empty is not None:
-            print_line(self.empty)
-            return
-        console = stdout_console()
-        parts = map(_for_people, self.replies.values())
-        found = {**self.held, **dict(chain.from_iterable(map(dict.items, parts)))}
-        silent = found.get("topics_without_messages")
-        if isinstance(silent, list):
-            found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-        print_reply(console, found | self.summed)
-        for name, rows in self.lists.items():
-            if rows:
-                print_reply(console, {name: rows})
-
-
-def _report(settings: Settings, *, verbose: bool, setting: str | None = None) -> _Report:
-    memory = open_memory(settings, verbose=verbose, setting=setting)
-    dispatcher = build_dispatcher(settings, memory)
+def _report(settings: Settings, memory: Memory) -> JsonObject:
+    """Returns what is recorded in one bag directory: replies of tools, and what may confuse."""
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
-    replies: list[JsonValue] = [json.loads(answer.text) for answer in call_tools(dispatcher, tools)]
+    replies = call_tools(build_dispatcher(settings, memory), tools)
     snapshot = memory.index.snapshot()
-    lists: dict[str, list[JsonValue]] = {
+    return {
+        **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
+        "held": _held(snapshot),
         "overlapping_recordings": [
             {
                 "recording": pair.names[0],
@@ -235,28 +170,45 @@ def _report(settings: Settings, *, verbose: bool, setting: str | None = None) ->
             for pair, topic in mixed_recordings(memory, Call())
         ],
         "contradicting_frames": [
-            {"frame": each.frame, "in_recordings": [*each.names], "parents": [*each.parents]}
-            for each in contradicting_frames(memory, Call())
+            {"frame": of.frame, "in_recordings": [*of.names], "parents": [*of.parents]}
+            for of in contradicting_frames(memory, Call())
         ],
         "counted_as_active": [
             {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
             for path, until in assumed_active(memory, snapshot)
         ],
     }
-    empty = None
-    if not _has_files(snapshot):
-        empty = f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}"
-    by_tool = dict(zip(tools, replies, strict=True))
-    summed = _summed_faults(memory, snapshot)
-    return _Report(empty, bool(snapshot.bags), _held(snapshot), by_tool, lists, summed)
 
 
-def _summed_faults(memory: Memory, snapshot: Snapshot) -> dict[str, JsonValue]:
+def _show(memory: Memory, report: JsonObject) -> None:
+    """Prints a report for people."""
+    snapshot = memory.index.snapshot()
+    aside = (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
+    if not any((snapshot.bags, *aside)):
+        print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
+        return
+    status, ranged, held, *lists = report.values()
+    found = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
+    silent = found.get("topics_without_messages")
+    if isinstance(silent, list):
+        found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
+    console = stdout_console()
+    print_reply(console, found | _summed_faults(memory, snapshot))
+    for name, rows in zip([*report][-len(lists) :], lists, strict=True):
+        if rows:
+            print_reply(console, {name: rows})
+
+
+def _object(value: JsonValue) -> JsonObject:
+    return value if isinstance(value, dict) else {}
+
+
+def _summed_faults(memory: Memory, snapshot: Snapshot) -> JsonObject:
     """Returns one row for the steps of a clock, and one for the bags it misdated, if many."""
-    summed: dict[str, JsonValue] = {}
+    summed: JsonObject = {}
     steps = clock_steps(View(memory, Call())) if snapshot.bags else ()
     if len(steps) > _MOST_ROWS:
-        largest = max(steps, key=lambda each: abs(each.by))
+        largest = max(steps, key=lambda step: abs(step.by))
         summed["clock_steps"] = [
             {
                 "steps": len(steps),
@@ -266,32 +218,29 @@ def _summed_faults(memory: Memory, snapshot: Snapshot) -> dict[str, JsonValue]:
                 "largest_at": unix_from_ns(largest.at),
             }
         ]
-    faults = snapshot.dating.faults
+    faults = sorted(snapshot.dating.faults, key=lambda fault: fault.bag.start)
     if len(faults) > _MOST_ROWS:
-        ordered = sorted(faults, key=lambda each: each.bag.start)
-        worst = max(faults, key=lambda each: each.by)
+        worst = max(snapshot.dating.faults, key=lambda fault: fault.by)
         summed["clock_faults"] = [
             {
                 "bags": len(faults),
-                "first": ordered[0].bag.path.name,
-                "last": ordered[-1].bag.path.name,
+                "first": faults[0].bag.path.name,
+                "last": faults[-1].bag.path.name,
                 "largest": f"{worst.bag.path.name}: {worst.reason}",
             }
         ]
     return summed
 
 
-def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
+def _held(snapshot: Snapshot) -> JsonObject:
     """Returns how much is recorded, as `ros2 bag info` does."""
-    bags = snapshot.bags
-    kinds = sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags})
-    first, last = snapshot.earliest, snapshot.latest
-    span = None if first is None or last is None else last - first
-    held: dict[str, JsonValue] = {
+    bags, first, last = snapshot.bags, snapshot.earliest, snapshot.latest
+    span = None if first is None or last is None else round(unix_from_ns(last - first), 3)
+    held: JsonObject = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
-        "storage": ", ".join(kinds) or None,
-        "duration_s": None if span is None else round(unix_from_ns(span), 3),
+        "storage": storage_of(bags) or None,
+        "duration_s": span,
         "messages": sum(bag.summary.count for bag in bags),
         "topics": len(snapshot.timeline.topics()),
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
@@ -303,21 +252,25 @@ def _held(snapshot: Snapshot) -> dict[str, JsonValue]:
     return held
 
 
-def _has_files(snapshot: Snapshot) -> bool:
-    aside = (snapshot.bags, snapshot.active, snapshot.damaged, snapshot.unread)
-    return any(aside) or bool(snapshot.empty)
+def storage_of(bags: Sequence[BagFile]) -> str:
+    """Returns the kinds of bags: `mcap`, or `db3, mcap`."""
+    return ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags}))
 
 
-def _for_people(reply: JsonValue) -> dict[str, JsonValue]:
-    """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
-    row = _with_budget_sentence(reply)
-    if not isinstance(row, dict):
-        return {}
-    has_recorder = row.get("recorder", "") is not None
+def _for_people(reply: JsonObject) -> JsonObject:
+    """Returns a reply without keys that are empty or repeated, or about a missing recorder.
+
+    Bags that are only looked at have no budget, and the lines above have their size.
+    """
+    shown = {**reply}
+    budget = shown.pop("budget", None)
+    if isinstance(budget, dict) and budget.get("max_gb") is not None:
+        shown["budget"] = describe_budget(budget)
+    has_recorder = shown.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
         key: _without_itself(value)
-        for key, value in row.items()
+        for key, value in shown.items()
         if key not in left_out and (value not in ([], 0) or key == "earliest")
     }
 
@@ -327,7 +280,7 @@ def _without_itself(value: JsonValue) -> JsonValue:
     if isinstance(value, str):
         return _OWN_LISTS.sub("see below", value)
     if isinstance(value, list):
-        return [_without_itself(each) if isinstance(each, str) else each for each in value]
+        return [_without_itself(inner) if isinstance(inner, str) else inner for inner in value]
     return value
 
 
@@ -346,18 +299,6 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
             yield each.path, each.path.stat().st_mtime_ns + patience
         except OSError:
             continue  # the file was moved or deleted since the scan
-
-
-def _with_budget_sentence(reply: JsonValue) -> JsonValue:
-    """Returns a reply of `memory_status` whose budget is a sentence; any other as it is.
-
-    Bags that are only looked at have no budget, and the line above has their size.
-    """
-    budget = reply.get("budget") if isinstance(reply, dict) else None
-    if not isinstance(reply, dict) or not isinstance(budget, dict):
-        return reply
-    rest = {key: value for key, value in reply.items() if key != "budget"}
-    return rest if budget.get("max_gb") is None else {**reply, "budget": describe_budget(budget)}
 
 
 def describe_budget(budget: dict[str, JsonValue]) -> str:
@@ -389,3 +330,89 @@ def _size_text(gigabytes: JsonValue) -> str:
     if not isinstance(gigabytes, int | float) or gigabytes >= 0.1 or not gigabytes:
         return f"{format_value(gigabytes)} GB"
     return f"{gigabytes * 1000:.3g} MB"
+
+
+def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
+    """List every recording of a folder: start, length, size, and which program made it.
+
+    To use one of them only, give --recording NAME to the other commands, or data.recording=NAME to
+    the server.
+    """
+    memory = bags.memory()
+    snapshot, root = memory.index.snapshot(), memory.index.bag_dir
+    rows, empty = [*_rows(snapshot, root)], [*_empty_rows(snapshot, root)]
+    if as_json:
+        print_line(json.dumps([*rows, *empty]))
+    elif not rows:
+        print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
+    else:
+        console = stdout_console()
+        read = [row for row in rows if "start" in row]
+        is_foreign = all(row["whose"] == _OTHERS for row in read)
+        left_out = {"end", "whose"} if is_foreign else {"end"}  # there is the length
+        print_reply(
+            console, [{key: row[key] for key in row if key not in left_out} for row in read]
+        )
+        if read and is_foreign:
+            print_line(f"whose: {_OTHERS} made all of them")
+        others = [row for row in rows if "start" not in row]
+        for title, some in (("not_read", others), ("empty", empty)):
+            if some:
+                print_reply(console, {title: [*some]})
+    return not rows
+
+
+def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
+    own = None  # where it cannot be known which this program made
+    with suppress(OSError, RecorderError):
+        own = OwnRecordings(root)
+    left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
+    for path, bags in sorted(recordings_of(snapshot).items(), key=lambda found: found[1][0].start):
+        inside = [file for file in left if file.startswith(f"{path}/")]
+        row = _row(name_of(path, bags, str(root)), bags)
+        row["whose"] = _maker(Path(path), bags, root, own)
+        if inside:
+            row["not_read"] = len(inside)
+        for file in inside:
+            del left[file]
+        yield row
+    for file, reason in sorted(left.items()):
+        yield {"recording": file.removeprefix(f"{root}/"), "reason": reason}
+
+
+def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
+    """Yields the recordings without any message; a loose bag file is one."""
+    aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
+    folders = {bag.path.parent for bag in snapshot.bags} | {each.path.parent for each in aside}
+    found = [each if each.parent == root else each.parent for each in snapshot.empty]
+    for path in dict.fromkeys(each for each in found if each not in folders):
+        yield {
+            "recording": str(path).removeprefix(f"{root}/"),
+            "messages": 0,
+            "reason": "no message was recorded",
+        }
+
+
+def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
+    start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+    topics = {topic for bag in bags for topic in bag.summary.schema.positions}
+    is_open = any(bag.state is BagState.ACTIVE for bag in bags)
+    return {
+        "recording": name,
+        "start": unix_from_ns(start),
+        "end": None if is_open else unix_from_ns(end),
+        "length_s": round(unix_from_ns(end - start), 3),
+        "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
+        "bags": len(bags),
+        "messages": sum(bag.summary.count for bag in bags),
+        "topics": len(topics),
+        "storage": storage_of(bags),
+    }
+
+
+def _maker(path: Path, bags: Sequence[BagFile], root: Path, own: OwnRecordings | None) -> JsonValue:
+    if path.is_relative_to(root / MOMENTS_FOLDER):
+        return "saved moment"
+    if own is None:
+        return None
+    return "this recorder" if own.owns_bag(bags[0].path) else _OTHERS

@@ -13,21 +13,10 @@ from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    MB,
-    AsJson,
-    BagDir,
-    Sets,
-    load_for,
-    print_line,
-    require_recorder,
-)
+from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
+from ros2_memory.cli.output import print_line
 from ros2_memory.core.directories import Identity, identity_of
-from ros2_memory.core.errors import (
-    InvalidArgumentsError,
-    RecorderError,
-)
+from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.retention.delete import size_of
 
@@ -43,40 +32,36 @@ def adopt(
     sets: Sets = None,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
-) -> None:
+) -> bool:
     """Let the recorder delete bags that it did not make, as if it had made them.
 
     Adopts the bags in each folder and below it: copies, restored recordings, bags of other
     programs. From then on retention counts them in its budget and deletes them by its limits, and
     `forget` deletes them too. adopt itself deletes and changes nothing.
     """
-    settings = load_for(bag_dir, sets)
+    settings, _ = load_for(bag_dir, sets)
     require_recorder(settings)
     root = settings.recording.bag_dir
     own = OwnRecordings(root)
-    given = [_below(root, each) for each in directories]
+    given = [_below(root, directory) for directory in directories]
     found = {
-        name: path
+        name: _bags_in(path)
         for directory in given
         for path in folders_with_bags(directory)
         if (name := own.name_of(path))
     }
     _require_list(root, own)
-    new = {name: path for name, path in found.items() if not all(map(own.owns_bag, _bags_in(path)))}
-    own.adopt({name: _identity(path) for name, path in new.items()})
-    adopted = {name: _count_bags(path) for name, path in new.items()}
+    new = {name: bags for name, bags in found.items() if not all(map(own.owns_bag, bags))}
+    own.adopt({name: _identity(root / name) for name in new})
+    adopted = [(name, len(bags), sum(map(size_of, bags)) / MB) for name, bags in new.items()]
     already = len(found) - len(new)
     if as_json:
-        rows = [
-            {"directory": name, "bags": files, "size_mb": size / MB}
-            for name, (files, size) in adopted.items()
-        ]
+        keys = ("directory", "bags", "size_mb")
+        rows = [dict(zip(keys, row, strict=True)) for row in adopted]
         print_line(json.dumps({"adopted": rows, "already": already}))
-        if not found:
-            raise typer.Exit(EXIT_NEGATIVE)
-        return
-    for name, (files, size) in adopted.items():
-        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size / MB:.1f} MB)")
+        return not found
+    for name, files, size_mb in adopted:
+        print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size_mb:.1f} MB)")
     if already:
         folders = counted(already, "directory is", "directories are")
         print_line(f"{folders} the recorder's own already")
@@ -87,7 +72,7 @@ def adopt(
         for link in islice(_links(given), _MAX_LINKS_NAMED):
             name = str(link.relative_to(root))
             print_line(f"{name} is a symbolic link, which is not followed: {_INSTEAD}")
-        raise typer.Exit(EXIT_NEGATIVE)
+    return not found
 
 
 def _below(root: Path, directory: Path) -> Path:
@@ -103,8 +88,8 @@ def _below(root: Path, directory: Path) -> Path:
             continue
         inside = root / path.relative_to(base)
         # The bag directory itself may be a link.
-        parts = [each for each in (inside, *inside.parents) if each.is_relative_to(root)]
-        link = next((each for each in parts if each != root and each.is_symlink()), None)
+        parts = [part for part in (inside, *inside.parents) if part.is_relative_to(root)]
+        link = next((part for part in parts if part != root and part.is_symlink()), None)
         if link is not None:
             raise InvalidArgumentsError(f"{link} is a symbolic link, which is not followed")
         return inside
@@ -143,12 +128,6 @@ def _identity(path: Path) -> Identity:
     if identity is None:
         raise RecorderError(f"{path} is not there any more")
     return identity
-
-
-def _count_bags(folder: Path) -> tuple[int, int]:
-    """Returns the number of bag files in a directory, and their bytes."""
-    bags = _bags_in(folder)
-    return len(bags), sum(map(size_of, bags))
 
 
 def _bags_in(folder: Path) -> list[Path]:

@@ -9,9 +9,8 @@ hold them (`retention.eraser`).
 """
 
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -34,30 +33,24 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
 from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
 from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
     MB,
+    STAYS,
     AsJson,
     BagDir,
     Overrides,
     Times,
     Verbose,
-    collect_lines,
+    lines_as_json,
     load_for,
     open_memory,
-    print_line,
     require_recorder,
-    spinner,
 )
-from ros2_memory.cli.output import format_time
+from ros2_memory.cli.output import format_time, print_line, spinner
 from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
 from ros2_memory.core import directories
-from ros2_memory.core.errors import (
-    BagError,
-    InvalidArgumentsError,
-    RecorderError,
-)
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.errors import BagError, InvalidArgumentsError, RecorderError
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -68,7 +61,6 @@ from ros2_memory.places.where import parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
-from ros2_memory.storage.base import BagReader
 from ros2_memory.storage.mcap.writer import McapWriter
 
 PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
@@ -98,7 +90,7 @@ def forget(
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,
-) -> None:
+) -> bool:
     """Delete the closed bags that lie wholly inside a time window, after confirmation.
 
     All messages in a file count, also copies that another recording has.
@@ -111,87 +103,65 @@ def forget(
     static transforms) that later answers need are copied forward. Works only where this deployment
     records.
     """
-    collect_lines(as_json, is_answered=yes or dry_run)
-    settings = load_for(bag_dir, overrides)
-    require_recorder(settings)
-    if times.last is None and None in (times.start, times.end):
-        raise InvalidArgumentsError("give a time window: --start and --end, or --last")
-    memory = open_memory(settings, verbose=verbose)
-    snapshot = memory.index.snapshot()
-    if snapshot.problem:
-        raise RecorderError(snapshot.problem)
-    window = times.window(memory)
-    taking = _Taking(settings, memory, _recorder_of(settings.recording.bag_dir), dry_run=dry_run)
-    interrupted = taking.finish()
-    if topic or where is not None:
-        wanted, lines = taking.wanted(window, topic or (), where)
-        if taking.take(wanted, lines, ask=not yes) or interrupted:
-            raise typer.Exit(EXIT_NEGATIVE)
-        return
-    plan = plan_deletion(settings, memory.index.snapshot(), window, build_reader(settings))
-    carrier = taking.carrier
-    kept = [*plan.kept, *_kept_elsewhere(memory, carrier, plan, window)]
-    _print_kept(kept)
-    if not plan.to_delete:
-        print_line(
-            "nothing to delete: each bag with messages in the window stays, for the reason above"
-            if plan.kept
-            else "nothing to delete: no closed bag has messages in the window"
-        )
-        # Of bags that retention deleted, something derived may be left.
-        _forget_derived(settings, (), dry_run=dry_run)
-    elif dry_run:
-        print_line(f"would be deleted: {_describe(plan)}")
-        for bag in plan.to_delete:
-            print_line(f"  {_name(bag.path, plan.bag_dir)}")
-    else:
-        print_line(f"to be deleted: {_describe(plan)}")
-        if not yes:
-            typer.confirm("Delete them? This cannot be undone.", abort=True)
-        contents = _contents(build_reader(settings), plan.to_delete)
-        kept += _delete(settings, memory, plan, carrier, contents)
-    if kept or interrupted:
-        raise typer.Exit(EXIT_NEGATIVE)
+    with lines_as_json(as_json, is_answered=yes or dry_run):
+        settings, _ = load_for(bag_dir, overrides)
+        require_recorder(settings)
+        if times.last is None and None in (times.start, times.end):
+            raise InvalidArgumentsError("give a time window: --start and --end, or --last")
+        memory = open_memory(settings, verbose=verbose)
+        if problem := memory.index.snapshot().problem:
+            raise RecorderError(problem)
+        window = times.window(memory)
+        work = _Forget(settings, memory, dry_run=dry_run)
+        work.finish_erasure()
+        if topic or where is not None:
+            work.erase(work.wanted(window, topic or (), where), asks=not yes)
+        else:
+            work.delete_bags(window, asks=not yes)
+        return work.leaves_some
 
 
-class _Taking:
-    """Takes messages out of bags.
+class _Forget:
+    """Forgets bags, or messages of them, and prints what is done.
 
     Args:
         settings: of this deployment.
         memory: over its bags.
-        recorder: why a recorder holds the bag directory; None where none does.
         dry_run: whether it only reports what it would do.
+
+    Attributes:
+        leaves_some: whether something stays that was to go.
     """
 
-    def __init__(
-        self, settings: Settings, memory: Memory, recorder: str | None, *, dry_run: bool
-    ) -> None:
+    def __init__(self, settings: Settings, memory: Memory, *, dry_run: bool) -> None:
+        self.leaves_some = False
         self._settings = settings
         self._memory = memory
-        self._recorder = recorder
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
+        self._reader = build_reader(settings)  # reads files as they are
+        self._recorder = _recorder_of(self._bag_dir)
+        self._unread: set[Path] = set()  # bags whose first messages are unknown
         snapshot = memory.index.snapshot()
         written = {aside.path: snapshot.unread_spans[aside] for aside in snapshot.active}
         for bag in snapshot.bags:
             if bag.state is BagState.ACTIVE:
                 written[bag.path] = TimeWindow(bag.start, MAX_NS)
-        own = OwnRecordings(self._bag_dir)
-        self.carrier = Carrier(
-            self._bag_dir, memory.reader, McapWriter(), settings.data.tf_static_topics, own
-        )
+        every = OwnRecordings(self._bag_dir)
+        self._own = every if settings.retention.foreign == "keep" else None
+        static_topics = settings.data.tf_static_topics
+        self._carrier = Carrier(self._bag_dir, memory.reader, McapWriter(), static_topics, every)
         self._eraser = Eraser(
             self._bag_dir,
-            build_reader(settings),
+            self._reader,
             McapWriter(),
-            own if settings.retention.foreign == "keep" else None,
+            self._own,
             written=written,
-            recorder=recorder,
+            recorder=self._recorder,
         )
 
-    def finish(self) -> bool:
-        """Finishes an erasure that was interrupted; returns whether something of it stays."""
+    def finish_erasure(self) -> None:
+        """Finishes an erasure that was interrupted."""
         try:
             begun = ERASING.read(self._bag_dir)
         except ValueError as error:
@@ -199,259 +169,359 @@ class _Taking:
                 f"{self._bag_dir / ERASING_FILE}: {error}; an earlier forget was interrupted: "
                 "delete the file, and forget again what was to go"
             ) from error
-        if begun is None:
-            return False
-        print_line(f"an earlier forget was interrupted: {_describe_erasure(begun)}")
-        return self.take(begun, [], ask=False)
+        if begun is not None:
+            ends = TimeWindow(begun.windows[0][0], begun.windows[-1][1]).asked()
+            topics, span = listed(begun.topics), _span(*ends)
+            print_line(f"an earlier forget was interrupted: {topics} {span}")
+            self.erase(begun, asks=False)
 
-    def wanted(
-        self, window: TimeWindow, globs: Sequence[str], where: str | None
-    ) -> tuple[Erasure, list[str]]:
-        """Returns what is asked for, and a line for each part of it that stays.
+    def wanted(self, window: TimeWindow, globs: Sequence[str], where: str | None) -> Erasure:
+        """Returns which messages are to go, and prints which of those asked for stay.
 
         Raises:
             InvalidArgumentsError: no such place is named, or no topic matches.
         """
-        lines: list[str] = []
-        windows = [window]
+        windows, unknown = [window], list[str]()
         if where is not None:
             with spinner(f"looking when the robot was in {where}"):
                 view = open_view(self._memory, Call(), None)
-                place = parse_where(self._memory.limits, where)
-                times = times_in_region(view, place, window)
-            around = [
-                TimeWindow(each.start - PLACE_MARGIN_NS, each.stop + PLACE_MARGIN_NS + 1)
-                for each in times
-            ]
-            windows = [each.intersect(window) for each in around]
-            lines += [f"what is not known: {each}" for each in view.notes.sentences()]
+                inside = times_in_region(view, parse_where(self._memory.limits, where), window)
+            margin = PLACE_MARGIN_NS
+            around = [TimeWindow(time.start - margin, time.stop + margin + 1) for time in inside]
+            windows = [time.intersect(window) for time in around]
+            unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
         with spinner("looking which topics there are"):
             known = self._eraser.topics()
-        latched = known.intersection(self.carrier.topics(self._memory.index.snapshot()))
-        if globs:
-            topics = {each for glob in globs for each in match_topics(known, glob)}
-            if not topics:
-                raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
-        else:
+        latched = known.intersection(self._carrier.topics(self._memory.index.snapshot()))
+        topics = {name for glob in globs for name in match_topics(known, glob)}
+        if globs and not topics:
+            raise InvalidArgumentsError(f"no recorded topic is named {listed([*globs])}")
+        if not globs:
             topics = {*known} - latched
             if latched and windows:
                 print_line(
                     "latched messages stay, because they are valid later, too (name a topic to "
                     f"forget it): {listed(sorted(latched))}"
                 )
+        self._stays(unknown)
         if self._recorder is not None and topics & latched:
-            lines.append(
+            line = (
                 f"{listed(sorted(topics & latched))}: latched messages, which the recorder carries "
-                f"on: {self._recorder}; stop the recorder, and forget again"
             )
+            self._stays([f"{line}on: {self._recorder}; stop the recorder, and forget again"])
             topics -= latched
-        return Erasure.of(topics, windows, topics & latched), lines
+        return Erasure.of(topics, windows, topics & latched)
 
-    def take(self, erasure: Erasure, lines: Sequence[str], *, ask: bool) -> bool:
-        """Takes messages out, after asking; returns whether something of them stays."""
-        kept = [*lines]
+    def erase(self, erasure: Erasure, *, asks: bool) -> None:
+        """Takes messages out of bags; `asks`: whether the user is asked before."""
         survey = Survey((), ())
         if erasure.topics and erasure.windows:
             with spinner("looking which bags hold some"):
                 survey = self._eraser.survey(erasure)
-        kept += survey.kept
-        _print_kept(kept)
+        self._stays(survey.kept)
         if not survey.holders and not erasure.files:
             print_line("no such message is in the window")
-            # Of bags that retention deleted, something derived may be left.
-            _forget_derived(self._settings, (), dry_run=self._dry_run)
-            return bool(kept)
-        size = sum(path.stat().st_size for path in {each.paths[0] for each in survey.holders})
+            self._forget_derived(())
+            return
+        counts = survey.counts
+        size = sum(path.stat().st_size for path in {holder.paths[0] for holder in survey.holders})
         what = (
-            f"{counted(survey.counts.total(), 'message')} of "
-            f"{counted(len(survey.counts), 'topic')}, by rewriting "
-            f"{counted(len(survey.holders), 'bag')} ({size / MB:.1f} MB)"
+            f"{counted(counts.total(), 'message')} of {counted(len(counts), 'topic')}, by "
+            f"rewriting {counted(len(survey.holders), 'bag')} ({size / MB:.1f} MB)"
         )
-        print_line(f"would be deleted: {what}" if self._dry_run else f"to be deleted: {what}")
-        for topic, count in sorted(survey.counts.items()):
-            print_line(f"  {topic}: {counted(count, 'message')}")
-        if self._dry_run:
-            return bool(kept)
-        if ask:
-            typer.confirm("Delete them? This cannot be undone.", abort=True)
+        rows = [f"{topic}: {counted(count, 'message')}" for topic, count in sorted(counts.items())]
+        if not self._confirmed(what, rows, asks=asks):
+            return
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             if recorder is not None and self._recorder is None:
                 raise RecorderError(f"nothing was deleted: {recorder}; forget again")
-            kept_by_lake = _request_of_lake(
-                self._bag_dir, [Forgetting(*each, erasure.topics) for each in erasure.windows]
+            kept_by_lake = self._request_of_lake(
+                [Forgetting(*window, erasure.topics) for window in erasure.windows]
             )
-            result = self._eraser.erase(erasure, survey, self._forget_derived)
-        print_line(
-            "not all is deleted" if result.kept else f"deleted: {survey.counts.total()} messages"
-        )
-        _print_kept([*result.kept, *kept_by_lake])
+            result = self._eraser.erase(erasure, survey, self._refresh_and_forget)
+        is_all = not result.kept
+        print_line(f"deleted: {counts.total()} messages" if is_all else "not all is deleted")
+        self._stays([*result.kept, *kept_by_lake])
         for note in result.notes:
             print_line(note)
-        return bool(kept or result.kept or kept_by_lake)
 
-    def _forget_derived(self, erasure: Erasure) -> None:
-        self._memory.index.refresh()
-        _forget_derived(self._settings, erasure.files)
+    def delete_bags(self, window: TimeWindow, *, asks: bool) -> None:
+        """Deletes the bags that lie inside a window; `asks` as above."""
+        going, kept = self._planned(window)
+        self._stays([*kept, *self._kept_elsewhere(going, window)])
+        if not going:
+            why = (
+                "each bag with messages in the window stays, for the reason above"
+                if kept
+                else "no closed bag has messages in the window"
+            )
+            print_line(f"nothing to delete: {why}")
+            self._forget_derived(())
+            return
+        first, last = min(bag.start for bag in going), max(bag.end for bag in going)
+        size = sum(bag.size for bag in going)
+        what = f"{counted(len(going), 'bag')}, {size / MB:.1f} MB, {_span(first, last)}"
+        if self._confirmed(what, map(self._name, going) if self._dry_run else (), asks=asks):
+            self._delete(going)
 
+    def _confirmed(self, what: str, rows: Iterable[str], *, asks: bool) -> bool:
+        """Prints what is to go, and returns whether it goes."""
+        print_line(f"{'would' if self._dry_run else 'to'} be deleted: {what}")
+        for row in rows:
+            print_line(f"  {row}")
+        if asks and not self._dry_run:
+            typer.confirm("Delete them? This cannot be undone.", abort=True)
+        return not self._dry_run
 
-def _forget_derived(settings: Settings, files: Sequence[str], *, dry_run: bool = False) -> None:
-    """Deletes what is derived from bags, and from those that retention deleted before.
+    def _stays(self, lines: Iterable[str]) -> None:
+        for line in lines:
+            self.leaves_some = True
+            print_line(f"{STAYS}{line}")
 
-    Args:
-        settings: of this deployment.
-        files: the bags, by their paths in the bag directory.
-        dry_run: whether nothing is to be deleted.
+    def _planned(self, window: TimeWindow) -> tuple[list[BagFile], list[str]]:
+        """Decides which bags of a window go, and gives a line with the reason for each other one.
 
-    Raises:
-        BagError: some of it may still be there.
-    """
-    if dry_run:
-        return
-    delete_catalogues(settings)
-    for path in column_paths(settings):
-        forget_columns(path, settings.recording.bag_dir, files)
-
-
-def _describe_erasure(erasure: Erasure) -> str:
-    first, last = erasure.windows[0][0], erasure.windows[-1][1]
-    span = TimeWindow(first, last)
-    ends = [format_time(unix_from_ns(each)) for each in span.asked()]
-    return f"{listed(erasure.topics)} from {ends[0]} to {ends[1]}"
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """The bags of a window that are deleted, and a line with the reason for each that is kept.
-
-    `own` are the recordings of which bags may be deleted; None: all.
-    """
-
-    bag_dir: Path
-    own: OwnRecordings | None
-    to_delete: tuple[BagFile, ...]
-    kept: tuple[str, ...]
-
-
-def plan_deletion(
-    settings: Settings, snapshot: Snapshot, window: TimeWindow, reader: BagReader
-) -> Plan:
-    """Decides what is deleted of a window; `reader` reads files as they are.
-
-    Only bags are read of which some messages do not count.
-    """
-    bag_dir = settings.recording.bag_dir
-    own = OwnRecordings(bag_dir) if settings.retention.foreign == "keep" else None
-    to_delete: list[BagFile] = []
-    kept: list[str] = []
-    for bag in _raw_bags(snapshot, reader):
-        if not window.overlaps(bag.start, bag.end):
-            continue
-        reason = _reason_to_keep(bag, window, bag_dir, own)
-        if reason is None:
-            to_delete.append(bag)
-        else:
-            kept.append(f"{_name(bag.path, bag_dir)}: {reason}")
-    deleted_too = {other_form(bag.file) for bag in to_delete}
-    for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
-        if str(aside.path) in deleted_too:
-            continue
-        name = _name(aside.path, bag_dir)
-        if span is None:
-            kept.append(f"{name}: when it was recorded is unknown ({aside.reason})")
-        elif span.overlaps(window.start, window.stop - 1) and not aside.answers:
-            kept.append(f"{name}: {aside.reason}")
-    return Plan(bag_dir, own, tuple(to_delete), tuple(kept))
-
-
-def _raw_bags(snapshot: Snapshot, reader: BagReader) -> Iterator[BagFile]:
-    """Yields the bags with the times of all messages in them, also of those that do not count."""
-    handovers: dict[Path, Handover] = {}
-    for bag in snapshot.bags:
-        folder = bag.recording
-        if bag.sidecar_ns and folder not in handovers:
-            handovers[folder] = read_handover(folder).handover
-        if bag.sidecar_ns and handovers[folder].rule(bag.path.name) is not None:
-            with suppress(BagError):
-                summary = reader.summarize(bag.path)
-                yield bag._replace(start=summary.start, end=summary.end)
+        Only bags are read of which some messages do not count.
+        """
+        going: list[BagFile] = []
+        kept: list[str] = []
+        snapshot = self._memory.index.snapshot()
+        for bag in self._raw_bags(snapshot):
+            if window.overlaps(bag.start, bag.end):
+                if reason := self._reason_to_keep(bag, window):
+                    kept.append(f"{self._name(bag)}: {reason}")
+                else:
+                    going.append(bag)
+        deleted_too = {other_form(bag.file) for bag in going}
+        for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
+            reason = aside.reason
+            if span is None:
+                reason = f"when it was recorded is unknown ({reason})"
+            elif aside.answers or not span.overlaps(window.start, window.stop - 1):
                 continue
-        yield bag
-    for path in snapshot.empty:
-        with suppress(BagError, OSError):
-            summary, status = reader.summarize(path), path.lstat()
-            if not summary.empty:
-                stamp = str(path), status.st_size, status.st_mtime_ns
-                yield BagFile(*stamp, BagState.CLOSED, summary, summary.start, summary.end)
+            if str(aside.path) not in deleted_too:
+                kept.append(f"{self._name(aside)}: {reason}")
+        return going, kept
 
+    def _raw_bags(self, snapshot: Snapshot) -> Iterator[BagFile]:
+        """Yields the bags with all messages in them, also those that do not count."""
+        handovers: dict[Path, Handover] = {}
+        for bag in snapshot.bags:
+            if bag.sidecar_ns:
+                if bag.recording not in handovers:
+                    handovers[bag.recording] = read_handover(bag.recording).handover
+                if handovers[bag.recording].rule(bag.path.name) is not None:
+                    try:
+                        summary = self._reader.summarize(bag.path)
+                    except BagError:
+                        self._unread.add(bag.path)
+                    else:
+                        start, end = summary.start, summary.end
+                        bag = bag._replace(summary=summary, start=start, end=end)  # noqa: PLW2901
+            yield bag
+        for path in snapshot.empty:
+            with suppress(BagError, OSError):
+                summary, status = self._reader.summarize(path), path.lstat()
+                if not summary.empty:
+                    stamp = str(path), status.st_size, status.st_mtime_ns
+                    yield BagFile(*stamp, BagState.CLOSED, summary, summary.start, summary.end)
 
-def _reason_to_keep(
-    bag: BagFile, window: TimeWindow, bag_dir: Path, own: OwnRecordings | None
-) -> str | None:
-    if bag.state is BagState.ACTIVE:
-        return "it is being written"
-    if not window.covers(bag.start, bag.end):
-        return "it reaches beyond the window"
-    if not _may_delete(bag, own):
-        folder = own.name_of(bag.path.parent) if own is not None else ""
-        if folder:
-            adopt = f"`ros2-memory adopt {folder}` first"
-        else:
+    def _reason_to_keep(self, bag: BagFile, window: TimeWindow) -> str | None:
+        if bag.state is BagState.ACTIVE:
+            return "it is being written"
+        if not window.covers(bag.start, bag.end):
+            return "it reaches beyond the window"
+        if self._own is not None and not self._own.owns_bag(bag.path):
+            folder = self._own.name_of(bag.path.parent)
             adopt = (
-                "move it into a directory of its own in the bag directory and let "
+                f"`ros2-memory adopt {folder}` first"
+                if folder
+                else "move it into a directory of its own in the bag directory and let "
                 "`ros2-memory adopt` take that"
             )
-        return f"this recorder did not make it; to forget it, {adopt}"
-    if bag.state is BagState.INCOMPLETE:
-        closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
-        return f"a crash left it open{closes}"
-    if bag.path.is_relative_to(bag_dir / MOMENTS_FOLDER):
-        return "it belongs to a saved moment; delete the moment's folder to forget it"
-    return None
+            return f"this recorder did not make it; to forget it, {adopt}"
+        if bag.state is BagState.INCOMPLETE:
+            closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
+            return f"a crash left it open{closes}"
+        if bag.path.is_relative_to(self._bag_dir / MOMENTS_FOLDER):
+            return "it belongs to a saved moment; delete the moment's folder to forget it"
+        return None
+
+    def _kept_elsewhere(self, going: Sequence[BagFile], window: TimeWindow) -> Iterator[str]:
+        """Yields what of the window remains readable without the bags that are deleted."""
+        with suppress(BagError):
+            carried = [
+                topic.topic
+                for topic in self._memory.reader.summarize(self._carrier.path).topics
+                if window.overlaps(topic.first, topic.last)
+            ]
+            if carried:
+                where = f"in {self._carrier.path}: {', '.join(carried)}"
+                yield f"latched messages that later answers need, {where}"
+        if linked := _with_other_links(going):
+            yield (
+                f"{counted(len(linked), 'bag')} of these, also in saved moments or "
+                "under other names: delete the moment's folder to forget it"
+            )
+
+    def _delete(self, planned: Sequence[BagFile]) -> None:
+        """Deletes the planned bags that are still there, and prints which stay.
+
+        A live recorder carries latched messages itself, and two programs must not do so at a time.
+        Bags with such messages are kept then.
+
+        Raises:
+            BagError: latched messages cannot be carried; nothing is deleted then.
+        """
+        kept: list[str] = []
+        with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
+            snapshot = self._memory.index.refresh()
+            present = {bag[:3] for bag in self._raw_bags(snapshot)}
+            bags = [
+                bag
+                for bag in planned
+                if bag[:3] in present and (self._own is None or self._own.owns_bag(bag.path))
+            ]
+            paths, also = {bag.path for bag in bags}, ""
+            if recorder is None:
+                carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
+                if carried is not None:
+                    messages = counted(carried, "latched message is", "latched messages are")
+                    also = f"; {messages} carried on"
+            else:
+                latched = self._carrier.with_latched(snapshot, paths)
+                paths -= {bag.path for bag in latched}
+                bags = [bag for bag in bags if bag.path in paths]
+                kept = [
+                    f"{self._name(bag)}: it has latched messages, which only the recorder may copy "
+                    f"forward while it runs: {recorder}; stop the recorder, and forget again"
+                    for bag in sorted(latched)
+                ]
+            kept += [
+                f"what a lake has of {self._name(bag)}, which cannot be read"
+                for bag in bags
+                if bag.path in self._unread
+            ]
+            if known := [bag for bag in bags if bag.path not in self._unread]:
+                forgotten = [
+                    ForgottenBag(bag.recording.name, bag.path.name, bag.summary.start)
+                    for bag in known
+                ]
+                start = min(min(bag.summary.start, bag.start) for bag in known)
+                stop = max(bag.end for bag in known) + 1
+                kept += self._request_of_lake([Forgetting(start, stop, bags=tuple(forgotten))])
+            deleted, freed = self._delete_files(bags, kept)
+            open_recordings = {
+                self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings
+            }
+            for recording in {bag.recording for bag in deleted} - open_recordings:
+                try:
+                    remove_emptied(self._bag_dir, recording)
+                except OSError as error:
+                    kept.append(f"{recording}: {error}")
+            try:
+                self._forget_derived(map(self._name, deleted))
+            except BagError as error:
+                kept.append(error.reason)
+            notes = [*self._correct_metadata(deleted, open_recordings)]
+        print_line(f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB{also}")
+        self._stays(kept)
+        for note in notes:
+            print_line(note)
+
+    def _delete_files(self, bags: Sequence[BagFile], kept: list[str]) -> tuple[list[BagFile], int]:
+        """Deletes bags in every form; returns which, and their bytes; adds faults to `kept`."""
+        deleted, freed = [], 0
+        for bag in bags:
+            try:
+                for path in (bag.path, Path(other_form(bag.file))):
+                    with suppress(FileNotFoundError):
+                        status = path.lstat()
+                        inode = status.st_dev, status.st_ino
+                        freed += remove_bag(self._bag_dir, path, inode)
+                deleted.append(bag)
+            except OSError as error:
+                kept.append(f"{bag.path}: {error}")
+        return deleted, freed
+
+    def _correct_metadata(
+        self, deleted: Sequence[BagFile], open_recordings: Collection[Path]
+    ) -> Iterator[str]:
+        """Takes deleted bags out of each recording's metadata.yaml; yields a line for each.
+
+        That of an open recording is left to its recorder, which writes it at the end.
+        """
+        for recording in sorted({bag.recording for bag in deleted}):
+            listing = recording / METADATA_FILE
+            name = self._name(listing)
+            if recording in open_recordings and not listing.exists():
+                yield f"{name} will list deleted bags: the recorder writes it at the end"
+                continue
+            counts: dict[str, Counter[str]] = {}
+            for bag in deleted:
+                if bag.recording == recording:
+                    of_bag = counts[bag.path.name] = Counter[str]()
+                    for topic in bag.summary.topics:
+                        of_bag[topic.topic] += topic.count
+            try:
+                with directories.opened(self._bag_dir, recording):
+                    is_listed = take_out(recording, counts)
+                if is_listed:
+                    yield f"{name} lists the remaining bags"
+            except FileNotFoundError:
+                continue  # the recording was deleted, and its metadata.yaml with it
+            except (OSError, ValueError) as error:
+                yield (
+                    f"{name} still lists deleted bags ({error}); rosbag2 opens the folder "
+                    f"after `ros2 bag reindex {recording}`"
+                )
+
+    def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> list[str]:
+        """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
+        if not forgettings:
+            return []
+        try:
+            FORGOTTEN.append(self._bag_dir, forgettings)
+        except OSError as error:
+            first = min(one.start for one in forgettings) // NS_PER_S
+            last = -(-max(one.stop for one in forgettings) // NS_PER_S)
+            line = (
+                f"what a lake has of it: {self._bag_dir / FORGOTTEN_FILE} cannot be written "
+                f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
+                f"--forget ROBOT --start {first} --end {last}` where that is done"
+            )
+            return [line]
+        if (self._bag_dir / SHIPPED_FILE).exists():
+            print_line("the next pass of ros2-memory ship deletes it from the lake, too")
+        return []
+
+    def _refresh_and_forget(self, erasure: Erasure) -> None:
+        self._memory.index.refresh()
+        self._forget_derived(erasure.files)
+
+    def _forget_derived(self, files: Iterable[str]) -> None:
+        """Deletes what is derived from bags, by their names, and from those deleted before.
+
+        Of bags that retention deleted, something may be left.
+
+        Raises:
+            BagError: some of it may still be there.
+        """
+        if not self._dry_run:
+            delete_catalogues(self._settings)
+            names = [*files]
+            for path in column_paths(self._settings):
+                forget_columns(path, self._bag_dir, names)
+
+    def _name(self, of: BagFile | SetAside | Path) -> str:
+        """Returns a path as people know it: relative to the bag directory, if it is in there."""
+        path = of if isinstance(of, Path) else of.path
+        inside = path.is_relative_to(self._bag_dir)
+        return str(path.relative_to(self._bag_dir) if inside else path)
 
 
-def _may_delete(bag: BagFile, own: OwnRecordings | None) -> bool:
-    """Returns whether the recorder made a bag, or keeps it (carried messages, saved moments)."""
-    return own is None or own.owns_bag(bag.path)
-
-
-def _name(path: Path, bag_dir: Path) -> str:
-    """Returns a path as people know it: relative to the bag directory, if it is in there."""
-    return str(path.relative_to(bag_dir)) if path.is_relative_to(bag_dir) else str(path)
-
-
-def _print_kept(lines: Sequence[str]) -> None:
-    for line in lines:
-        print_line(f"stays: {line}")
-
-
-def _describe(plan: Plan) -> str:
-    first, last = min(bag.start for bag in plan.to_delete), max(bag.end for bag in plan.to_delete)
-    size = sum(bag.size for bag in plan.to_delete)
-    return (
-        f"{counted(len(plan.to_delete), 'bag')}, {size / MB:.1f} MB, from "
-        f"{format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
-    )
-
-
-def _kept_elsewhere(
-    memory: Memory, carrier: Carrier, plan: Plan, window: TimeWindow
-) -> Iterator[str]:
-    """Yields what of the window remains readable without the bags that are deleted."""
-    with suppress(BagError):
-        carried = [
-            topic.topic
-            for topic in memory.reader.summarize(carrier.path).topics
-            if window.overlaps(topic.first, topic.last)
-        ]
-        if carried:
-            topics = ", ".join(carried)
-            yield f"latched messages that later answers need, in {carrier.path}: {topics}"
-    linked = _with_other_links(plan.to_delete)
-    if linked:
-        yield (
-            f"{counted(len(linked), 'bag')} of these, also in saved moments or "
-            "under other names: delete the moment's folder to forget it"
-        )
+def _span(first: Ns, last: Ns) -> str:
+    return f"from {format_time(unix_from_ns(first))} to {format_time(unix_from_ns(last))}"
 
 
 def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
@@ -462,123 +532,6 @@ def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
             if bag.path.lstat().st_nlink > 1:
                 linked.add(bag.path)
     return linked
-
-
-def _contents(
-    reader: BagReader, bags: Sequence[BagFile]
-) -> tuple[dict[Path, Counter[str]], dict[Path, Ns]]:
-    """Returns the messages of each topic in each file, and the log time of its first message.
-
-    Also those that do not count in answers: `metadata.yaml` lists them. A file that cannot be read
-    is left out.
-    """
-    counts: dict[Path, Counter[str]] = {}
-    firsts: dict[Path, Ns] = {}
-    for bag in bags:
-        with suppress(BagError):
-            in_file = counts.setdefault(bag.path, Counter())
-            summary = reader.summarize(bag.path)
-            for topic in summary.topics:
-                in_file[topic.topic] += topic.count
-            if not summary.empty:
-                firsts[bag.path] = summary.start
-    return counts, firsts
-
-
-def _delete(
-    settings: Settings,
-    memory: Memory,
-    plan: Plan,
-    carrier: Carrier,
-    contents: tuple[Mapping[Path, Counter[str]], Mapping[Path, Ns]],
-) -> list[str]:
-    """Deletes the planned bags that are still there; returns a line for each that is kept.
-
-    A live recorder carries latched messages itself, and two programs must not do so at a time.
-    Bags with such messages are kept then.
-
-    Raises:
-        BagError: latched messages cannot be carried; nothing is deleted then.
-    """
-    kept: list[str] = []
-    counts, firsts = contents
-    with spinner("deleting"), _recorder_locked_out(plan.bag_dir) as recorder:
-        snapshot = memory.index.refresh()
-        present = {bag[:3] for bag in _raw_bags(snapshot, build_reader(settings))}
-        bags = [bag for bag in plan.to_delete if bag[:3] in present and _may_delete(bag, plan.own)]
-        carried = None
-        if recorder is None:
-            paths = {bag.path for bag in bags}
-            carried = carrier.carry(snapshot, paths, _with_other_links(bags))
-        else:
-            latched = {*carrier.with_latched(snapshot, {bag.path for bag in bags})}
-            bags = [bag for bag in bags if bag not in latched]
-            kept = [
-                f"{_name(bag.path, plan.bag_dir)}: it has latched messages, which only the "
-                f"recorder may copy forward while it runs: {recorder}; stop the recorder, and "
-                "forget again"
-                for bag in sorted(latched)
-            ]
-        kept += [
-            f"what a lake has of {_name(bag.path, plan.bag_dir)}, which cannot be read"
-            for bag in bags
-            if bag.path not in firsts
-        ]
-        kept += _request_of_lake(plan.bag_dir, [*_forgetting_of(bags, firsts)])
-        deleted, freed = _delete_files(plan.bag_dir, bags, kept)
-        reported_open = read_heartbeat(plan.bag_dir).recordings
-        open_recordings = {plan.bag_dir / name for name in reported_open}
-        for recording in {bag.recording for bag in deleted} - open_recordings:
-            try:
-                remove_emptied(plan.bag_dir, recording)
-            except OSError as error:
-                kept.append(f"{recording}: {error}")
-        try:
-            _forget_derived(settings, [_name(bag.path, plan.bag_dir) for bag in deleted])
-        except BagError as error:
-            kept.append(error.reason)
-        notes = [*_correct_metadata(plan, deleted, open_recordings, counts)]
-    line = f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB"
-    if carried is not None:
-        messages = counted(carried, "latched message is", "latched messages are")
-        line += f"; {messages} carried on"
-    print_line(line)
-    _print_kept(kept)
-    for note in notes:
-        print_line(note)
-    return kept
-
-
-def _forgetting_of(bags: Sequence[BagFile], firsts: Mapping[Path, Ns]) -> Iterator[Forgetting]:
-    known = [bag for bag in bags if bag.path in firsts]
-    if known:
-        yield Forgetting(
-            min(min(firsts[bag.path], bag.start) for bag in known),
-            max(bag.end for bag in known) + 1,
-            bags=tuple(
-                ForgottenBag(bag.recording.name, bag.path.name, firsts[bag.path]) for bag in known
-            ),
-        )
-
-
-def _request_of_lake(bag_dir: Path, forgettings: Sequence[Forgetting]) -> list[str]:
-    """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
-    if not forgettings:
-        return []
-    try:
-        FORGOTTEN.append(bag_dir, forgettings)
-    except OSError as error:
-        first = min(each.start for each in forgettings) // NS_PER_S
-        last = -(-max(each.stop for each in forgettings) // NS_PER_S)
-        line = (
-            f"what a lake has of it: {bag_dir / FORGOTTEN_FILE} cannot be written "
-            f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "
-            f"--forget ROBOT --start {first} --end {last}` where that is done"
-        )
-        return [line]
-    if (bag_dir / SHIPPED_FILE).exists():
-        print_line("the next pass of ros2-memory ship deletes it from the lake, too")
-    return []
 
 
 def _recorder_of(bag_dir: Path) -> str | None:
@@ -601,55 +554,3 @@ def _recorder_locked_out(bag_dir: Path) -> Iterator[str | None]:
         yield None
     finally:
         lock.release()
-
-
-def _delete_files(
-    bag_dir: Path, bags: Sequence[BagFile], kept: list[str]
-) -> tuple[list[BagFile], int]:
-    """Deletes bags in every form; returns those deleted and their bytes, adds faults to `kept`."""
-    deleted, freed = [], 0
-    for bag in bags:
-        try:
-            for path in (bag.path, Path(other_form(bag.file))):
-                with suppress(FileNotFoundError):
-                    status = path.lstat()
-                    freed += remove_bag(bag_dir, path, (status.st_dev, status.st_ino))
-        except OSError as error:
-            kept.append(f"{bag.path}: {error}")
-        else:
-            deleted.append(bag)
-    return deleted, freed
-
-
-def _correct_metadata(
-    plan: Plan,
-    deleted: Sequence[BagFile],
-    open_recordings: Collection[Path],
-    counts: Mapping[Path, Counter[str]],
-) -> Iterator[str]:
-    """Takes deleted bags out of each recording's metadata.yaml; yields a line for each.
-
-    That of an open recording is left to its recorder, which writes it at the end.
-    """
-    for recording in sorted({bag.recording for bag in deleted}):
-        name = f"{_name(recording, plan.bag_dir)}/{METADATA_FILE}"
-        if recording in open_recordings and not (recording / METADATA_FILE).exists():
-            yield f"{name} will list deleted bags: the recorder writes it at the end"
-            continue
-        of_recording = {
-            bag.path.name: counts.get(bag.path, Counter[str]())
-            for bag in deleted
-            if bag.recording == recording
-        }
-        try:
-            with directories.opened(plan.bag_dir, recording):
-                is_listed = take_out(recording, of_recording)
-            if is_listed:
-                yield f"{name} lists the remaining bags"
-        except FileNotFoundError:
-            continue  # the recording was deleted, and its metadata.yaml with it
-        except (OSError, ValueError) as error:
-            yield (
-                f"{name} still lists deleted bags ({error}); rosbag2 opens the folder "
-                f"after `ros2 bag reindex {recording}`"
-            )

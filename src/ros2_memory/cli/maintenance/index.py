@@ -27,14 +27,12 @@ from ros2_memory.cli.options import (
     Words,
     load_given,
     open_memory,
-    print_line,
 )
-from ros2_memory.cli.output import progress_bar
+from ros2_memory.cli.output import print_line, progress_bar
 from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
-from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted
 from ros2_memory.serving.backfill import Backfill
 
@@ -67,38 +65,33 @@ def index(
     settings, _ = load_given(bag_dir, words)
     if for_server is not None:
         _fill_for_server(settings, for_server)
-    elif settings.fleet.robots:
-        _fill_fleet(settings, as_json=as_json, verbose=verbose)
-    else:
-        progress = _fill_for_people(settings, verbose=verbose)
-        if as_json:
-            print_line(json.dumps(as_object(progress)))
-        else:
-            print(describe_progress(progress), file=sys.stderr)
-
-
-def _fill_fleet(settings: Settings, *, as_json: bool, verbose: bool) -> None:
-    """Fills the stores of a fleet's robots; names those whose bags cannot be listed."""
-    done: dict[str, JsonValue] = {}
+        return
+    robots = settings.fleet.robots
+    done: dict[str, dict[str, int]] = {}
     problems: list[str] = []
-    for name in settings.fleet.robots:
+    for name in robots or ("",):
         try:
-            progress = _fill_for_people(
-                robot_settings(settings, name), verbose=verbose, setting=ROBOTS_SETTING
-            )
+            progress = _fill_for_people(settings, name, verbose=verbose)
         except RecorderError as error:
+            if not robots:
+                raise
             problems.append(f"{name}: {error}")
             continue
-        done[name] = as_object(progress)
+        bags, stored, refused = progress.closed, progress.stored, progress.refused
+        done[name] = {"bags": bags, "stored": stored, "refused": refused}
         if not as_json:
-            print(f"{describe_progress(progress)} of {name}", file=sys.stderr)
+            of = f" of {name}" if robots else ""
+            print(f"{describe_progress(progress)}{of}", file=sys.stderr)
     if as_json:
-        print_line(json.dumps(done))
+        print_line(json.dumps(done if robots else done[""]))
     if problems:
         raise RecorderError("; ".join(problems))
 
 
-def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None = None) -> Progress:
+def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progress:
+    """Fills the store of a robot of a fleet, or of the only one without a name."""
+    setting = ROBOTS_SETTING if robot else None
+    settings = robot_settings(settings, robot) if robot else settings
     cache_mb = _cache_mb(settings)
     memory = open_memory(settings, verbose=verbose, setting=setting, cache_mb=cache_mb)
     if problem := memory.index.snapshot().problem:
@@ -123,9 +116,8 @@ def _fill_for_people(settings: Settings, *, verbose: bool, setting: str | None =
 def _fill_for_server(settings: Settings, server: int) -> None:
     if not _end_with_parent(server):
         raise typer.Exit(EXIT_CANNOT_RUN)
-    configure_logging(
-        settings.logging.level, settings.logging.format, arguments=settings.logging.arguments
-    )
+    logged = settings.logging
+    configure_logging(logged.level, logged.format, arguments=logged.arguments)
     _filled(_low_priority_backfill(settings))
 
 
@@ -187,11 +179,6 @@ def _garbage_collected_rarely() -> Iterator[None]:
     finally:
         gc.set_threshold(*before)
         gc.unfreeze()
-
-
-def as_object(progress: Progress) -> dict[str, JsonValue]:
-    """Returns how many bags are stored, for programs."""
-    return {"bags": progress.closed, "stored": progress.stored, "refused": progress.refused}
 
 
 def describe_progress(progress: Progress) -> str:

@@ -8,13 +8,12 @@ import json
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import partial
+from itertools import accumulate
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 from rich.console import Console
-from rich.progress import Progress, TaskID
 
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
@@ -22,8 +21,8 @@ from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE
 from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.cli.options import EXIT_NEGATIVE, AsJson, print_line
-from ros2_memory.cli.output import progress_bar
+from ros2_memory.cli.options import AsJson
+from ros2_memory.cli.output import print_line, progress_bar
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted, listed
@@ -57,7 +56,7 @@ def recover(
         bool, typer.Option("--dry-run", help="Show what would be changed, and change nothing.")
     ] = False,
     as_json: AsJson = False,
-) -> None:
+) -> bool:
     """Repair MCAP files that a crash, a full disk or a power cut left unfinished.
 
     Rewrites each file in place from everything that can be read of it, and keeps the original until
@@ -77,8 +76,7 @@ def recover(
     outcome = recover_files(path, report, force=force, dry_run=dry_run)
     if as_json:
         print_line(json.dumps({**asdict(outcome), "lines": lines[:-1]}))
-    if outcome.failed:
-        raise typer.Exit(EXIT_NEGATIVE)
+    return outcome.failed > 0
 
 
 @dataclass(slots=True)
@@ -128,32 +126,34 @@ def recover_files(
     recovery = _Recovery(clock, force, build_repairer(), dry_run=dry_run)
     with progress_bar(console) as bar:
         task = bar.add_task("", total=max(sum(sizes), 1))
-        done = 0
-        for file, size in zip(files, sizes, strict=True):
+        for file, done in zip(files, accumulate(sizes, initial=0), strict=False):
             name = str(file if file == path else file.relative_to(path))
             bar.update(task, completed=done, description=name)
-            line = recovery.recover(file, partial(_advance, bar, task, done))
+
+            def show(read: int, done: int = done) -> None:
+                bar.update(task, completed=done + read)
+
+            line = recovery.recover(file, show)
             if line is None and file == path:
                 line = "whole already: there is nothing to repair"
             if line is not None:
                 bar.stop()  # or the line would be printed into the bar
                 report(f"{name}: {line}")
                 bar.start()
-            done += size
     for folder in sorted(recovery.changed):
-        recovery.correct_metadata(folder, report)
+        if line := recovery.correct_metadata(folder):
+            report(line)
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
         report(f"{left} left alone: only MCAP files are repaired")
-    if dry_run:
-        seen = recovery.outcome
-        report(
-            f"nothing was changed: of the MCAP files {seen.whole} are whole, {seen.repaired} would "
-            f"be repaired, {seen.removed} removed, and {seen.failed} not repaired"
-        )
-    else:
-        report(str(recovery.outcome))
-    return recovery.outcome
+    seen = recovery.outcome
+    report(
+        f"nothing was changed: of the MCAP files {seen.whole} are whole, {seen.repaired} would "
+        f"be repaired, {seen.removed} removed, and {seen.failed} not repaired"
+        if dry_run
+        else str(seen)
+    )
+    return seen
 
 
 def foreign_unfinished(path: Path) -> tuple[Path, ...]:
@@ -167,20 +167,13 @@ def foreign_unfinished(path: Path) -> tuple[Path, ...]:
         with suppress(BagError):
             if file.parent not in found and not repairer.is_whole(file):
                 found.add(file.parent)
-    return tuple(sorted(each for each in found if not _is_own(each)))
+    return tuple(sorted(folder for folder in found if not _is_own(folder)))
 
 
 def _is_own(folder: Path) -> bool:
     whole = folder.absolute()
-    for bag_dir in whole.parents:
-        if (bag_dir / LIST_FILE).exists():
-            own = OwnRecordings(bag_dir)
-            return own.owns(whole)
-    return False
-
-
-def _advance(bar: Progress, task: TaskID, done: int, read: int) -> None:
-    bar.update(task, completed=done + read)
+    listing = next((above for above in whole.parents if (above / LIST_FILE).exists()), None)
+    return listing is not None and OwnRecordings(listing).owns(whole)
 
 
 class _Recovery:
@@ -206,9 +199,10 @@ class _Recovery:
                 outcome.whole += 1
                 return None
             self._require_unused(file)
-            if self._dry_run:
-                return self._plan(file)
-            repaired = self._repairer.repair(file, on_read)
+            size = size_of(file)
+            rewritten = None
+            if not self._dry_run and (repaired := self._repairer.repair(file, on_read)):
+                rewritten = repaired.rewritten
         except BagVanishedError:
             outcome.failed += 1
             return "NOT REPAIRED: it is not there any more"
@@ -216,51 +210,40 @@ class _Recovery:
             outcome.failed += 1
             return f"NOT REPAIRED: {error.reason}"
         self.changed.add(file.parent)
-        rewritten = None if repaired is None else repaired.rewritten
-        if repaired is None or rewritten is None:
+        if rewritten is None and not (self._dry_run and size):
             outcome.removed += 1
-            return "empty, removed"
+            return f"empty, {'would be ' if self._dry_run else ''}removed"
         outcome.repaired += 1
+        if rewritten is None:
+            return f"would be repaired ({counted(size, 'byte')})"
         outcome.messages += rewritten.messages
         return (
-            f"repaired: {counted(rewritten.messages, 'message')}, "
-            f"{rewritten.describe_loss()} "
-            f"({repaired.was_bytes} bytes before, {repaired.is_bytes} now)"
+            f"repaired: {counted(rewritten.messages, 'message')}, {rewritten.describe_loss()} "
+            f"({size} bytes before, {size_of(file)} now)"
             f"{''.join(f'; {note}' for note in rewritten.notes)}"
         )
 
-    def correct_metadata(self, folder: Path, report: Callable[[str], None]) -> None:
-        """Makes metadata.yaml describe the files of the recording, where it does not."""
+    def correct_metadata(self, folder: Path) -> str | None:
+        """Makes metadata.yaml describe the files of the recording; returns what was done."""
         path = folder / METADATA_FILE
         existed = size_of(path) > 0
         if self._dry_run:
-            if existed or is_named_by_rosbag2(folder):
-                verb = "corrected" if existed else "written"
-                report(f"{path}: would be {verb} to match the files")
-            return
+            verb = "corrected" if existed else "written"
+            is_written = existed or is_named_by_rosbag2(folder)
+            return f"{path}: would be {verb} to match the files" if is_written else None
         try:
             if self._repairer.correct_metadata(folder):
-                report(f"{path}: {'rewritten' if existed else 'written'} to match the files")
-            elif not existed and any(folder.glob(f"*{_MCAP}")):
-                report(
-                    f"{folder} has no {METADATA_FILE}, and none is written, since its files are "
-                    f"not named after it as {folder.name}_0{_MCAP}: "
-                    f"`ros2 bag reindex {folder}` makes one"
-                )
+                return f"{path}: {'rewritten' if existed else 'written'} to match the files"
         except BagError as error:
-            report(f"{path} NOT CORRECTED: {error.path}: {error.reason}")
+            return f"{path} NOT CORRECTED: {error.path}: {error.reason}"
         except (OSError, ValueError) as error:
-            report(f"{path} NOT CORRECTED: {error}")
-
-    def _plan(self, file: Path) -> str:
-        """Returns what would be done with an unfinished file."""
-        self.changed.add(file.parent)
-        size = size_of(file)
-        if not size:
-            self.outcome.removed += 1
-            return "empty, would be removed"
-        self.outcome.repaired += 1
-        return f"would be repaired ({counted(size, 'byte')})"
+            return f"{path} NOT CORRECTED: {error}"
+        if existed or not any(folder.glob(f"*{_MCAP}")):
+            return None
+        return (
+            f"{folder} has no {METADATA_FILE}, and none is written, since its files are not named "
+            f"after it as {folder.name}_0{_MCAP}: `ros2 bag reindex {folder}` makes one"
+        )
 
     def _require_unused(self, file: Path) -> None:
         """Checks that nothing writes a file, as far as that can be known.
@@ -313,6 +296,6 @@ def _files_below(path: Path, clock: Clock) -> tuple[list[Path], int]:
         raise RecorderError(f"{path} cannot be listed: {walked.problem}")
     # A saved moment has hard links to bags, which were whole when it was saved.
     links = HardLinks(path)
-    bags = sorted(Path(each) for each in walked.stamps if not links.is_saved(each))
+    bags = sorted(Path(name) for name in walked.stamps if not links.is_saved(name))
     files = [bag for bag in bags if bag.suffix == _MCAP]
     return files, len(bags) - len(files)

@@ -2,7 +2,6 @@
 
 import json
 import math
-import sys
 import time
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -14,17 +13,8 @@ import typer
 from ros2_memory.bootstrap import shared_parts
 from ros2_memory.bootstrap_fleet import build_robots
 from ros2_memory.bootstrap_lake import lake_location
-from ros2_memory.cli.options import (
-    EXIT_NEGATIVE,
-    AsJson,
-    End,
-    Overrides,
-    Start,
-    Verbose,
-    load_for,
-    parse_time,
-    print_line,
-)
+from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
+from ros2_memory.cli.output import print_line, print_notes
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeError
 from ros2_memory.core.logging_setup import configure_logging, get_logger
@@ -64,14 +54,14 @@ def ship(
     end: End = None,
     as_json: AsJson = False,
     verbose: Verbose = False,
-) -> None:
+) -> bool:
     """Ship the closed bags of many robots into a lake of Apache Iceberg tables.
 
     Reads the bags of fleet.robots, writes below lake.warehouse, and goes on until it is stopped.
     It can be killed and started again at any time: each bag comes into the lake once. Needs
     ros2-memory[lake].
     """
-    settings = load_for(None, overrides)
+    settings, _ = load_for(None, overrides)
     window = _window_of(forget, start, end)
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
@@ -80,43 +70,31 @@ def ship(
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
-    pace = _Pace(settings.lake.commit_interval_s)
+    pace = _pace(settings.lake.commit_interval_s)
     alone = writing_alone(location.state_dir)
     with alone, closing(WarehouseLease(location, WallClock())) as lease:
         if forget is None and not once:
-            new = partial(_new_robots, partial(load_for, None, overrides), shared)
+            new = partial(_new_robots, overrides, shared)
             _ship_on(settings, location, robots, pace, lease, new_robots=new)
         lease.renew()
         if forget is not None and window is not None:
-            _forget(location, forget, window, robots, as_json=as_json)
-            return
+            return _forget(location, forget, window, robots, as_json=as_json)
         with _shipper(settings, location, robots, pace, lease) as shipper:
             done = shipper.run()
             shipper.keep_up(ns_from_unix(settings.lake.grace_h * 3600))
+    rows, bags = counted(done.rows, "row"), counted(done.bags, "bag")
+    waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
+    keys = ("bags", "rows", "forgotten", "waiting", "problems")
     if as_json:
-        print_line(
-            json.dumps(
-                {
-                    "bags": done.bags,
-                    "rows": done.rows,
-                    "forgotten": done.forgotten,
-                    "waiting": done.waiting,
-                    "problems": done.problems,
-                }
-            )
-        )
+        print_line(json.dumps({key: getattr(done, key) for key in keys}))
     else:
-        rows = counted(done.rows, "row")
-        waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
-        print_line(f"shipped {counted(done.bags, 'bag')} ({rows}){waiting}")
+        print_line(f"shipped {bags} ({rows}){waiting}")
         if done.forgotten:
             print_line(f"forgotten as on the robot: {counted(done.forgotten, 'bag')}")
-        for problem in done.problems:
-            print(f"note: {problem}", file=sys.stderr)
+        print_notes(done.problems)
     if done.forgotten:
         _note_versions(location)
-    if done.waiting or done.problems:
-        raise typer.Exit(EXIT_NEGATIVE)
+    return bool(done.waiting or done.problems)
 
 
 def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWindow | None:
@@ -140,7 +118,7 @@ def _forget(
     robots: "Sequence[RobotBags]",
     *,
     as_json: bool,
-) -> None:
+) -> bool:
     """Forgets a time of a robot in the lake, and prints what is gone.
 
     Raises:
@@ -164,38 +142,33 @@ def _forget(
             )
         append_tombstone(location.state_dir, tombstone, done=False)
         gone = forget_in_lake(lake, tombstone)
+    kept_by = [*gone.kept_by]
     if as_json:
-        kept_by = [*gone.kept_by]
         print_line(json.dumps({"bags": gone.bags, "files": gone.files, "kept_by": kept_by}))
     else:
         bags = counted(gone.bags, "bag")
         print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
-        for each in gone.kept_by:
-            print(f"note: a branch or tag keeps an older version: {each}", file=sys.stderr)
+        print_notes([f"a branch or tag keeps an older version: {name}" for name in kept_by])
     _note_versions(location)
-    if gone.kept_by:
-        raise typer.Exit(EXIT_NEGATIVE)
+    return bool(kept_by)
 
 
 def _note_versions(location: "LakeLocation") -> None:
     """Prints, after something was forgotten, what a bucket may still have of it."""
     if not location.warehouse.startswith("file:"):
-        print(
-            "note: where the bucket keeps versions of deleted objects, those are not erased",
-            file=sys.stderr,
-        )
+        print_notes(["where the bucket keeps versions of deleted objects, those are not erased"])
 
 
-class _Pace:
-    """Waits before a commit until enough time has passed since the one before."""
+def _pace(interval_s: float) -> "Callable[[], None]":
+    """Returns what waits before a commit until enough time has passed since the one before."""
+    last_s = -math.inf
 
-    def __init__(self, interval_s: float) -> None:
-        self._interval_s = interval_s
-        self._last_s = -math.inf
+    def wait() -> None:
+        nonlocal last_s
+        _wait(last_s + interval_s - time.monotonic())
+        last_s = time.monotonic()
 
-    def __call__(self) -> None:
-        _wait(self._last_s + self._interval_s - time.monotonic())
-        self._last_s = time.monotonic()
+    return wait
 
 
 def _wait(seconds: float) -> None:
@@ -211,7 +184,7 @@ def _shipper(
     settings: Settings,
     location: "LakeLocation",
     robots: "Sequence[RobotBags]",
-    pace: _Pace,
+    pace: "Callable[[], None]",
     lease: "WarehouseLease",
 ) -> "Iterator[Shipper]":
     from ros2_memory.lake.forgetting import forget_in_lake, read_tombstones  # noqa: PLC0415
@@ -245,7 +218,7 @@ def _ship_on(
     settings: Settings,
     location: "LakeLocation",
     robots: "Sequence[RobotBags]",
-    pace: _Pace,
+    pace: "Callable[[], None]",
     lease: "WarehouseLease",
     *,
     new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]",
@@ -284,12 +257,12 @@ def _ship_on(
 
 
 def _new_robots(
-    load: "Callable[[], Settings]", shared: "SharedParts", robots: "Sequence[RobotBags]"
+    overrides: Overrides, shared: "SharedParts", robots: "Sequence[RobotBags]"
 ) -> "Sequence[RobotBags]":
     """Returns the robots of the settings that were not there before: a pattern may match more."""
     try:
-        settings = load()
-        known = {each.name for each in robots}
+        settings, _ = load_for(None, overrides)
+        known = {robot.name for robot in robots}
         new = {name: bags for name, bags in settings.fleet.robots.items() if name not in known}
         if not new:
             return []

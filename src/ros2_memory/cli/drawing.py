@@ -50,8 +50,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from matplotlib.axes import Axes
+    from numpy.typing import NDArray
 
-    from ros2_memory.cli.plot.scene import DrawnPath, Signal, Stop, TimelineRow
+    from ros2_memory.cli.plot import DrawnPath, Signal, Stop, TimelineRow
     from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
@@ -104,32 +105,24 @@ def draw_path(
         _draw_place(axes, place)
     points = np.column_stack([path.xs, path.ys])
     pieces = np.stack([points[:-1], points[1:]], axis=1)
-    driven = ~np.array(path.jumps[1:], dtype=bool)
-    times = np.array(path.times)
-    lines = LineCollection(
-        [*pieces[driven]], array=(times[:-1] / _DAY_S)[driven], cmap="viridis", linewidths=2.0
-    )
+    driven = ~path.jumps[1:]
+    days = path.times[:-1] / _DAY_S
+    lines = LineCollection([*pieces[driven]], array=days[driven], cmap="viridis", linewidths=2.0)
     axes.add_collection(lines)
-    jumped = LineCollection([*pieces[~driven]], colors="#9ca3af", linestyles="dotted")
-    axes.add_collection(jumped)
-    handles = [
-        axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start"),
-        axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end"),
-    ]
+    axes.add_collection(LineCollection([*pieces[~driven]], colors="#9ca3af", linestyles="dotted"))
+    axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
+    axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
     if stops:
-        sizes = [30 + min(each.length, 3600) / 12 for each in stops]
-        xs, ys = [each.x for each in stops], [each.y for each in stops]
-        handles.append(
-            axes.scatter(
-                xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, zorder=2, label="stood"
-            )
-        )
-    _fit(axes, [*path.xs], [*path.ys])
+        xs, ys, lengths = zip(*stops, strict=True)
+        sizes = 30 + np.minimum(lengths, 3600) / 12
+        look = {"color": "#f59e0b", "alpha": 0.55, "linewidths": 0}
+        axes.scatter(xs, ys, s=sizes, zorder=2, label="stood", **look)
+    _fit(axes, points)
     axes.grid(visible=True, **_GRID)
     axes.set_axisbelow(True)
     axes.set_xlabel(f"x (m, {path.frame})")
     axes.set_ylabel("y (m)")
-    axes.legend(handles=handles, loc="best", framealpha=0.85, fontsize=8)
+    axes.legend(loc="best", framealpha=0.85, fontsize=8)
     if path.times[-1] > path.times[0] and axes.figure is not None:
         is_wide = np.ptp(axes.get_xlim()) > 1.4 * np.ptp(axes.get_ylim())
         side = "bottom" if is_wide else "right"
@@ -138,15 +131,13 @@ def draw_path(
         _format_times(bar.ax, path.times[0], path.times[-1], of_colors=side)
 
 
-def _fit(axes: Axes, xs: Sequence[float], ys: Sequence[float]) -> None:
+def _fit(axes: Axes, points: NDArray[np.float64]) -> None:
     """Shows all points at one scale, with some room, and neither side much shorter."""
-    width, height = max(xs) - min(xs), max(ys) - min(ys)
-    least = max(width, height, 0.5) * _LEAST_SIDE
-    for middle, size, limit in (
-        ((max(xs) + min(xs)) / 2, max(width, least), axes.set_xlim),
-        ((max(ys) + min(ys)) / 2, max(height, least), axes.set_ylim),
-    ):
-        limit(middle - size * 0.58, middle + size * 0.58)
+    low, high = points.min(axis=0), points.max(axis=0)
+    least = max(*(high - low), 0.5) * _LEAST_SIDE
+    half = np.maximum(high - low, least) * 0.58
+    (left, bottom), (right, top) = (low + high) / 2 - half, (low + high) / 2 + half
+    axes.set(xlim=(left, right), ylim=(bottom, top))
     axes.set_aspect("equal", adjustable="box")
 
 
@@ -155,11 +146,10 @@ def _draw_place(axes: Axes, place: Place) -> None:
     left, right, low, high = region.bounds
     if isinstance(region, Circle):
         axes.add_patch(RoundPatch((region.x, region.y), region.radius_m, **shade))
-    elif isinstance(region, Polygon):
-        axes.add_patch(PolygonPatch([*region.corners], **shade))
     else:
         corners = [(left, low), (right, low), (right, high), (left, high)]
-        axes.add_patch(PolygonPatch(corners, **shade))
+        given = region.corners if isinstance(region, Polygon) else corners
+        axes.add_patch(PolygonPatch([*given], **shade))
     middle = ((left + right) / 2, (low + high) / 2)
     axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
 
@@ -186,7 +176,7 @@ def draw_signals(figure: Figure, signals: Sequence[Signal], span: tuple[float, f
     """Draws each signal in a row of its own, over one axis of time."""
     rows = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
     for number, (axes, signal) in enumerate(zip(rows, signals, strict=True)):
-        times = np.array(signal.times) / _DAY_S
+        times = signal.times / _DAY_S
         marker = "." if len(times) < 60 else ""
         color = _PALETTE[number % len(_PALETTE)]
         axes.plot(times, signal.values, color=color, linewidth=1.1, marker=marker)
