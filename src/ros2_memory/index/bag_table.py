@@ -1,19 +1,16 @@
 """The files of a bag directory: scans it again and again, and classifies what has changed.
 
-One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, and under several
-paths: where it was recorded, and hard links in saved moments. Of all these one counts.
+One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, of which one counts.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, classify
@@ -31,9 +28,6 @@ if TYPE_CHECKING:
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
-
-_FILE: Final = attrgetter("size", "mtime_ns", "inode")
-
 
 KINDS: Final = (".mcap", ".db3")
 """A compressed bag may lie beside the file it was made from, and is classified with that."""
@@ -60,44 +54,6 @@ class UnchangedBags:
     def __contains__(self, path: str) -> bool:
         return path in self._bags
 
-    def take(
-        self,
-        stamps: dict[str, Stamp],
-        known: Mapping[str, BagFile],
-        reader: BagReader,
-        context: ScanContext,
-    ) -> list[BagFile]:
-        """Takes the files that are unchanged out of `stamps`.
-
-        Files that need a closer look stay: young ones, and empty or incomplete ones.
-
-        Returns:
-            Their bags in the order of their starts.
-        """
-        last = context.now - max(context.three_splits, YOUNG_NS)
-        kinds = tuple(kind for kind in KINDS if reader.reads(Path(f"bag{kind}")))
-        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
-        taken, inodes = self._bags, self._inodes
-        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
-            file = known.get(path)
-            if (
-                file is not None
-                and file.mtime_ns == mtime_ns < last
-                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
-                and path.endswith(kinds)
-                and (schema := file.summary.schema).complete
-                and schema.topics
-                and not (compressed and other_form(path) in compressed)
-            ):
-                taken[file.file], inodes[file.file] = file, inode
-        rest = {path: stamp for path, stamp in stamps.items() if path not in taken}
-        stamps.clear()
-        stamps.update(rest)
-        # Sorted here by numpy: sorting what is sorted takes no time later.
-        bags = [*taken.values()]
-        order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
-        return [bags[at] for at in order.tolist()]
-
     def add(self, bag: BagFile, inode: int) -> None:
         """Adds a bag that has proved to be closed, and old enough not to change."""
         self._bags[bag.file], self._inodes[bag.file] = bag, inode
@@ -105,11 +61,6 @@ class UnchangedBags:
     def rows(self) -> Iterator[tuple[BagFile, int]]:
         """Yields each bag with its inode."""
         return zip(self._bags.values(), map(self._inodes.__getitem__, self._bags), strict=True)
-
-    def is_unchanged(self, path: str, stamp: Stamp, now: Ns) -> bool:
-        """Returns whether a file is one of these, and looks as before."""
-        known = self.stamp(path)
-        return known is not None and settled(stamp.mtime_ns, now) and stamp.matches(known)
 
     def stamp(self, path: str) -> Stamp | None:
         """Returns the stamp of one of these files; None for any other.
@@ -144,7 +95,7 @@ class KnownBags:
         files: notes on all files.
         named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
-        saved: all files in saved moments, whether they count or not.
+        saved: all files in saved moments, whether they count there or not.
         unchanged: closed bags of which only rows are kept; each counts.
     """
 
@@ -153,7 +104,7 @@ class KnownBags:
     files: Mapping[str, FileNotes]
     named: Collection[str]
     now: Ns
-    saved: Collection[str] = ()
+    saved: Mapping[str, Stamp] = field(default_factory=dict)
     unchanged: UnchangedBags = field(default_factory=UnchangedBags)
 
 
@@ -197,7 +148,6 @@ class BagTable:
         self._tree = Tree(bag_dir, only, setting=setting)
         self._unchanged = UnchangedBags()
         self._files: dict[str, FileNotes] = {}
-        self._links = HardLinks(bag_dir)
         self._classified: dict[str, Classification] = {}
         self._counted: dict[str, Classification] = {}
         self._set_aside: dict[str, Classification] = {}
@@ -217,17 +167,16 @@ class BagTable:
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._unchanged)
         known = self._known() if self._known is not None and is_first else {}
-        restored = self._restore(scanned.stamps, known, context)
-        changed = self._forget(scanned.gone) | self._examine(
-            scanned.stamps, known, context, restored
-        )
+        settled_bags = self._known_unchanged(scanned.stamps, known, context) if known else []
+        changed = self._forget(scanned.gone)
+        changed |= self._examine(scanned.stamps, known, context, settled_bags)
         hidden = frozenset(self._hidden)
         removed, added = self._count(changed | hidden, context)
         changed |= hidden - self._hidden
-        added = [*restored, *added]
+        added = [*settled_bags, *added]
         self._timeline = self._timeline.changed(removed, added)
         self._settle(context)
-        is_new = bool(changed or restored) or not scanned.is_like(self._scanned)
+        is_new = bool(changed or settled_bags) or not scanned.is_like(self._scanned)
         # Without the stamps, of which the first scan has one for each file.
         self._scanned = replace(scanned, stamps={}, gone=set())
         return TableChange(removed, added, is_new)
@@ -266,7 +215,7 @@ class BagTable:
             self._files,
             named,
             now,
-            self._links.known,
+            self._tree.saved,
             self._unchanged,
         )
 
@@ -277,24 +226,44 @@ class BagTable:
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
 
-    def _restore(
-        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
+    def _known_unchanged(
+        self, stamps: Mapping[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
     ) -> list[BagFile]:
-        """Returns the bags of files that are unchanged, which need no examination."""
-        if not known:
-            return []
-        # Which link of a saved bag counts has yet to be decided.
-        saved = {path: stamps.pop(path) for path in self._links.saved_among(stamps)}
-        bags = self._unchanged.take(stamps, known, self._reader, context)
-        stamps.update(saved)
-        return bags
+        """Adds the files that are known, and unchanged, to those that need no examination.
+
+        Others need it: young ones, and empty or incomplete ones.
+
+        Returns:
+            Their bags in the order of their starts.
+        """
+        last = context.now - max(context.three_splits, YOUNG_NS)
+        kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
+        bags: list[BagFile] = []
+        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
+            file = known.get(path)
+            if (
+                file is not None
+                and file.mtime_ns == mtime_ns < last
+                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
+                and path.endswith(kinds)
+                and (schema := file.summary.schema).complete
+                and schema.topics
+                and not (compressed and other_form(path) in compressed)
+            ):
+                self._unchanged.add(file, inode)
+                bags.append(file)
+        # Sorted here by numpy: sorting what is sorted takes no time later.
+        order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
+        return [bags[at] for at in order.tolist()]
 
     def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
         """Reactivates files that have gone, changed, or got another form."""
         if not self._unchanged:
             return
         for path, stamp in [*scanned.stamps.items()]:
-            if self._unchanged.is_unchanged(path, stamp, context.now):
+            known = self._unchanged.stamp(path)
+            if known and settled(stamp.mtime_ns, context.now) and stamp.matches(known):
                 del scanned.stamps[path]
             else:
                 self._reactivate(path, context)
@@ -314,7 +283,6 @@ class BagTable:
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
-            self._links.discard(path)
             if self._classified.pop(path, None) is not None:
                 forgotten.add(path)
         return forgotten
@@ -338,7 +306,6 @@ class BagTable:
             and notes.kind in KINDS
             and notes.stamp.mtime_ns < context.now - max(context.three_splits, YOUNG_NS)
             and path not in self._watched
-            and path not in self._links.known
             and other_form(path) not in self._files
         )
 
@@ -353,21 +320,22 @@ class BagTable:
         stamps: dict[str, Stamp],
         known: Mapping[str, BagFile],
         context: ScanContext,
-        settled: list[BagFile],
+        settled_bags: list[BagFile],
     ) -> set[str]:
         """Classifies files; returns those whose classification changed.
 
-        New ones that will not change are added to `settled` instead: a first scan of a week would
-        otherwise hold all that is known of each file at once.
+        New ones that will not change are added to `settled_bags` instead: a first scan of a week
+        would otherwise hold all that is known of each file at once.
         """
         changed = set()
         is_first = not (self._classified or self._unchanged)
         for path, stamp in stamps.items():
+            if known and path in self._unchanged:
+                continue
             notes = self._files.get(path)
             if notes is None:
                 notes = FileNotes.first(path, stamp, context.now)
                 self._files[path] = notes
-                self._links.add(path)
                 file = known.get(path)
                 if file is not None and notes.trusted and stamp.is_of(file):
                     notes.restore(file.summary)
@@ -389,7 +357,7 @@ class BagTable:
                 and self._is_settled(path, classification, context)
                 and classification.bag is not None
             ):
-                settled.append(classification.bag)
+                settled_bags.append(classification.bag)
                 self._add_unchanged(path, classification)
             elif classification != self._classified.get(path):
                 self._classified[path] = classification
@@ -402,8 +370,6 @@ class BagTable:
         """Updates which files count; returns the bags that left and those that came."""
         removed, added = [], []
         paths = {form for each in changed for form in (each, other_form(each))}
-        if self._links.known:
-            paths.update(link for each in [*paths] for link in self._links.of(each))
         for path in paths:
             before, after = self._counted.pop(path, None), self._that_counts(path, context)
             self._set_aside.pop(path, None)
@@ -426,8 +392,6 @@ class BagTable:
         complete ones that have been there for three splits are kept on purpose: both count.
         """
         self._hidden.discard(path)
-        if any(self._is_same_file(path, link) for link in self._links.before(path)):
-            return None
         own, other = self._classified.get(path), self._classified.get(other_form(path))
         if own is None or other is None or own.state > other.state:
             return own
@@ -441,14 +405,6 @@ class BagTable:
             return own
         self._hidden.add(path)
         return None
-
-    def _is_same_file(self, path: str, link: str) -> bool:
-        """Returns whether another path of a file is known, too, and leads to the same file."""
-        notes, own = self._files.get(link), self._files.get(path)
-        stamp = self._unchanged.stamp(link) if notes is None else notes.stamp
-        if stamp is None or own is None:
-            return False
-        return _FILE(own.stamp) == _FILE(stamp)
 
 
 def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:

@@ -135,14 +135,17 @@ class Tree:
     """The directories under one root, as the last scan saw them. Not for several threads at once.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out, and so is `lost+found`. Of the hard links of one file only the first
-    path is found, except for those in saved moments, among which `BagTable` chooses.
+    with a dot are left out, and so is `lost+found`. Of the hard links of one file one is found: that
+    nearest to the root, one in a saved moment only where there is no other.
 
     Args:
         root: the directory.
         only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
             and its like): nothing else is found then.
         setting: the one that names the root, for sentences.
+
+    Attributes:
+        saved: all files in saved moments, also those that are found elsewhere.
     """
 
     def __init__(
@@ -154,8 +157,9 @@ class Tree:
         self._named = None if only is None else paths_named(self._root, only)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
-        self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}"
+        self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
         self._second: set[str] = set()
+        self.saved: dict[str, Stamp] = {}
 
     def scan(self, now: Ns, watched: Iterable[str]) -> ScanResult:
         """Returns what is new, changed or gone since the last scan, and the `watched` files.
@@ -182,6 +186,12 @@ class Tree:
                 result.gone.update(set(folder.files).difference(after.files if after else ()))
         for file in watched:
             self._look_up(file, result)
+        for file in result.gone & self.saved.keys():
+            del self.saved[file]
+        moments = self._moments
+        self.saved.update(
+            (file, stamp) for file, stamp in result.stamps.items() if file.startswith(moments)
+        )
         self._leave_out_second_links(before, result)
         return result
 
@@ -199,21 +209,21 @@ class Tree:
         self._second = second
 
     def _second_links(self) -> set[str]:
-        """Returns all but the first link of each file that has several outside of saved moments."""
-        folders = [
-            folder
-            for path, folder in self._folders.items()
-            if path != self._moments and not path.startswith(f"{self._moments}/")
-        ]
-        linked = {(folder.device, inode) for folder in folders for inode in folder.linked}
-        if not linked:
-            return set()
+        """Returns all but the first link of each file that has several."""
+        # A folder that was listed before a file got its second link does not show that.
+        linked = {inode for folder in self._folders.values() for inode in folder.linked}
         links: dict[tuple[int, int], list[str]] = {}
-        for folder in folders:
+        for folder in self._folders.values():
+            if linked.isdisjoint(folder.inodes):
+                continue
             for path, inode in zip(folder.files, folder.inodes, strict=True):
-                if (folder.device, inode) in linked:
+                if inode in linked:
                     links.setdefault((folder.device, inode), []).append(path)
-        return {path for each in links.values() for path in sorted(each, key=_outermost)[1:]}
+        return {path for paths in links.values() for path in sorted(paths, key=self._preferred)[1:]}
+
+    def _preferred(self, path: str) -> tuple[bool, int, str]:
+        """Returns the sort key of the links of one file."""
+        return path.startswith(self._moments), path.count("/"), path
 
     def distrust(self, path: str) -> None:
         """Has the folder of a file listed again in the next scan, whatever its mtime."""
@@ -377,11 +387,6 @@ def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:
         folder.sidecar_ns = entry.stat(follow_symlinks=False).st_mtime_ns
     except OSError:
         folder.trusted = False
-
-
-def _outermost(path: str) -> tuple[int, str]:
-    """Returns the sort key of the links of one file: the one nearest to the root first."""
-    return path.count("/"), path
 
 
 def _is_gone(error: OSError) -> bool:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
-    CARRY_FILE,
     DELETED_FILE,
     LOCK_FILE,
     MOMENT_FILE,
@@ -197,7 +196,10 @@ class Inventory:
                 span, file = self._span(bag), (device, inode, bag.size)
                 stored = StoredBag(bag.file, recording, *span, bag.mtime_ns, *file)
                 rows[bag.file] = stored
-            yield (Deletable.NO if bag.file.endswith(CARRY_FILE) else Deletable.YES), stored
+            if bag.file in known.saved:
+                yield Deletable.SAVED, stored
+            else:
+                yield (Deletable.NO if is_carried(bag.file) else Deletable.YES), stored
 
     def _judge(self, recording: str) -> Callable[[str], bool]:
         """Returns what decides by its name whether a bag in a directory may be deleted."""
@@ -232,7 +234,7 @@ class Inventory:
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         except OSError:
             device = -1
-        stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.saved}
+        stamps = {stamp.inode: stamp for stamp in known.saved.values()}
         return tuple(_file(device, stamp) for stamp in stamps.values())
 
     def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
