@@ -24,6 +24,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.bag_dir.handover_file import (
+    Exclusion,
+    FileRule,
     Handover,
     HandoverReading,
     read_handover,
@@ -35,15 +37,13 @@ from ros2_memory.bag_dir.moment_file import moments_of
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.bag_dir.handover_file import Exclusion, FileRule
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Batch, Channel, Closing, Definition, Record
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)

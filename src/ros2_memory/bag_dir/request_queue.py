@@ -28,13 +28,12 @@ from ros2_memory.bag_dir.json_files import READABLE, Count, parsed
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import FORMAT, REQUEST, SaveRequest
 from ros2_memory.core import directories
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
 
 MAX_AT_ONCE: Final = 16
 """Requests that the recorder takes in one turn; the next turn comes moments later."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
-from ros2_memory.index.file_state import Classification, FileNotes, FileState, classify
+from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import ScanContext
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256

@@ -20,13 +20,12 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import BagFile
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
     from ros2_memory.index.timeline import Timeline

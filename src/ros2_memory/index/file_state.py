@@ -39,18 +39,15 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
-from ros2_memory.bag_dir.state_files import read_gate
+from ros2_memory.bag_dir.state_files import Gate, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.scan import YOUNG_NS, settled
-from ros2_memory.storage.base import Closing
+from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
+from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.state_files import Gate
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.index.scan import Stamp
-    from ros2_memory.storage.base import BagReader
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """How long until an unreadable file is tried again: the fault may have been the machine's."""

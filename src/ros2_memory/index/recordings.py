@@ -25,14 +25,13 @@ from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.segment import folder_of
+from ros2_memory.index.segment import Segment, folder_of
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
-    from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
 _NUMBERED: Final = re.compile(

@@ -21,14 +21,13 @@ from ros2_memory.bag_dir.layout import (
     MOMENTS_FOLDER,
     bag_kind,
 )
-from ros2_memory.core.model import SetAside
+from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from ros2_memory.core.model import BagFile
 
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a young one proves nothing."""
@@ -135,8 +134,8 @@ class Tree:
     """The directories under one root, as the last scan saw them. Not for several threads at once.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out, and so is `lost+found`. Of the hard links of one file one is found: that
-    nearest to the root, one in a saved moment only where there is no other.
+    with a dot are left out, and so is `lost+found`. Of the hard links of one file one is found:
+    that nearest to the root, one in a saved moment only where there is no other.
 
     Args:
         root: the directory.

@@ -14,11 +14,11 @@ import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.core.bag_summary import numbers_of
-from ros2_memory.core.model import BagState
+from ros2_memory.core.bag_summary import SummarySchema, numbers_of
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import pauses_between, pauses_within
-from ros2_memory.index.split_order import split_ranges_of
+from ros2_memory.index.holes import Pause, pauses_between, pauses_within
+from ros2_memory.index.split_order import Series, SplitRange, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import BagFile, TimeWindow
-    from ros2_memory.index.holes import Pause
-    from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
 """A topic with a message this often, or less often, is rare."""

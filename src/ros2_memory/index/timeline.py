@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
 from ros2_memory.core.memo import Memo
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import overlap_spans, united
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import Spans, overlap_spans, united
 from ros2_memory.index.segment import (
     Pace,
     Segment,
+    Span,
+    TopicExtent,
     TopicTotals,
     add_totals,
     folder_of,
@@ -33,10 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.segment import Span, TopicExtent
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""

@@ -18,25 +18,28 @@ import structlog
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.metadata_yaml import bare_name
-from ros2_memory.bag_dir.state_files import append_deleted, deleted_of, unshipped
+from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.inventory import Inventory
-from ros2_memory.retention.policy import ages, plan_deletions
-from ros2_memory.retention.recorded_time import relative_recording
+from ros2_memory.retention.policy import (
+    RetentionLimits,
+    RetentionStock,
+    StoredBag,
+    ages,
+    plan_deletions,
+)
+from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.bag_dir.state_files import Deleted
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
-    from ros2_memory.retention.policy import RetentionLimits, RetentionStock, StoredBag
-    from ros2_memory.retention.recorded_time import RecordedTime
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.handover_file import (
+    MessageList,
     handover_to_change,
     message_id,
     read_handover,
@@ -48,20 +49,17 @@ from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.retention.delete import repair_name
 from ros2_memory.retention.repair import open_files
 from ros2_memory.retention.rewriting import Identity, beside, left_in, replace_file, rewritten
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-    from ros2_memory.bag_dir.handover_file import MessageList
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import BagReader, BagWriter
 
 NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"

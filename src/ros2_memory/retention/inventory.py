@@ -27,7 +27,7 @@ from ros2_memory.bag_dir.layout import (
     split_number,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.file_state import FileState
+from ros2_memory.index.file_state import Classification, FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
-    from ros2_memory.index.file_state import Classification
     from ros2_memory.index.scan import Stamp
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)

@@ -36,7 +36,7 @@ from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader, BagWriter, Record
 

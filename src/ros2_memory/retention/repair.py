@@ -19,12 +19,10 @@ from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.retention.rewriting import beside, give_attributes
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-
-    from ros2_memory.storage.base import BagReader, BagWriter, Rewritten
 
 
 @dataclass(frozen=True, slots=True)
