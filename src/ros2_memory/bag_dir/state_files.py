@@ -10,7 +10,7 @@
     triggers.json      the recorder: how far the rules of `recording.keep_when` know the recordings
 
 What is about to be deleted is written before it is, so a kill hides nothing. Elsewhere are
-`recordings.jsonl` (`own_recordings`), and the folder of requests (`request_queue`).
+`recordings.jsonl` (`own_recordings`), and the folder of requests (`moment_file`).
 """
 
 from __future__ import annotations

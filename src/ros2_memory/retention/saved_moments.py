@@ -26,6 +26,8 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
+    Outcome,
+    RequestQueue,
     SavedMoment,
     SaveRequest,
     StoredMoment,
@@ -34,7 +36,6 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local

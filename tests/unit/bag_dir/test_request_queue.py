@@ -9,7 +9,7 @@ import pytest
 import structlog
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.request_queue import (
+from ros2_memory.bag_dir.moment_file import (
     MAX_AT_ONCE,
     STALE_NS,
     Outcome,
