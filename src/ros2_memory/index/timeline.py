@@ -194,13 +194,11 @@ class Timeline:
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
-        totals, extents = [], []
-        for segment in self.segments:
-            extent = segment.extent_of(recording)
-            if extent is not None:
-                extents.append(extent)
-                totals.append(segment.totals_in(topic, recording))
-        return Pace(reduce(TopicTotals.__or__, filter(None, totals)), *reduce(wider, extents))
+        folder = str(recording)
+        segments = [segment for segment in self.segments if folder in segment.folders]
+        totals = filter(None, (segment.totals_in(topic, folder) for segment in segments))
+        extents = (segment.folder_spans[folder] for segment in segments)
+        return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
 
     @cached_property
     def silent(self) -> frozenset[str]:
