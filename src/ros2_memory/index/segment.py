@@ -45,7 +45,6 @@ Span: TypeAlias = "tuple[Ns, Ns]"
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2
-_OCTAVES: Final = 64 * _PER_OCTAVE
 
 _Times: TypeAlias = "NDArray[np.int64]"
 
@@ -427,19 +426,14 @@ def _columns(segment: Segment) -> _Columns:
 
 def _presence_of(column: TopicColumn, lengths: _Times) -> Presence:
     """Returns when bags hold a topic, and how often; given the lengths of all bags (ns)."""
-    # The types of a topic count together.
-    rows = np.flatnonzero(np.diff(column.bags, prepend=-1))
-    counts = np.add.reduceat(column.counts, rows)
-    firsts, lasts = (
-        np.minimum.reduceat(column.firsts, rows),
-        np.maximum.reduceat(column.lasts, rows),
-    )
-    return Presence(
-        _runs(firsts, lasts),
-        _spacings(counts, lasts - firsts),
-        int(counts.sum()),
-        int(lengths[column.bags[rows]].sum()),
-    )
+    bags, counts, firsts, lasts = column
+    if (bags[1:] == bags[:-1]).any():  # the types of a topic count together
+        bags, rows = np.unique(bags, return_index=True)
+        counts = np.add.reduceat(counts, rows)
+        firsts, lasts = np.minimum.reduceat(firsts, rows), np.maximum.reduceat(lasts, rows)
+    spacings = _spacings(counts, lasts - firsts)
+    length = int(lengths[bags].sum())
+    return Presence(_runs(firsts, lasts), spacings, int(counts.sum()), length)
 
 
 def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:
@@ -455,8 +449,7 @@ def _spacings(counts: _Times, spans: _Times) -> dict[int, Spacing]:
     """Returns the spacings of the bags with a topic, by the part of an octave of the period."""
     shown = (counts >= _FEWEST) & (spans > 0)
     spans, intervals = spans[shown], counts[shown] - 1
-    octaves = (np.log2(spans / intervals) * _PER_OCTAVE).astype(np.int64)
-    octaves = octaves.clip(0, _OCTAVES - 1)
+    octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
     return {
         octave: Spacing(int(here.sum()), int(spans[here].sum()), int(intervals[here].sum()))
         for octave in sorted({*octaves.tolist()})
