@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -32,55 +32,13 @@ KINDS: Final = (".mcap", ".db3")
 """A compressed bag may lie beside the file it was made from, and is classified with that."""
 
 
-class UnchangedBags:
-    """Closed bags that do not change any more, or not since their columns were stored.
+Unchanged: TypeAlias = "dict[str, tuple[BagFile, int]]"
+"""By path, the bag and the inode of closed files that do not change any more, or not since their
+columns were stored.
 
-    Those are most of a week. Of each only the bag and its inode are kept. Should its file change,
-    it is reactivated: the notes on it are made as if it had been read, and it is classified again.
-    Not for several threads at once.
-    """
-
-    def __init__(self) -> None:
-        self._bags: dict[str, BagFile] = {}
-        self._inodes: dict[str, int] = {}
-
-    def __len__(self) -> int:
-        return len(self._bags)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._bags)
-
-    def __contains__(self, path: str) -> bool:
-        return path in self._bags
-
-    def add(self, bag: BagFile, inode: int) -> None:
-        """Adds a bag that has proved to be closed, and old enough not to change."""
-        self._bags[bag.file], self._inodes[bag.file] = bag, inode
-
-    def rows(self) -> Iterator[tuple[BagFile, int]]:
-        """Yields each bag with its inode."""
-        return zip(self._bags.values(), map(self._inodes.__getitem__, self._bags), strict=True)
-
-    def stamp(self, path: str) -> Stamp | None:
-        """Returns the stamp of one of these files; None for any other.
-
-        Its ctime is 0: that counts only where a file could not be read.
-        """
-        bag = self._bags.get(path)
-        if bag is None:
-            return None
-        return Stamp(bag.size, bag.mtime_ns, 0, self._inodes[path], bag.sidecar_ns)
-
-    def reactivate(self, path: str, now: Ns) -> tuple[FileNotes, Classification] | None:
-        """Removes a file, and returns what would be known had it been read; None for any other."""
-        stamp = self.stamp(path)
-        if stamp is None:
-            return None
-        bag = self._bags.pop(path)
-        del self._inodes[path]
-        notes = FileNotes.first(path, stamp, now)
-        notes.restore(bag.summary)
-        return notes, Classification(FileState.CLOSED, bag)
+Those are most of a week, so no more is kept of them. Should a file change, the notes on it are made
+as if it had been read, and it is classified again.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +62,7 @@ class KnownBags:
     named: Collection[str]
     now: Ns
     saved: Mapping[str, Stamp] = field(default_factory=dict)
-    unchanged: UnchangedBags = field(default_factory=UnchangedBags)
+    unchanged: Unchanged = field(default_factory=dict)
 
 
 class TableChange(NamedTuple):
@@ -145,7 +103,7 @@ class BagTable:
         self._reader = reader
         self._known = known
         self._tree = Tree(bag_dir, only, setting=setting)
-        self._unchanged = UnchangedBags()
+        self._unchanged: Unchanged = {}
         self._files: dict[str, FileNotes] = {}
         self._classified: dict[str, Classification] = {}
         self._counted: dict[str, Classification] = {}
@@ -166,16 +124,21 @@ class BagTable:
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._unchanged)
         known = self._known() if self._known is not None and is_first else {}
-        settled_bags = self._known_unchanged(scanned.stamps, known, context) if known else []
-        changed = self._forget(scanned.gone)
-        changed |= self._examine(scanned.stamps, known, context, settled_bags)
+        unchanged: list[BagFile] = []
+        changed = self._forget(scanned.gone) | self._examine(
+            scanned.stamps, known, context, unchanged
+        )
+        if unchanged:
+            # Sorted here by numpy: sorting what is sorted takes no time later.
+            starts = np.array([bag.start for bag in unchanged], np.int64)
+            unchanged = [unchanged[at] for at in np.argsort(starts, kind="stable").tolist()]
         hidden = frozenset(self._hidden)
         removed, added = self._count(changed | hidden, context)
         changed |= hidden - self._hidden
-        added = [*settled_bags, *added]
+        added = [*unchanged, *added]
         self._timeline = self._timeline.changed(removed, added)
         self._settle(context)
-        is_new = bool(changed or settled_bags) or not scanned.is_like(self._scanned)
+        is_new = bool(changed or unchanged) or not scanned.is_like(self._scanned)
         # Without the stamps, of which the first scan has one for each file.
         self._scanned = replace(scanned, stamps={}, gone=set())
         return TableChange(removed, added, is_new)
@@ -225,43 +188,12 @@ class BagTable:
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
 
-    def _known_unchanged(
-        self, stamps: Mapping[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
-    ) -> list[BagFile]:
-        """Adds the files that are known, and unchanged, to those that need no examination.
-
-        Others need it: young ones, and empty or incomplete ones.
-
-        Returns:
-            Their bags in the order of their starts.
-        """
-        last = context.now - max(context.three_splits, YOUNG_NS)
-        kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
-        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
-        bags: list[BagFile] = []
-        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
-            file = known.get(path)
-            if (
-                file is not None
-                and file.mtime_ns == mtime_ns < last
-                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
-                and path.endswith(kinds)
-                and (schema := file.summary.schema).complete
-                and schema.topics
-                and not (compressed and other_form(path) in compressed)
-            ):
-                self._unchanged.add(file, inode)
-                bags.append(file)
-        # Sorted here by numpy: sorting what is sorted takes no time later.
-        order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
-        return [bags[at] for at in order.tolist()]
-
     def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
         """Reactivates files that have gone, changed, or got another form."""
         if not self._unchanged:
             return
         for path, stamp in [*scanned.stamps.items()]:
-            known = self._unchanged.stamp(path)
+            known = self._stamp(path)
             if known and settled(stamp.mtime_ns, context.now) and stamp.matches(known):
                 del scanned.stamps[path]
             else:
@@ -271,10 +203,22 @@ class BagTable:
             self._reactivate(path, context)
 
     def _reactivate(self, path: str, context: ScanContext) -> None:
-        reactivated = self._unchanged.reactivate(path, context.now)
-        if reactivated is not None:
-            self._files[path], classification = reactivated
+        """Makes of an unchanged file what would be known had it been read."""
+        stamp = self._stamp(path)
+        if stamp is not None:
+            bag, _ = self._unchanged.pop(path)
+            notes = self._files[path] = FileNotes.first(path, stamp, context.now)
+            notes.restore(bag.summary)
+            classification = Classification(FileState.CLOSED, bag)
             self._classified[path] = self._counted[path] = classification
+
+    def _stamp(self, path: str) -> Stamp | None:
+        """Returns the stamp of an unchanged file; None for any other.
+
+        Its ctime is 0: that counts only where a file could not be read.
+        """
+        bag, inode = self._unchanged.get(path, (None, 0))
+        return bag and Stamp(bag.size, bag.mtime_ns, 0, inode, bag.sidecar_ns)
 
     def _forget(self, paths: Iterable[str]) -> set[str]:
         """Drops the state of files; returns those that were classified."""
@@ -312,30 +256,44 @@ class BagTable:
         if found.bag is not None:
             if self._packs:
                 found.bag.summary.pack()
-            self._unchanged.add(found.bag, self._files.pop(path).stamp.inode)
+            self._unchanged[path] = found.bag, self._files.pop(path).stamp.inode
 
     def _examine(
         self,
         stamps: dict[str, Stamp],
         known: Mapping[str, BagFile],
         context: ScanContext,
-        settled_bags: list[BagFile],
+        unchanged: list[BagFile],
     ) -> set[str]:
         """Classifies files; returns those whose classification changed.
 
-        New ones that will not change are added to `settled_bags` instead: a first scan of a week
-        would otherwise hold all that is known of each file at once.
+        New ones that will not change are added to `unchanged` instead: a first scan of a week would
+        otherwise hold all that is known of each file at once. Those that are `known` are not looked
+        at, unless they are young, empty or incomplete.
         """
         changed = set()
         is_first = not (self._classified or self._unchanged)
+        last = context.now - max(context.three_splits, YOUNG_NS)
+        kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)} if known else set()
         for path, stamp in stamps.items():
-            if known and path in self._unchanged:
+            file = known.get(path)
+            if (
+                file is not None
+                and file.mtime_ns == stamp.mtime_ns < last
+                and (file.size, file.sidecar_ns) == (stamp.size, stamp.sidecar_ns)
+                and path.endswith(kinds)
+                and (schema := file.summary.schema).complete
+                and schema.topics
+                and not (compressed and other_form(path) in compressed)
+            ):
+                self._unchanged[file.file] = file, stamp.inode
+                unchanged.append(file)
                 continue
             notes = self._files.get(path)
             if notes is None:
                 notes = FileNotes.first(path, stamp, context.now)
                 self._files[path] = notes
-                file = known.get(path)
                 if file is not None and notes.trusted and stamp.is_of(file):
                     notes.restore(file.summary)
             elif not notes.update(stamp, context.now) and path not in self._watched:
@@ -356,7 +314,7 @@ class BagTable:
                 and self._is_settled(path, classification, context)
                 and classification.bag is not None
             ):
-                settled_bags.append(classification.bag)
+                unchanged.append(classification.bag)
                 self._add_unchanged(path, classification)
             elif classification != self._classified.get(path):
                 self._classified[path] = classification

@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -90,7 +91,7 @@ class Classification:
     silent: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ScanContext:
     """What one scan knows besides the files themselves.
 
@@ -110,16 +111,14 @@ class ScanContext:
     include_active: bool = False
     trusts_mtime: bool = True
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
-    _gate: list[Gate] = field(default_factory=list)
 
-    def holds_back(self, path: Path) -> bool:
-        """Returns whether the recorder has not released a file yet.
+    @cached_property
+    def gate(self) -> Gate:
+        """What the recorder has not released yet.
 
         That is looked up after the directory was listed: what was found there is known by then.
         """
-        if not self._gate:
-            self._gate.append(read_gate(self.root))
-        return self._gate[0].holds(path.parent.name, path.name)
+        return read_gate(self.root)
 
     def may_be_recorded(self, path: Path) -> bool:
         """Returns whether no live heartbeat shows that this file's recording is over."""
@@ -233,7 +232,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     """
     if not reader.reads(notes.path):
         return _set_aside(FileState.UNREAD, notes, _not_read(notes))
-    if context.holds_back(notes.path):
+    if context.gate.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
         if notes.closing is None and notes.fault is None:

@@ -183,7 +183,7 @@ class Inventory:
     def _settled(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
         """Yields the bags of which the index keeps rows."""
         rows = self._unchanged
-        for bag, inode in known.unchanged.rows():
+        for bag, inode in known.unchanged.values():
             stored = rows.get(bag.file)
             if stored is None or (stored.inode, stored.size, stored.written) != (
                 inode,
