@@ -107,7 +107,6 @@ class BagTable:
         self._files: dict[str, FileNotes] = {}
         self._classified: dict[str, Classification] = {}
         self._counted: dict[str, Classification] = {}
-        self._set_aside: dict[str, Classification] = {}
         self._hidden: set[str] = set()
         self._watched: set[str] = set()
         self._patrol: list[str] = []
@@ -149,10 +148,10 @@ class BagTable:
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty: list[Path] = []
-        for path, each in self._set_aside.items():
+        for path, each in self._counted.items():
             if each.aside is not None:
                 aside.setdefault(each.state, []).append(each.aside)
-            else:
+            elif each.bag is None:
                 empty.append(Path(path))
                 silent.update(each.silent)
         return Snapshot(
@@ -329,11 +328,8 @@ class BagTable:
         paths = {form for each in changed for form in (each, other_form(each))}
         for path in paths:
             before, after = self._counted.pop(path, None), self._that_counts(path, context)
-            self._set_aside.pop(path, None)
             if after is not None:
                 self._counted[path] = after
-                if after.bag is None or after.aside is not None:
-                    self._set_aside[path] = after
             if before == after:
                 continue
             if before is not None and before.bag is not None:
