@@ -49,13 +49,6 @@ def test_a_request_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> 
     assert not queue.has_requests()
 
 
-def test_a_refusal_is_an_answer(tmp_path: Path) -> None:
-    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    [request] = queue.take(T0)
-    queue.answer(request, Outcome(refused="there is no room"))
-    assert posted.outcome() == Outcome(refused="there is no room")
-
-
 def test_a_request_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
     first, second, queue = asked(tmp_path), asked(tmp_path), RequestQueue(tmp_path)
     assert first.withdraw()

@@ -456,12 +456,6 @@ class TestTheShare:
         assert moments.stored.items() >= stored.items()
         assert sum(moments.stored.values()) <= share
 
-    @given(FILES, st.integers(0, 150))
-    def test_all_that_is_granted_fits(self, files: list[tuple[int, int]], share: int) -> None:
-        moments = Share(share)
-        if moments.refusal(files) is None:
-            assert all(moments.take(*file) for file in files)
-
     def test_a_refusal_says_what_is_used_and_what_to_do(self) -> None:
         refused = Share(10**9, stored={1: 900_000_000}).refusal([(2, 200_000_000)])
         assert refused is not None
