@@ -124,10 +124,8 @@ def _losses(bag_dir: Path) -> Sequence[Loss]:
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
     """Returns the losses that fall between two log times; none where the file cannot be read."""
-    try:
-        return [each for each in _losses(bag_dir) if each.start < stop and start < each.stop]
-    except (OSError, ValueError):
-        return []
+    losses = _losses(bag_dir) or ()
+    return [loss for loss in losses if loss.start < stop and start < loss.stop]
 
 
 # deleted.jsonl
@@ -176,7 +174,7 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """
     if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
         return
-    known = _deleted(bag_dir)
+    known = read_deleted(bag_dir)
     there = {name for name in known if name and (bag_dir / name).is_dir()}
     gone = (span for name, row in known.items() if name not in there for span in row.spans)
     rows, size = [Deleted("", (), _joined(gone, _TOUCHING_NS)[-_MOST_SPANS:])], 0
@@ -204,10 +202,7 @@ def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
 
 def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
     """Returns what was deleted, by recording; nothing where the file cannot be read."""
-    try:
-        return _deleted(bag_dir)
-    except (OSError, ValueError):
-        return {}
+    return _deleted(bag_dir) or {}
 
 
 def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
@@ -289,10 +284,7 @@ def unshipped(bag_dir: Path, bags: Iterable[tuple[str, int]]) -> frozenset[str]:
 
     That is all of them where the receipts cannot be read.
     """
-    try:
-        sizes = _shipped_sizes(bag_dir)
-    except OSError:
-        sizes = {}
+    sizes = _shipped_sizes(bag_dir) or {}
     return frozenset(path for path, size in bags if sizes.get(path) != size)
 
 
@@ -508,15 +500,12 @@ SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
 
 @until_changed(SCREENED_FILE)
 def _screen_state(bag_dir: Path) -> ScreenState | None:
-    return SCREENED.read(bag_dir)
+    return SCREENED.read(bag_dir) or OPEN_GATE.state
 
 
 def read_gate(bag_dir: Path) -> Gate:
     """Returns what is held back at this moment. Raises nothing."""
-    try:
-        return Gate(_screen_state(bag_dir) or OPEN_GATE.state)
-    except (OSError, ValueError):
-        return Gate(None)
+    return Gate(_screen_state(bag_dir))
 
 
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:

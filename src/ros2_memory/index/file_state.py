@@ -231,7 +231,12 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
         BagVanishedError: the file does not exist any more.
     """
     if not reader.reads(notes.path):
-        return _set_aside(FileState.UNREAD, notes, _not_read(notes))
+        reason = (
+            f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"
+        )
+        if not notes.file.endswith(notes.kind):
+            reason = f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
+        return _set_aside(FileState.UNREAD, notes, reason)
     if context.gate.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
@@ -359,9 +364,3 @@ def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
 
 def _set_aside(state: FileState, notes: FileNotes, reason: str) -> Classification:
     return Classification(state, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
-
-
-def _not_read(notes: FileNotes) -> str:
-    if not notes.path.name.endswith(notes.kind):
-        return f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
-    return f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"

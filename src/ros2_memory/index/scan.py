@@ -263,11 +263,11 @@ class Tree:
             for path, inode in zip(folder.files, folder.inodes, strict=True):
                 if inode in linked:
                     links.setdefault((folder.device, inode), []).append(path)
-        return {path for paths in links.values() for path in sorted(paths, key=self._preferred)[1:]}
-
-    def _preferred(self, path: str) -> tuple[bool, int, str]:
-        """Returns the sort key of the links of one file."""
-        return path.startswith(self._moments), path.count("/"), path
+        second: set[str] = set()
+        for paths in links.values():
+            paths.sort(key=lambda path: (path.startswith(self._moments), path.count("/"), path))
+            second.update(paths[1:])
+        return second
 
     def distrust(self, path: str) -> None:
         """Has the folder of a file listed again in the next scan, whatever its mtime."""
