@@ -160,7 +160,7 @@ def deleted_of(recording: str, splits: Iterable[tuple[str, Ns, Ns]]) -> Deleted:
     """Returns the entry for splits of a recording: each its name, first and last log time."""
     named = [*splits]
     spans = [(first, last + 1) for _, first, last in named if 0 <= last - first <= _LONGEST_NS]
-    return Deleted(recording, tuple(name for name, _, _ in named), _joined(spans, _APART_NS))
+    return Deleted(recording, tuple(name for name, _, _ in named), (*united(spans, _APART_NS),))
 
 
 def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
@@ -177,7 +177,7 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     known = read_deleted(bag_dir)
     there = {name for name in known if name and (bag_dir / name).is_dir()}
     gone = (span for name, row in known.items() if name not in there for span in row.spans)
-    rows, size = [Deleted("", (), _joined(gone, _TOUCHING_NS)[-_MOST_SPANS:])], 0
+    rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0
     # The newest recordings come last, so they are the first to stay.
     for name in reversed([name for name in known if name in there]):
         size += len(DELETED.text([known[name]]))
@@ -195,7 +195,7 @@ def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
         files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
         spans.setdefault(row.recording, []).extend(row.spans)
     return {
-        name: Deleted(name, tuple(known), _joined(spans[name], _APART_NS if name else _TOUCHING_NS))
+        name: Deleted(name, (*known,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),))
         for name, known in files.items()
     }
 
@@ -208,13 +208,7 @@ def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
 def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
     every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
-    return _joined(every, _TOUCHING_NS)
-
-
-def _joined(spans: Iterable[tuple[Ns, Ns]], apart: Ns) -> tuple[tuple[Ns, Ns], ...]:
-    """Returns spans, sorted; those that are no further apart than this are joined."""
-    wider = united((start, stop + apart) for start, stop in spans)
-    return tuple((start, stop - apart) for start, stop in wider)
+    return tuple(united(every, _TOUCHING_NS))
 
 
 # shipped.jsonl

@@ -185,7 +185,12 @@ class FileNotes:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
             self.grew_at = now  # also again after the clock was set back
-        is_outdated = self._is_outdated(stamp, now)
+        # Permissions change only the ctime.
+        patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
+        is_retried = self.fault is not None and (
+            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
+        )
+        is_outdated = is_retried or not self.trusted or stamp.content != self.stamp.content
         if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
             self.is_transient = False
@@ -212,15 +217,6 @@ class FileNotes:
             or classification.state in _WATCHED
             or self.closing is Closing.OPEN
             or (self.kind == ".db3" and context.now - self.stamp.mtime_ns <= context.three_splits)
-        )
-
-    def _is_outdated(self, stamp: Stamp, now: Ns) -> bool:
-        if not self.trusted or stamp.content != self.stamp.content:
-            return True
-        # Permissions change only the ctime.
-        patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
-        return self.fault is not None and (
-            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
         )
 
 

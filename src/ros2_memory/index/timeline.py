@@ -238,13 +238,14 @@ class Timeline:
         Those of a bag that a crash left open reach to the last time that its file was written to,
         if that was within a day.
         """
-        return [
-            bag
-            for segment in self._faulty_segments
-            if segment.bags[0].start < window.stop
-            for bag in segment.faulty
-            if window.overlaps(bag.start, _lost_until(bag))
-        ]
+        found = []
+        for segment in self._faulty_segments:
+            for bag in segment.faulty if segment.bags[0].start < window.stop else ():
+                is_cut = bag.state is BagState.INCOMPLETE
+                is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
+                if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
+                    found.append(bag)
+        return found
 
     @cached_property
     def _faulty_segments(self) -> list[Segment]:
@@ -271,12 +272,6 @@ class Timeline:
             for bag in segment.bags
             if any(held.type == type_name for held in bag.summary.of(topic))
         )
-
-
-def _lost_until(bag: BagFile) -> Ns:
-    """Returns until when (inclusive) a bag may have recorded what cannot be read of it."""
-    is_cut = bag.state is BagState.INCOMPLETE and bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
-    return bag.mtime_ns if is_cut else bag.end
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:

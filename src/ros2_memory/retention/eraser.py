@@ -223,8 +223,12 @@ class Eraser:
         files = [self._bag_dir / name for name in erasure.files]
         notes = [*self._correct_metadata({path.parent for path in files})]
         try:
-            for path in files:
-                self._remove_leftover(path)
+            for path in files:  # what an interrupted erasure left beside a bag
+                with (
+                    suppress(FileNotFoundError, NotADirectoryError),
+                    directories.opened(self._bag_dir, path.parent) as folder,
+                ):
+                    os.unlink(repair_name(path.name), dir_fd=folder)
             forgotten(erasure)
             # So that answers report it.
             known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
@@ -402,18 +406,6 @@ class Eraser:
                     f"{name} still counts deleted messages ({error}); `ros2 bag reindex "
                     f"{recording}` rewrites it"
                 )
-
-    def _remove_leftover(self, path: Path) -> None:
-        """Deletes what an interrupted erasure left beside a bag.
-
-        Raises:
-            OSError: it cannot be deleted.
-        """
-        with (
-            suppress(FileNotFoundError, NotADirectoryError),
-            directories.opened(self._bag_dir, path.parent) as folder,
-        ):
-            os.unlink(repair_name(path.name), dir_fd=folder)
 
     def _name(self, path: Path) -> str:
         return os.path.relpath(path, self._bag_dir)
