@@ -300,13 +300,14 @@ def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
     since, least = {**stock.recorded_since}, MAX_NS
     reached, latest = dict[str, Ns](), MIN_NS
     for name in names:
-        latest = reached[name] = max(latest, newest.get(name, MIN_NS))
+        reached[name] = latest  # by the recordings before it
+        latest = max(latest, newest.get(name, MIN_NS))
         if name in since:
             least = since[name] = min(least, since[name])
     instead: dict[str, Ns] = {}
     for name in reversed(names):
-        if newest.get(name) == reached[name]:
-            latest = reached[name]
+        if reached[name] <= newest.get(name, MIN_NS):
+            latest = newest.get(name, latest)
         instead[name] = latest
     bags = [
         bag.dated(instead[bag.recording]) if bag.date < reached.get(bag.recording, MIN_NS) else bag

@@ -81,6 +81,12 @@ class TestAge:
         deleted = expired(stock(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
         assert names(deleted) == ["old"]
 
+    def test_bags_of_one_listed_recording_have_the_dates_that_they_have(self) -> None:
+        listed = replace(stock(*hourly(172)), places={"rec": 0})
+        assert names(expired(listed, LIMITS)) == ["h171", "h170", "h169"]
+        small = replace(LIMITS, max_total_bytes=1680)
+        assert names(expired(listed, small)) == ["h171", "h170", "h169", "h168"]
+
     def test_what_is_not_shipped_waits_until_the_budget_needs_its_room(self) -> None:
         held = replace(stock(*hourly(172)), unshipped=frozenset({"rec/h170", "rec/h0"}))
         assert names(expired(held, LIMITS)) == ["h171", "h169"]
