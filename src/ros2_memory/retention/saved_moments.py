@@ -308,8 +308,11 @@ class MomentKeeper:
             raise
         flush(folder.parent)
         stored[folder.name] = made
-        by = {} if begun.rule is None else {"rule": begun.rule}
-        _log.info("moment_kept", folder=folder.name, bags=len(made.files), **by)
+        if begun.rule is None:
+            _log.info("moment_kept", folder=folder.name, bags=len(made.files))
+        else:
+            rule = begun.rule
+            _log.info("moment_kept", folder=folder.name, bags=len(made.files), rule=rule)
         return made
 
     def _advance(
