@@ -426,7 +426,7 @@ def _columns(segment: Segment) -> _Columns:
 
 def _presence_of(column: TopicColumn, lengths: _Times) -> Presence:
     """Returns when bags hold a topic, and how often; given the lengths of all bags (ns)."""
-    bags, counts, firsts, lasts = column
+    bags, firsts, lasts, counts = column
     if (bags[1:] == bags[:-1]).any():  # the types of a topic count together
         bags, rows = np.unique(bags, return_index=True)
         counts = np.add.reduceat(counts, rows)
