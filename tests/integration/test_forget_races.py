@@ -20,9 +20,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.moment_file import PendingRequest, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
 from tests.support.bags import odom, write_mcap
 from tests.support.examples import LONG
@@ -31,7 +30,7 @@ from tests.support.memories import ROOT
 from tests.support.processes import until
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.request_queue import Outcome
+    from ros2_memory.bag_dir.moment_file import Outcome
 
 S = 10**9
 ROUNDS = 24 if LONG else 8

@@ -14,9 +14,13 @@ from mcap.writer import Writer
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
-from ros2_memory.bag_dir.moment_file import SavedMoment, SaveRequest, write_saved_moment
+from ros2_memory.bag_dir.moment_file import (
+    PendingRequest,
+    SavedMoment,
+    SaveRequest,
+    write_saved_moment,
+)
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
-from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
@@ -31,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
-    from ros2_memory.bag_dir.request_queue import Outcome
+    from ros2_memory.bag_dir.moment_file import Outcome
     from ros2_memory.core.timebase import Clock
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening

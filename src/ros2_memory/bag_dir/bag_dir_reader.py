@@ -17,13 +17,13 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from itertools import chain
-from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.bag_dir.handover_file import (
+    FileRule,
     Handover,
     HandoverReading,
     read_handover,
@@ -35,15 +35,14 @@ from ros2_memory.bag_dir.moment_file import moments_of
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader
+from ros2_memory.core.spans import united
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
-    from ros2_memory.bag_dir.handover_file import Exclusion, FileRule
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Batch, Channel, Closing, Definition, Record
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)
@@ -279,7 +278,10 @@ class BagDirReader(BagReader):
         if (topic.latched and not rule.hides_latched) or not rule.touches(span, [topic.topic]):
             return topic
         # Excluded messages lie in few chunks: only these are read, but for listed ones.
-        windows = [span] if topic.topic in rule.elsewhere else _united(rule.exclusions, span)
+        windows = [span]
+        if topic.topic not in rule.elsewhere:
+            cut = [span.intersect(TimeWindow(*each[2:])) for each in rule.exclusions]
+            windows = [TimeWindow(*each) for each in united((one.start, one.stop) for one in cut)]
         lost = sum(
             record.channel.type == topic.type and not rule.counts(record)
             for window in windows
@@ -303,15 +305,3 @@ def _counted_in(rule: FileRule, batch: Batch) -> Batch:
     """Returns the messages of a batch that count."""
     counts = [rule.counts(batch.record(nth)) for nth in range(batch.sizes.size)]
     return batch if all(counts) else batch.taken(np.array(counts, np.bool_))
-
-
-def _united(exclusions: Iterable[Exclusion], span: TimeWindow) -> list[TimeWindow]:
-    """Returns the parts of a span that exclusions touch, without overlaps."""
-    touching = [
-        each for each in exclusions if each.log_from < span.stop and span.start < each.log_until
-    ]
-    united: list[TimeWindow] = []
-    for each in sorted(touching, key=attrgetter("log_from")):
-        start = max(each.log_from, united[-1].stop if united else span.start)
-        united.append(TimeWindow(start, max(start, min(each.log_until, span.stop))))
-    return united

@@ -41,14 +41,13 @@ from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
 from ros2_memory.bag_dir.json_files import Int64, parsed
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Record
 
 FORMAT: Final = 1

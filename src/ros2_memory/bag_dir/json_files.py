@@ -15,6 +15,7 @@ import errno
 import json
 import os
 import re
+from contextlib import suppress
 from functools import lru_cache, wraps
 from typing import (
     TYPE_CHECKING,
@@ -224,24 +225,27 @@ class JsonDocument(Generic[_T]):
         flush(target.parent)
 
 
-def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T]]:
+def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T | None]]:
     """Has a function of a bag directory called again only once a file there has changed.
 
-    For files that every answer needs. Where there is none, the function is called each time.
+    For files that every answer needs. Where there is none, the function is called each time; where
+    it cannot be read, None is returned.
     """
 
-    def decorate(read: Callable[[Path], _T]) -> Callable[[Path], _T]:
+    def decorate(read: Callable[[Path], _T]) -> Callable[[Path], _T | None]:
         @lru_cache(2)
         def known(bag_dir: Path, _stamp: tuple[int, int, int]) -> _T:
             return read(bag_dir)
 
         @wraps(read)
-        def current(bag_dir: Path) -> _T:
-            try:
-                status = (bag_dir / name).lstat()
-            except (FileNotFoundError, NotADirectoryError):
-                return read(bag_dir)
-            return known(bag_dir, (status.st_ino, status.st_mtime_ns, status.st_size))
+        def current(bag_dir: Path) -> _T | None:
+            with suppress(OSError, ValueError):
+                try:
+                    status = (bag_dir / name).lstat()
+                except (FileNotFoundError, NotADirectoryError):
+                    return read(bag_dir)
+                return known(bag_dir, (status.st_ino, status.st_mtime_ns, status.st_size))
+            return None
 
         return current
 
@@ -302,8 +306,7 @@ def _with_check(begun: bytes) -> bytes:
 
 def _require_check(line: bytes) -> None:
     """Raises ValueError where a line has no check, or that fails."""
-    begun, _, _ = line.rpartition(_CHECK)
-    if line != _with_check(begun):
+    if line != _with_check(line.rpartition(_CHECK)[0]):
         raise ValueError("its check (crc32) is missing or fails: it is damaged, or was edited")
 
 

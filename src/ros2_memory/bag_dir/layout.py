@@ -16,7 +16,7 @@
           moment.json                      its label and its time
           rec_20261120T043000Z/            hard links, under the names that the bags have above
       .episodic/recordings.jsonl   recordings that the recorder made (see `own_recordings`)
-      .episodic/requests/          requests of the query server (see `request_queue`)
+      .episodic/requests/          requests of the query server (see `moment_file`)
       .episodic/*.json, *.jsonl    what the two programs know (see `state_files`)
 
 The two YAML files lie beside the recordings: a recording's own directory must not exist before

@@ -140,6 +140,11 @@ class ListRow:
         """The directory of the recording; None until its child has made it."""
         return None if self.inode is None else Identity(self.inode, self.generation)
 
+    def lists(self, identity: Identity | None) -> bool:
+        """Returns whether a directory is that of the recording."""
+        listed = self.identity
+        return identity is not None and listed is not None and identity.matches(listed)
+
 
 LIST: Final = JsonLog(LIST_FILE, ListRow, is_brief=True)
 
@@ -190,9 +195,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        with self._lock:
-            self._read()
-            return [name for name in self._list.entries if not is_kept_apart(name)]
+        return [name for name in [*self._current()] if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
         """Returns the listed recordings in the order in which they began; no adopted ones.
@@ -200,9 +203,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        with self._lock:
-            self._read()
-            return [name for name, entry in self._list.entries.items() if not entry.adopted]
+        return [name for name, row in [*self._current().items()] if not row.adopted]
 
     def owns_bag(self, path: Path) -> bool:
         """Returns whether a bag file is the recorder's: see `judge`.
@@ -210,9 +211,8 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        with self._lock:
-            self._read()
-            return self.judge_of(str(path.parent))(path.name)
+        self._current()
+        return self.judge_of(str(path.parent))(path.name)
 
     def judge_of(self, directory: str) -> Callable[[str], bool]:
         """Returns `judge` of the directory that has this path now."""
@@ -229,9 +229,7 @@ class OwnRecordings:
             identity: shows whether it is the one that was listed.
         """
         row = self._list.entries.get(folder)
-        if row is None or not self.lists(folder, identity):
-            return lambda _: False
-        return row.holds
+        return row.holds if row and row.lists(identity) else lambda _: False
 
     def owns(self, directory: Path) -> bool:
         """Returns whether a directory is a recording of this bag directory's recorder.
@@ -241,12 +239,11 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        with self._lock:
-            self._read()
-            name = self.name_of(directory)
+        name = self.name_of(directory)
+        if name in self._current():
             with suppress(OSError):
-                return name in self._list.entries and self.lists(name, identity_of(directory))
-            return False
+                return self.lists(name, identity_of(directory))
+        return False
 
     def began(self, directory: Path) -> bool:
         """Returns whether a recording was to begin there, and no directory was listed for it.
@@ -254,16 +251,13 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        with self._lock:
-            self._read()
-            entry = self._list.entries.get(self.name_of(directory))
-            return entry is not None and entry.identity is None
+        row = self._current().get(self.name_of(directory))
+        return row is not None and row.identity is None
 
     def lists(self, name: str, identity: Identity | None) -> bool:
         """Returns whether the list, as last read, has a directory of this name and identity."""
-        entry = self._list.entries.get(name)
-        listed = None if entry is None else entry.identity
-        return identity is not None and listed is not None and identity.matches(listed)
+        row = self._list.entries.get(name)
+        return row is not None and row.lists(identity)
 
     def name_of(self, directory: Path | str) -> str:
         """Returns the name of a directory in the list; empty where it lies elsewhere."""
@@ -304,7 +298,14 @@ class OwnRecordings:
             found = self._find_completed(custom_data)
             self._list.add(found)
             found += self._find_ended()
-            self._report_claim(left)
+            if left:
+                names, count = left[:_MAX_NAMED], len(left)
+                _log.warning(
+                    "recordings_not_adopted", recordings=count, names=names, advice=_ADVICE
+                )
+            for name, row in self._list.entries.items():
+                if row.identity is None and (self._bag_dir / name).is_dir():
+                    _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
             gone = self._gone(self._list.entries)
             if exists and self.bag_dir_id and not (found or gone):
                 return
@@ -369,7 +370,7 @@ class OwnRecordings:
             self._add([self._adopted(*each) for each in sorted(identities.items())])
 
     def _adopted(self, name: str, identity: Identity) -> ListRow:
-        """Returns the line of a directory that is adopted, one of the list or another."""
+        """Returns the line of a directory that is adopted."""
         row = self._row(name, identity)
         with suppress(OSError):
             return row.with_bags(path.name for path in _bags_in(self._bag_dir / name))
@@ -378,10 +379,10 @@ class OwnRecordings:
     def _row(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory, one of the list or another."""
         row = self._list.entries.get(name)
-        if row is not None and self.lists(name, identity):
-            return row
-        row = ListRow("", name, identity.inode, identity.generation)
-        return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
+        if row is None or not row.lists(identity):
+            row = ListRow("", name, *identity)
+            return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
+        return row
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
         """Lists bags that the recorder puts into a directory of a moment or of carried messages.
@@ -396,29 +397,19 @@ class OwnRecordings:
             name, identity = self.name_of(directory), identity_of(directory)
             if identity is None:
                 raise FileNotFoundError(f"{directory} is not there any more")
-            held = self._row(name, identity).with_bags(bags)
-            if held == self._list.entries.get(name):
+            row = self._row(name, identity).with_bags(bags)
+            if row == self._list.entries.get(name):
                 return
             try:
-                self._add([held])
+                self._add([row])
             except RecorderError as error:
-                self._know([held])
+                self._know([row])
                 _log.error("recordings_not_listed", reason=str(error))
 
     def _know(self, rows: Iterable[ListRow]) -> None:
         """Counts rows as listed that cannot be written; the next one that is written takes them."""
         self._unwritten.update({row.recording: row for row in rows})
         self._list.add(self._unwritten.values())
-
-    def _report_claim(self, left: Sequence[str]) -> None:
-        if left:
-            names = left[:_MAX_NAMED]
-            _log.warning(
-                "recordings_not_adopted", recordings=len(left), names=names, advice=_ADVICE
-            )
-        for name, entry in self._list.entries.items():
-            if entry.identity is None and (self._bag_dir / name).is_dir():
-                _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
 
     def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
         """Returns the entries without a directory whose directory our child made after all.
@@ -458,13 +449,22 @@ class OwnRecordings:
         """Returns the recordings that are no longer in the bag directory."""
         gone = []
         for name in names:
-            try:
-                os.lstat(self._bag_dir / name)
-            except (FileNotFoundError, NotADirectoryError):
-                gone.append(name)
-            except OSError:
-                continue  # a disk that fails hides what is there
+            with suppress(OSError):  # a disk that fails hides what is there
+                try:
+                    os.lstat(self._bag_dir / name)
+                except (FileNotFoundError, NotADirectoryError):
+                    gone.append(name)
         return gone
+
+    def _current(self) -> Mapping[str, ListRow]:
+        """Returns the lines of recordings, read again if the file has changed.
+
+        Raises:
+            OSError: the list cannot be read.
+        """
+        with self._lock:
+            self._read()
+            return self._list.entries
 
     def _read(self) -> bool:
         """Reads the file if it has changed; returns whether there is one."""
@@ -633,7 +633,7 @@ def _bags_in(folder: Path) -> list[Path]:
 
 
 def _row_of(name: str, identity: Identity) -> ListRow:
-    return ListRow("", name, identity.inode, identity.generation, splits=0)
+    return ListRow("", name, *identity, splits=0)
 
 
 def _give_to_owner(path: Path, bag_dir: Path) -> None:

@@ -10,7 +10,7 @@
     triggers.json      the recorder: how far the rules of `recording.keep_when` know the recordings
 
 What is about to be deleted is written before it is, so a kill hides nothing. Elsewhere are
-`recordings.jsonl` (`own_recordings`), and the folder of requests (`request_queue`).
+`recordings.jsonl` (`own_recordings`), and the folder of requests (`moment_file`).
 """
 
 from __future__ import annotations
@@ -124,10 +124,8 @@ def _losses(bag_dir: Path) -> Sequence[Loss]:
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
     """Returns the losses that fall between two log times; none where the file cannot be read."""
-    try:
-        return [each for each in _losses(bag_dir) if each.start < stop and start < each.stop]
-    except (OSError, ValueError):
-        return []
+    losses = _losses(bag_dir) or ()
+    return [loss for loss in losses if loss.start < stop and start < loss.stop]
 
 
 # deleted.jsonl
@@ -162,7 +160,7 @@ def deleted_of(recording: str, splits: Iterable[tuple[str, Ns, Ns]]) -> Deleted:
     """Returns the entry for splits of a recording: each its name, first and last log time."""
     named = [*splits]
     spans = [(first, last + 1) for _, first, last in named if 0 <= last - first <= _LONGEST_NS]
-    return Deleted(recording, tuple(name for name, _, _ in named), _joined(spans, _APART_NS))
+    return Deleted(recording, tuple(name for name, _, _ in named), (*united(spans, _APART_NS),))
 
 
 def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
@@ -176,10 +174,10 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """
     if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
         return
-    known = _deleted(bag_dir)
+    known = read_deleted(bag_dir)
     there = {name for name in known if name and (bag_dir / name).is_dir()}
     gone = (span for name, row in known.items() if name not in there for span in row.spans)
-    rows, size = [Deleted("", (), _joined(gone, _TOUCHING_NS)[-_MOST_SPANS:])], 0
+    rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0
     # The newest recordings come last, so they are the first to stay.
     for name in reversed([name for name in known if name in there]):
         size += len(DELETED.text([known[name]]))
@@ -197,29 +195,20 @@ def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
         files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
         spans.setdefault(row.recording, []).extend(row.spans)
     return {
-        name: Deleted(name, tuple(known), _joined(spans[name], _APART_NS if name else _TOUCHING_NS))
+        name: Deleted(name, (*known,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),))
         for name, known in files.items()
     }
 
 
 def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
     """Returns what was deleted, by recording; nothing where the file cannot be read."""
-    try:
-        return _deleted(bag_dir)
-    except (OSError, ValueError):
-        return {}
+    return _deleted(bag_dir) or {}
 
 
 def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
     every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
-    return _joined(every, _TOUCHING_NS)
-
-
-def _joined(spans: Iterable[tuple[Ns, Ns]], apart: Ns) -> tuple[tuple[Ns, Ns], ...]:
-    """Returns spans, sorted; those that are no further apart than this are joined."""
-    wider = united((start, stop + apart) for start, stop in spans)
-    return tuple((start, stop - apart) for start, stop in wider)
+    return tuple(united(every, _TOUCHING_NS))
 
 
 # shipped.jsonl
@@ -289,10 +278,7 @@ def unshipped(bag_dir: Path, bags: Iterable[tuple[str, int]]) -> frozenset[str]:
 
     That is all of them where the receipts cannot be read.
     """
-    try:
-        sizes = _shipped_sizes(bag_dir)
-    except OSError:
-        sizes = {}
+    sizes = _shipped_sizes(bag_dir) or {}
     return frozenset(path for path, size in bags if sizes.get(path) != size)
 
 
@@ -508,15 +494,12 @@ SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
 
 @until_changed(SCREENED_FILE)
 def _screen_state(bag_dir: Path) -> ScreenState | None:
-    return SCREENED.read(bag_dir)
+    return SCREENED.read(bag_dir) or OPEN_GATE.state
 
 
 def read_gate(bag_dir: Path) -> Gate:
     """Returns what is held back at this moment. Raises nothing."""
-    try:
-        return Gate(_screen_state(bag_dir) or OPEN_GATE.state)
-    except (OSError, ValueError):
-        return Gate(None)
+    return Gate(_screen_state(bag_dir))
 
 
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
-from ros2_memory.bag_dir.carried_origin import origin_of
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import QueryTimeoutError
@@ -18,6 +17,7 @@ from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns, unix_from_ns
 from ros2_memory.index.listed_splits import absent_splits, listing_from_json, listing_to_json
+from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence

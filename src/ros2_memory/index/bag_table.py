@@ -1,136 +1,44 @@
 """The files of a bag directory: scans it again and again, and classifies what has changed.
 
-One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, and under several
-paths: where it was recorded, and hard links in saved moments. Of all these one counts.
+One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, of which one counts.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
 from ros2_memory.core.errors import BagVanishedError
-from ros2_memory.index.file_state import Classification, FileNotes, FileState, classify
+from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.file_state import ScanContext
     from ros2_memory.storage.base import BagReader
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
 
-_FILE: Final = attrgetter("size", "mtime_ns", "inode")
-
-
 KINDS: Final = (".mcap", ".db3")
 """A compressed bag may lie beside the file it was made from, and is classified with that."""
 
 
-class UnchangedBags:
-    """Closed bags that do not change any more, or not since their columns were stored.
+Unchanged: TypeAlias = "dict[str, tuple[BagFile, int]]"
+"""By path, the bag and the inode of closed files that do not change any more, or not since their
+columns were stored.
 
-    Those are most of a week. Of each only the bag and its inode are kept. Should its file change,
-    it is reactivated: the notes on it are made as if it had been read, and it is classified again.
-    Not for several threads at once.
-    """
-
-    def __init__(self) -> None:
-        self._bags: dict[str, BagFile] = {}
-        self._inodes: dict[str, int] = {}
-
-    def __len__(self) -> int:
-        return len(self._bags)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._bags)
-
-    def __contains__(self, path: str) -> bool:
-        return path in self._bags
-
-    def take(
-        self,
-        stamps: dict[str, Stamp],
-        known: Mapping[str, BagFile],
-        reader: BagReader,
-        context: ScanContext,
-    ) -> list[BagFile]:
-        """Takes the files that are unchanged out of `stamps`.
-
-        Files that need a closer look stay: young ones, and empty or incomplete ones.
-
-        Returns:
-            Their bags in the order of their starts.
-        """
-        last = context.now - max(context.three_splits, YOUNG_NS)
-        kinds = tuple(kind for kind in KINDS if reader.reads(Path(f"bag{kind}")))
-        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
-        taken, inodes = self._bags, self._inodes
-        for path, (size, mtime_ns, _, inode, sidecar_ns) in stamps.items():
-            file = known.get(path)
-            if (
-                file is not None
-                and file.mtime_ns == mtime_ns < last
-                and (file.size, file.sidecar_ns) == (size, sidecar_ns)
-                and path.endswith(kinds)
-                and (schema := file.summary.schema).complete
-                and schema.topics
-                and not (compressed and other_form(path) in compressed)
-            ):
-                taken[file.file], inodes[file.file] = file, inode
-        rest = {path: stamp for path, stamp in stamps.items() if path not in taken}
-        stamps.clear()
-        stamps.update(rest)
-        # Sorted here by numpy: sorting what is sorted takes no time later.
-        bags = [*taken.values()]
-        order = np.argsort(np.array([bag.start for bag in bags], np.int64), kind="stable")
-        return [bags[at] for at in order.tolist()]
-
-    def add(self, bag: BagFile, inode: int) -> None:
-        """Adds a bag that has proved to be closed, and old enough not to change."""
-        self._bags[bag.file], self._inodes[bag.file] = bag, inode
-
-    def rows(self) -> Iterator[tuple[BagFile, int]]:
-        """Yields each bag with its inode."""
-        return zip(self._bags.values(), map(self._inodes.__getitem__, self._bags), strict=True)
-
-    def is_unchanged(self, path: str, stamp: Stamp, now: Ns) -> bool:
-        """Returns whether a file is one of these, and looks as before."""
-        known = self.stamp(path)
-        return known is not None and settled(stamp.mtime_ns, now) and stamp.matches(known)
-
-    def stamp(self, path: str) -> Stamp | None:
-        """Returns the stamp of one of these files; None for any other.
-
-        Its ctime is 0: that counts only where a file could not be read.
-        """
-        bag = self._bags.get(path)
-        if bag is None:
-            return None
-        return Stamp(bag.size, bag.mtime_ns, 0, self._inodes[path], bag.sidecar_ns)
-
-    def reactivate(self, path: str, now: Ns) -> tuple[FileNotes, Classification] | None:
-        """Removes a file, and returns what would be known had it been read; None for any other."""
-        stamp = self.stamp(path)
-        if stamp is None:
-            return None
-        bag = self._bags.pop(path)
-        del self._inodes[path]
-        notes = FileNotes.first(path, stamp, now)
-        notes.restore(bag.summary)
-        return notes, Classification(FileState.CLOSED, bag)
+Those are most of a week, so no more is kept of them. Should a file change, the notes on it are made
+as if it had been read, and it is classified again.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +52,7 @@ class KnownBags:
         files: notes on all files.
         named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
-        saved: all files in saved moments, whether they count or not.
+        saved: all files in saved moments, whether they count there or not.
         unchanged: closed bags of which only rows are kept; each counts.
     """
 
@@ -153,8 +61,8 @@ class KnownBags:
     files: Mapping[str, FileNotes]
     named: Collection[str]
     now: Ns
-    saved: Collection[str] = ()
-    unchanged: UnchangedBags = field(default_factory=UnchangedBags)
+    saved: Mapping[str, Stamp] = field(default_factory=dict)
+    unchanged: Unchanged = field(default_factory=dict)
 
 
 class TableChange(NamedTuple):
@@ -195,12 +103,10 @@ class BagTable:
         self._reader = reader
         self._known = known
         self._tree = Tree(bag_dir, only, setting=setting)
-        self._unchanged = UnchangedBags()
+        self._unchanged: Unchanged = {}
         self._files: dict[str, FileNotes] = {}
-        self._links = HardLinks(bag_dir)
         self._classified: dict[str, Classification] = {}
         self._counted: dict[str, Classification] = {}
-        self._set_aside: dict[str, Classification] = {}
         self._hidden: set[str] = set()
         self._watched: set[str] = set()
         self._patrol: list[str] = []
@@ -217,17 +123,21 @@ class BagTable:
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._unchanged)
         known = self._known() if self._known is not None and is_first else {}
-        restored = self._restore(scanned.stamps, known, context)
+        unchanged: list[BagFile] = []
         changed = self._forget(scanned.gone) | self._examine(
-            scanned.stamps, known, context, restored
+            scanned.stamps, known, context, unchanged
         )
+        if unchanged:
+            # Sorted here by numpy: sorting what is sorted takes no time later.
+            starts = np.array([bag.start for bag in unchanged], np.int64)
+            unchanged = [unchanged[at] for at in np.argsort(starts, kind="stable").tolist()]
         hidden = frozenset(self._hidden)
         removed, added = self._count(changed | hidden, context)
         changed |= hidden - self._hidden
-        added = [*restored, *added]
+        added = [*unchanged, *added]
         self._timeline = self._timeline.changed(removed, added)
         self._settle(context)
-        is_new = bool(changed or restored) or not scanned.is_like(self._scanned)
+        is_new = bool(changed or unchanged) or not scanned.is_like(self._scanned)
         # Without the stamps, of which the first scan has one for each file.
         self._scanned = replace(scanned, stamps={}, gone=set())
         return TableChange(removed, added, is_new)
@@ -238,10 +148,10 @@ class BagTable:
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty: list[Path] = []
-        for path, each in self._set_aside.items():
+        for path, each in self._counted.items():
             if each.aside is not None:
                 aside.setdefault(each.state, []).append(each.aside)
-            else:
+            elif each.bag is None:
                 empty.append(Path(path))
                 silent.update(each.silent)
         return Snapshot(
@@ -266,7 +176,7 @@ class BagTable:
             self._files,
             named,
             now,
-            self._links.known,
+            self._tree.saved,
             self._unchanged,
         )
 
@@ -277,24 +187,13 @@ class BagTable:
         del self._patrol[-PATROL:]
         return [path for path in following if path in self._files or path in self._unchanged]
 
-    def _restore(
-        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
-    ) -> list[BagFile]:
-        """Returns the bags of files that are unchanged, which need no examination."""
-        if not known:
-            return []
-        # Which link of a saved bag counts has yet to be decided.
-        saved = {path: stamps.pop(path) for path in self._links.saved_among(stamps)}
-        bags = self._unchanged.take(stamps, known, self._reader, context)
-        stamps.update(saved)
-        return bags
-
     def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
         """Reactivates files that have gone, changed, or got another form."""
         if not self._unchanged:
             return
         for path, stamp in [*scanned.stamps.items()]:
-            if self._unchanged.is_unchanged(path, stamp, context.now):
+            known = self._stamp(path)
+            if known and settled(stamp.mtime_ns, context.now) and stamp.matches(known):
                 del scanned.stamps[path]
             else:
                 self._reactivate(path, context)
@@ -303,10 +202,22 @@ class BagTable:
             self._reactivate(path, context)
 
     def _reactivate(self, path: str, context: ScanContext) -> None:
-        reactivated = self._unchanged.reactivate(path, context.now)
-        if reactivated is not None:
-            self._files[path], classification = reactivated
+        """Makes of an unchanged file what would be known had it been read."""
+        stamp = self._stamp(path)
+        if stamp is not None:
+            bag, _ = self._unchanged.pop(path)
+            notes = self._files[path] = FileNotes.first(path, stamp, context.now)
+            notes.restore(bag.summary)
+            classification = Classification(FileState.CLOSED, bag)
             self._classified[path] = self._counted[path] = classification
+
+    def _stamp(self, path: str) -> Stamp | None:
+        """Returns the stamp of an unchanged file; None for any other.
+
+        Its ctime is 0: that counts only where a file could not be read.
+        """
+        bag, inode = self._unchanged.get(path, (None, 0))
+        return bag and Stamp(bag.size, bag.mtime_ns, 0, inode, bag.sidecar_ns)
 
     def _forget(self, paths: Iterable[str]) -> set[str]:
         """Drops the state of files; returns those that were classified."""
@@ -314,7 +225,6 @@ class BagTable:
         for path in paths:
             self._watched.discard(path)
             self._files.pop(path, None)
-            self._links.discard(path)
             if self._classified.pop(path, None) is not None:
                 forgotten.add(path)
         return forgotten
@@ -338,7 +248,6 @@ class BagTable:
             and notes.kind in KINDS
             and notes.stamp.mtime_ns < context.now - max(context.three_splits, YOUNG_NS)
             and path not in self._watched
-            and path not in self._links.known
             and other_form(path) not in self._files
         )
 
@@ -346,29 +255,44 @@ class BagTable:
         if found.bag is not None:
             if self._packs:
                 found.bag.summary.pack()
-            self._unchanged.add(found.bag, self._files.pop(path).stamp.inode)
+            self._unchanged[path] = found.bag, self._files.pop(path).stamp.inode
 
     def _examine(
         self,
         stamps: dict[str, Stamp],
         known: Mapping[str, BagFile],
         context: ScanContext,
-        settled: list[BagFile],
+        unchanged: list[BagFile],
     ) -> set[str]:
         """Classifies files; returns those whose classification changed.
 
-        New ones that will not change are added to `settled` instead: a first scan of a week would
-        otherwise hold all that is known of each file at once.
+        New ones that will not change are added to `unchanged` instead: a first scan of a week would
+        otherwise hold all that is known of each file at once. Those that are `known` are not looked
+        at, unless they are young, empty or incomplete.
         """
         changed = set()
         is_first = not (self._classified or self._unchanged)
+        last = context.now - max(context.three_splits, YOUNG_NS)
+        kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)} if known else set()
         for path, stamp in stamps.items():
+            file = known.get(path)
+            if (
+                file is not None
+                and file.mtime_ns == stamp.mtime_ns < last
+                and (file.size, file.sidecar_ns) == (stamp.size, stamp.sidecar_ns)
+                and path.endswith(kinds)
+                and (schema := file.summary.schema).complete
+                and schema.topics
+                and not (compressed and other_form(path) in compressed)
+            ):
+                self._unchanged[file.file] = file, stamp.inode
+                unchanged.append(file)
+                continue
             notes = self._files.get(path)
             if notes is None:
                 notes = FileNotes.first(path, stamp, context.now)
                 self._files[path] = notes
-                self._links.add(path)
-                file = known.get(path)
                 if file is not None and notes.trusted and stamp.is_of(file):
                     notes.restore(file.summary)
             elif not notes.update(stamp, context.now) and path not in self._watched:
@@ -389,7 +313,7 @@ class BagTable:
                 and self._is_settled(path, classification, context)
                 and classification.bag is not None
             ):
-                settled.append(classification.bag)
+                unchanged.append(classification.bag)
                 self._add_unchanged(path, classification)
             elif classification != self._classified.get(path):
                 self._classified[path] = classification
@@ -402,15 +326,10 @@ class BagTable:
         """Updates which files count; returns the bags that left and those that came."""
         removed, added = [], []
         paths = {form for each in changed for form in (each, other_form(each))}
-        if self._links.known:
-            paths.update(link for each in [*paths] for link in self._links.of(each))
         for path in paths:
             before, after = self._counted.pop(path, None), self._that_counts(path, context)
-            self._set_aside.pop(path, None)
             if after is not None:
                 self._counted[path] = after
-                if after.bag is None or after.aside is not None:
-                    self._set_aside[path] = after
             if before == after:
                 continue
             if before is not None and before.bag is not None:
@@ -426,8 +345,6 @@ class BagTable:
         complete ones that have been there for three splits are kept on purpose: both count.
         """
         self._hidden.discard(path)
-        if any(self._is_same_file(path, link) for link in self._links.before(path)):
-            return None
         own, other = self._classified.get(path), self._classified.get(other_form(path))
         if own is None or other is None or own.state > other.state:
             return own
@@ -441,14 +358,6 @@ class BagTable:
             return own
         self._hidden.add(path)
         return None
-
-    def _is_same_file(self, path: str, link: str) -> bool:
-        """Returns whether another path of a file is known, too, and leads to the same file."""
-        notes, own = self._files.get(link), self._files.get(path)
-        stamp = self._unchanged.stamp(link) if notes is None else notes.stamp
-        if stamp is None or own is None:
-            return False
-        return _FILE(own.stamp) == _FILE(stamp)
 
 
 def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:

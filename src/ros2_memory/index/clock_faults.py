@@ -17,16 +17,16 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from itertools import chain, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import BagFile
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
     from ros2_memory.index.timeline import Timeline
@@ -141,7 +141,9 @@ def check_dates(
         for bag in part.bags
         if bag.end > limit
     ]
-    unset = [ClockFault(bag, FaultyClock.UNSET) for bag in _unset(parts) if bag.end <= limit]
+    recorded = chain.from_iterable(part.bags for part in parts)
+    first = takewhile(lambda bag: bag.start < FIRST_BAGS_NS, recorded)
+    unset = [ClockFault(bag, FaultyClock.UNSET) for bag in first if bag.end <= limit]
     bags = sum(len(part.bags) for part in parts)
     note: str | None = None
     if len(ahead) == bags and bags:
@@ -156,14 +158,6 @@ def check_dates(
         dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))
     earliest, latest = _span(parts, [fault.bag for fault in dating.faults if fault.misleads])
     return replace(dating, earliest=earliest, latest=latest)
-
-
-def _unset(parts: Iterable[Segment]) -> Iterator[BagFile]:
-    for part in parts:
-        for bag in part.bags:
-            if bag.start >= FIRST_BAGS_NS:
-                return
-            yield bag
 
 
 def _step_faults(

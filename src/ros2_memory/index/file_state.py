@@ -34,23 +34,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
-from ros2_memory.bag_dir.state_files import read_gate
+from ros2_memory.bag_dir.state_files import Gate, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.scan import YOUNG_NS, settled
-from ros2_memory.storage.base import Closing
+from ros2_memory.index.scan import YOUNG_NS, Stamp, settled
+from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.state_files import Gate
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.index.scan import Stamp
-    from ros2_memory.storage.base import BagReader
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """How long until an unreadable file is tried again: the fault may have been the machine's."""
@@ -93,7 +91,7 @@ class Classification:
     silent: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ScanContext:
     """What one scan knows besides the files themselves.
 
@@ -113,16 +111,14 @@ class ScanContext:
     include_active: bool = False
     trusts_mtime: bool = True
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
-    _gate: list[Gate] = field(default_factory=list)
 
-    def holds_back(self, path: Path) -> bool:
-        """Returns whether the recorder has not released a file yet.
+    @cached_property
+    def gate(self) -> Gate:
+        """What the recorder has not released yet.
 
         That is looked up after the directory was listed: what was found there is known by then.
         """
-        if not self._gate:
-            self._gate.append(read_gate(self.root))
-        return self._gate[0].holds(path.parent.name, path.name)
+        return read_gate(self.root)
 
     def may_be_recorded(self, path: Path) -> bool:
         """Returns whether no live heartbeat shows that this file's recording is over."""
@@ -189,7 +185,12 @@ class FileNotes:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
             self.grew_at = now  # also again after the clock was set back
-        is_outdated = self._is_outdated(stamp, now)
+        # Permissions change only the ctime.
+        patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
+        is_retried = self.fault is not None and (
+            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
+        )
+        is_outdated = is_retried or not self.trusted or stamp.content != self.stamp.content
         if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
             self.is_transient = False
@@ -218,15 +219,6 @@ class FileNotes:
             or (self.kind == ".db3" and context.now - self.stamp.mtime_ns <= context.three_splits)
         )
 
-    def _is_outdated(self, stamp: Stamp, now: Ns) -> bool:
-        if not self.trusted or stamp.content != self.stamp.content:
-            return True
-        # Permissions change only the ctime.
-        patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
-        return self.fault is not None and (
-            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
-        )
-
 
 def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
     """Returns the state of a file; reads only what the notes do not have.
@@ -235,8 +227,13 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
         BagVanishedError: the file does not exist any more.
     """
     if not reader.reads(notes.path):
-        return _set_aside(FileState.UNREAD, notes, _not_read(notes))
-    if context.holds_back(notes.path):
+        reason = (
+            f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"
+        )
+        if not notes.file.endswith(notes.kind):
+            reason = f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
+        return _set_aside(FileState.UNREAD, notes, reason)
+    if context.gate.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
         if notes.closing is None and notes.fault is None:
@@ -363,9 +360,3 @@ def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
 
 def _set_aside(state: FileState, notes: FileNotes, reason: str) -> Classification:
     return Classification(state, aside=SetAside(notes.path, reason, notes.stamp.mtime_ns))
-
-
-def _not_read(notes: FileNotes) -> str:
-    if not notes.path.name.endswith(notes.kind):
-        return f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
-    return f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.silences import usual_period
+from ros2_memory.analysis.silences import Presence, usual_period
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
@@ -18,7 +18,6 @@ from ros2_memory.index.split_order import split_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.silences import Presence
     from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile
 

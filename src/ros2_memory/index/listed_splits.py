@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -232,14 +231,13 @@ def _read(bag_dir: Path, folder: str) -> _Listed:
     if not names:
         return _Listed()
     counts = listing.messages
-    gone = [*takewhile(lambda name: name not in present, names)]
-    first = tuple((name, counts.get(name, 0)) for name in gone)
     there = [name for name in names if name in present]
-    later = tuple((name, counts.get(name, 0)) for name in names[len(gone) :] if name not in present)
+    missing = [(name, counts.get(name, 0)) for name in names if name not in present]
+    begun = names.index(there[0]) if there else len(names)
     messages = sum(counts.get(name, 0) for name in there) if counts else listing.total
     return _Listed(
-        first,
-        later,
+        tuple(missing[:begun]),
+        tuple(missing[begun:]),
         bags=sum(counts.get(name, 1) > 0 for name in there),
         messages=None if HANDOVER_FILE in files else messages,
         is_total=not counts,

@@ -21,25 +21,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
+from ros2_memory.bag_dir.layout import BAG_KINDS, MOMENTS_FOLDER
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.segment import folder_of
+from ros2_memory.index.segment import Segment, folder_of
+from ros2_memory.index.split_order import split_of, stem_of
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
-    from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
-_NUMBERED: Final = re.compile(
-    r"(?P<series>.+?)(?:_(?P<number>\d+))?\.(?:mcap|db3)(?:\.zstd)?", re.IGNORECASE
-)
-
-_OF_NAME: Final = r"(?:/.*|(?:_\d+)?\.(?:mcap|db3)(?:\.zstd)?)?"
+_OF_NAME: Final = rf"(?:/.*|(?:_\d+)?(?:{'|'.join(map(re.escape, BAG_KINDS))}))?"
 """What may follow the name of a recording in a path: what is in its folder, or a bag's suffix."""
 
 LONG_NS: Final[Ns] = 30 * NS_PER_S
@@ -152,7 +148,7 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     for bags in folders.values():
         series: dict[str, list[BagFile]] = {}
         for bag in bags:
-            series.setdefault(_series_of(bag.file)[0], []).append(bag)
+            series.setdefault(_series_of(bag.file), []).append(bag)
         for name, members in series.items():
             is_one = _follow(members)
             found.update({bag.file: name if is_one else stem_of(bag.file) for bag in members})
@@ -165,21 +161,16 @@ def is_named_after_folder(file: str) -> bool:
     return name.startswith(f"{folder.rpartition('/')[2]}_") or name.partition(".")[0].isdigit()
 
 
-def stem_of(file: str) -> str:
-    """Returns the path of a bag without its suffixes."""
-    series, number = _series_of(file)
-    return series if number is None else f"{series}_{number}"
-
-
-def _series_of(file: str) -> tuple[str, str | None]:
-    found = _NUMBERED.fullmatch(file)
-    return (file, None) if found is None else (found["series"], found["number"])
+def _series_of(file: str) -> str:
+    """Returns the path of a bag without its suffixes, and without its number where it has one."""
+    split = split_of(file)
+    return split[0][:-1] if split and split[0].endswith("_") else stem_of(file)
 
 
 def _follow(bags: Sequence[BagFile]) -> bool:
     """Returns whether bags are numbered, and each ends before the next begins."""
     ordered = sorted(bags, key=lambda bag: (bag.start, bag.end))
-    is_numbered = len(bags) == 1 or all(_series_of(bag.file)[1] is not None for bag in bags)
+    is_numbered = len(bags) == 1 or all(_series_of(bag.file) != stem_of(bag.file) for bag in bags)
     return is_numbered and all(
         one.end <= next_one.start + OUT_OF_ORDER_NS for one, next_one in pairwise(ordered)
     )

@@ -10,25 +10,22 @@ import errno
 import os
 import stat
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
-    BAG_KINDS,
     HANDOVER_FILE,
     METADATA_FILE,
     MOMENTS_FOLDER,
     bag_kind,
 )
-from ros2_memory.core.model import SetAside
+from ros2_memory.core.model import BagFile, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from ros2_memory.core.model import BagFile
 
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a young one proves nothing."""
@@ -130,19 +127,69 @@ class _Folder:
     sidecar_ns: Ns = 0
     has_metadata: bool = False
 
+    def find_sidecar(self, path: str) -> None:
+        """Looks up the `handover.json` in the directory."""
+        try:
+            status = os.lstat(f"{path}/{HANDOVER_FILE}")
+        except FileNotFoundError:
+            return
+        except OSError:
+            self.trusted = False
+            return
+        self.sidecar_ns = 0 if stat.S_ISLNK(status.st_mode) else status.st_mtime_ns
+
+    def enter(self, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
+        """Adds what the directory has under a name."""
+        hidden, kind = entry.name.startswith("."), bag_kind(entry.name)
+        # Nearly all entries are bags: they are checked first.
+        if kind and entry.is_file(follow_symlinks=False):
+            self._enter_bag(entry, stamps)
+        elif entry.is_symlink():
+            if not hidden:
+                self.links.append(Path(entry.path))
+        elif entry.is_dir(follow_symlinks=False):
+            if not hidden and entry.name != LOST_AND_FOUND:
+                self.folders.append(entry.path)
+        elif entry.name == METADATA_FILE:
+            self.has_metadata = True
+        elif kind:
+            self.odd.append(SetAside(Path(entry.path), "not a regular file"))
+
+    def _enter_bag(self, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
+        inode = 0
+        try:
+            status = entry.stat(follow_symlinks=False)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            reason = f"cannot be read: {error.strerror or error}"
+            self.odd.append(SetAside(Path(entry.path), reason))
+            # A known file is not gone because of that.
+            self.trusted = False
+        else:
+            inode = status.st_ino
+            stamps[entry.path] = Stamp.of(status, self.sidecar_ns)
+            if status.st_nlink > 1:
+                self.linked.add(inode)
+        self.files.append(entry.path)
+        self.inodes.append(inode)
+
 
 class Tree:
     """The directories under one root, as the last scan saw them. Not for several threads at once.
 
     The root itself may be a symbolic link; inside it none is followed. Folders whose name begins
-    with a dot are left out, and so is `lost+found`. Of the hard links of one file only the first
-    path is found, except for those in saved moments, among which `BagTable` chooses.
+    with a dot are left out, and so is `lost+found`. Of the hard links of one file one is found:
+    that nearest to the root, one in a saved moment only where there is no other.
 
     Args:
         root: the directory.
         only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
             and its like): nothing else is found then.
         setting: the one that names the root, for sentences.
+
+    Attributes:
+        saved: all files in saved moments, also those that are found elsewhere.
     """
 
     def __init__(
@@ -154,8 +201,9 @@ class Tree:
         self._named = None if only is None else paths_named(self._root, only)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
-        self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}"
+        self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
         self._second: set[str] = set()
+        self.saved: dict[str, Stamp] = {}
 
     def scan(self, now: Ns, watched: Iterable[str]) -> ScanResult:
         """Returns what is new, changed or gone since the last scan, and the `watched` files.
@@ -182,6 +230,12 @@ class Tree:
                 result.gone.update(set(folder.files).difference(after.files if after else ()))
         for file in watched:
             self._look_up(file, result)
+        for file in result.gone & self.saved.keys():
+            del self.saved[file]
+        moments = self._moments
+        self.saved.update(
+            (file, stamp) for file, stamp in result.stamps.items() if file.startswith(moments)
+        )
         self._leave_out_second_links(before, result)
         return result
 
@@ -199,21 +253,21 @@ class Tree:
         self._second = second
 
     def _second_links(self) -> set[str]:
-        """Returns all but the first link of each file that has several outside of saved moments."""
-        folders = [
-            folder
-            for path, folder in self._folders.items()
-            if path != self._moments and not path.startswith(f"{self._moments}/")
-        ]
-        linked = {(folder.device, inode) for folder in folders for inode in folder.linked}
-        if not linked:
-            return set()
+        """Returns all but the first link of each file that has several."""
+        # A folder that was listed before a file got its second link does not show that.
+        linked = {inode for folder in self._folders.values() for inode in folder.linked}
         links: dict[tuple[int, int], list[str]] = {}
-        for folder in folders:
+        for folder in self._folders.values():
+            if linked.isdisjoint(folder.inodes):
+                continue
             for path, inode in zip(folder.files, folder.inodes, strict=True):
-                if (folder.device, inode) in linked:
+                if inode in linked:
                     links.setdefault((folder.device, inode), []).append(path)
-        return {path for each in links.values() for path in sorted(each, key=_outermost)[1:]}
+        second: set[str] = set()
+        for paths in links.values():
+            paths.sort(key=lambda path: (path.startswith(self._moments), path.count("/"), path))
+            second.update(paths[1:])
+        return second
 
     def distrust(self, path: str) -> None:
         """Has the folder of a file listed again in the next scan, whatever its mtime."""
@@ -241,33 +295,13 @@ class Tree:
             return f"the bag directory is a file, not a directory: correct {self._setting}"
         return f"the bag directory cannot be read: {error.strerror or error}"
 
-    def _leave_out_others(self, path: str, folder: _Folder, stamps: dict[str, Stamp]) -> None:
-        """Leaves out of a folder what `only` does not name."""
-        if self._only is None or self._named is None:
-            return
-        is_named = self._named.fullmatch
-        kept = [bool(is_named(file)) for file in folder.files]
-        for file, is_kept in zip(folder.files, kept, strict=True):
-            if not is_kept:
-                stamps.pop(file, None)
-        folder.files = list(compress(folder.files, kept))
-        folder.inodes = list(compress(folder.inodes, kept))
-        folder.folders = [
-            each for each in folder.folders if is_named(each) or self._only.startswith(f"{each}/")
-        ]
-        folder.links = [each for each in folder.links if is_named(str(each))]
-        folder.odd = [each for each in folder.odd if is_named(str(each.path))]
-        folder.has_metadata &= bool(is_named(path))
-
     def _descend(self, before: dict[str, _Folder], now: Ns, result: ScanResult) -> OSError | None:
         """Visits every folder; returns the error where the root cannot be listed."""
         waiting = [self._root]
         while waiting:
             path = waiting.pop()
             try:
-                is_root = path == self._root
-                folder = _visit(path, before.get(path), now, result.stamps, is_root=is_root)
-                self._leave_out_others(path, folder, result.stamps)
+                folder = self._visit(path, before.get(path), now, result.stamps)
             except OSError as error:
                 if path == self._root:
                     return error
@@ -292,6 +326,32 @@ class Tree:
             )
         return None
 
+    def _visit(
+        self, path: str, known: _Folder | None, now: Ns, stamps: dict[str, Stamp]
+    ) -> _Folder:
+        """Returns the folder as it is known if nothing came or went, else as it is listed now.
+
+        Its mtime is read first: what changes during the listing is then found by the next scan.
+        Only the root may be a link: anything else that is one has just replaced a folder.
+        """
+        status = os.stat(path, follow_symlinks=path == self._root)  # noqa: PTH116 - a Path costs more
+        if not stat.S_ISDIR(status.st_mode):
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), path)
+        mtime_ns, device = status.st_mtime_ns, status.st_dev
+        if known and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
+            return known
+        folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now), device=device)
+        folder.find_sidecar(path)
+        with os.scandir(path) as entries:
+            for entry in entries:
+                if (
+                    self._named is None
+                    or self._named.fullmatch(entry.path)
+                    or (self._only or "").startswith(f"{entry.path}/")
+                ):
+                    folder.enter(entry, stamps)
+        return folder
+
     def _look_up(self, path: str, result: ScanResult) -> None:
         if path in result.stamps or path in result.gone:
             return
@@ -303,85 +363,6 @@ class Tree:
             if _is_gone(error):
                 result.gone.add(path)
             self.distrust(path)
-
-
-def _visit(
-    path: str, known: _Folder | None, now: Ns, stamps: dict[str, Stamp], *, is_root: bool
-) -> _Folder:
-    """Returns the folder as it is known if nothing came or went, else as it is listed now.
-
-    Its mtime is read first: what changes during the listing is then found by the next scan. Only
-    the root may be a link: anything else that is one has just replaced a folder.
-    """
-    status = os.stat(path, follow_symlinks=is_root)  # noqa: PTH116 - a Path costs more
-    if not stat.S_ISDIR(status.st_mode):
-        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), path)
-    mtime_ns, device = status.st_mtime_ns, status.st_dev
-    if known is not None and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
-        return known
-    folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now), device=device)
-    with os.scandir(path) as entries:
-        for entry in entries:
-            _enter(folder, entry, stamps)
-    if folder.sidecar_ns:
-        for file in folder.files:
-            if file in stamps:
-                stamps[file] = Stamp(*stamps[file][:4], folder.sidecar_ns)
-    return folder
-
-
-def _enter(folder: _Folder, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
-    hidden = entry.name.startswith(".")
-    # Nearly all entries are bags: they are checked first.
-    if not hidden and entry.name.endswith(BAG_KINDS) and entry.is_file(follow_symlinks=False):
-        _enter_file(folder, entry, stamps)
-    elif entry.is_symlink():
-        if not hidden:
-            folder.links.append(Path(entry.path))
-    elif entry.is_dir(follow_symlinks=False):
-        if not hidden and entry.name != LOST_AND_FOUND:
-            folder.folders.append(entry.path)
-    elif entry.name == HANDOVER_FILE:
-        _enter_sidecar(folder, entry)
-    elif entry.name == METADATA_FILE:
-        folder.has_metadata = True
-    elif bag_kind(entry.name):
-        if entry.is_file(follow_symlinks=False):
-            _enter_file(folder, entry, stamps)
-        else:
-            folder.odd.append(SetAside(Path(entry.path), "not a regular file"))
-
-
-def _enter_file(folder: _Folder, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
-    try:
-        status = entry.stat(follow_symlinks=False)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        reason = f"cannot be read: {error.strerror or error}"
-        folder.odd.append(SetAside(Path(entry.path), reason))
-        folder.trusted = False
-        # A known file is not gone because of that.
-        folder.files.append(entry.path)
-        folder.inodes.append(0)
-        return
-    stamps[entry.path] = Stamp.of(status)
-    folder.files.append(entry.path)
-    folder.inodes.append(status.st_ino)
-    if status.st_nlink > 1:
-        folder.linked.add(status.st_ino)
-
-
-def _enter_sidecar(folder: _Folder, entry: os.DirEntry[str]) -> None:
-    try:
-        folder.sidecar_ns = entry.stat(follow_symlinks=False).st_mtime_ns
-    except OSError:
-        folder.trusted = False
-
-
-def _outermost(path: str) -> tuple[int, str]:
-    """Returns the sort key of the links of one file: the one nearest to the root first."""
-    return path.count("/"), path
 
 
 def _is_gone(error: OSError) -> bool:

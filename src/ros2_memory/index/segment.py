@@ -7,18 +7,18 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 from __future__ import annotations
 
 from functools import cached_property, lru_cache, reduce
-from itertools import chain, pairwise
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.core.bag_summary import numbers_of
-from ros2_memory.core.model import BagState
+from ros2_memory.core.bag_summary import SummarySchema, numbers_of
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import pauses_between, pauses_within
-from ros2_memory.index.split_order import split_ranges_of
+from ros2_memory.index.holes import Pause, pauses_between, pauses_within
+from ros2_memory.index.split_order import Series, SplitRange, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -27,10 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.bag_summary import SummarySchema
-    from ros2_memory.core.model import BagFile, TimeWindow
-    from ros2_memory.index.holes import Pause
-    from ros2_memory.index.split_order import Series, SplitRange
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
 """A topic with a message this often, or less often, is rare."""
@@ -49,9 +45,6 @@ Span: TypeAlias = "tuple[Ns, Ns]"
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2
-_OCTAVES: Final = 64 * _PER_OCTAVE
-
-_NOWHERE: Final = np.empty(0, np.intp)
 
 _Times: TypeAlias = "NDArray[np.int64]"
 
@@ -308,33 +301,29 @@ class Segment:
             header.topic for schema in self._schemas for header in schema.topics if header.latched
         )
 
-    def totals_in(self, topic: str, recording: Path) -> TopicTotals | None:
-        """Returns what a recording's bags hold of a topic, under all of its types."""
-        if str(recording) not in self.folders or topic not in self.totals:
+    def totals_in(self, topic: str, folder: str) -> TopicTotals | None:
+        """Returns what the bags in a folder hold of a topic, under all of its types."""
+        column = _columns(self).of(topic)
+        folders, of = self._folder_rows
+        if column is None or folder not in folders:
             return None
-        totals = [*self.totals[topic].values()]
-        if len(self.folders) > 1:
-            totals = [
-                TopicTotals(summary.first, summary.last, summary.count)
-                for bag in self.bags
-                if bag.recording == recording
-                for summary in bag.summary.of(topic)
-            ]
-        return reduce(TopicTotals.__or__, totals) if totals else None
-
-    def extent_of(self, recording: Path) -> Span | None:
-        """Returns the times (inclusive) between which a recording has bags among these."""
-        if str(recording) not in self.folders:
+        here = of[column.bags] == folders.index(folder)
+        _, firsts, lasts, counts = (numbers[here] for numbers in column)
+        if not counts.size:
             return None
-        if len(self.folders) == 1:
-            return self.bags[0].start, self.latest
-        own = [bag for bag in self.bags if bag.recording == recording]
-        return own[0].start, max(bag.end for bag in own)
+        return TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
 
     @cached_property
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
-        return _presences_of(self)
+        columns = _columns(self)
+        topics = {topic for group in columns.groups for topic in group.schema.positions}
+        lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
+        return {
+            topic: _presence_of(column, lengths)
+            for topic in sorted(topics)
+            if (column := columns.of(topic)) is not None
+        }
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -435,76 +424,34 @@ def _columns(segment: Segment) -> _Columns:
     return _Columns(segment.bags)
 
 
-# When bags hold each topic. A week has 60,000 with some ten topics or more, so this computes with
-# the numbers of all bags and topics of a segment at a time.
+def _presence_of(column: TopicColumn, lengths: _Times) -> Presence:
+    """Returns when bags hold a topic, and how often; given the lengths of all bags (ns)."""
+    bags, firsts, lasts, counts = column
+    if (bags[1:] == bags[:-1]).any():  # the types of a topic count together
+        bags, rows = np.unique(bags, return_index=True)
+        counts = np.add.reduceat(counts, rows)
+        firsts, lasts = np.minimum.reduceat(firsts, rows), np.maximum.reduceat(lasts, rows)
+    spacings = _spacings(counts, lasts - firsts)
+    length = int(lengths[bags].sum())
+    return Presence(_runs(firsts, lasts), spacings, int(counts.sum()), length)
 
 
-def _presences_of(segment: Segment) -> dict[str, Presence]:
-    """Returns by topic when the bags hold it, and how often; a topic's types count together."""
-    bags, groups = segment.bags, _columns(segment).groups
-    topics = sorted({topic for schema, _, _ in groups for topic in schema.positions})
-    at = {topic: column for column, topic in enumerate(topics)}
-    counts, firsts, lasts = _tables((len(bags), len(topics)), groups, at)
-    held = np.array([bag.end - bag.start for bag in bags], np.int64)
-    messages = counts.sum(axis=0).tolist()
-    lengths = np.where(counts > 0, held[:, None], 0).sum(axis=0).tolist()
-    rows = zip(
-        topics, _runs(firsts, lasts), _spacings(counts, lasts - firsts), messages, lengths,
-        strict=True,
-    )  # fmt: skip
-    return {topic: Presence(*each) for topic, *each in rows}
+def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:
+    """Returns the runs of a topic; see `Presence`."""
+    order = np.argsort(firsts, kind="stable")
+    begins, reach = firsts[order], np.maximum.accumulate(lasts[order])
+    breaks = np.flatnonzero(begins[1:] - reach[:-1] > SHORTEST_NS)
+    starts = begins[[0, *(breaks + 1)]].tolist()
+    return tuple(zip(starts, reach[[*breaks, -1]].tolist(), strict=True))
 
 
-def _tables(
-    shape: tuple[int, int], groups: Sequence[_SchemaGroup], column: dict[str, int]
-) -> tuple[_Times, _Times, _Times]:
-    """Returns counts, first and last times by bag and topic; where a bag has none, 0, MAX, MIN."""
-    counts = np.zeros(shape, np.int64)
-    firsts, lasts = np.full(shape, MAX_NS), np.full(shape, MIN_NS)
-    for schema, rows, numbers in groups:
-        columns = [column[header.topic] for header in schema.topics]
-        if len(schema.positions) == len(columns):
-            here = np.ix_(rows.tolist(), columns)
-            counts[here], firsts[here], lasts[here] = np.moveaxis(numbers, 2, 0)
-            continue
-        for position, at in enumerate(columns):  # a topic of two types has two
-            count, first, last = numbers[:, position].T
-            counts[rows, at] += count
-            firsts[rows, at] = np.minimum(firsts[rows, at], first)
-            lasts[rows, at] = np.maximum(lasts[rows, at], last)
-    return counts, firsts, lasts
-
-
-def _runs(firsts: _Times, lasts: _Times) -> Iterator[tuple[Span, ...]]:
-    """Yields for each topic its runs; see `Presence`."""
-    order = np.argsort(firsts, axis=0, kind="stable")
-    firsts = np.take_along_axis(firsts, order, 0)
-    reach = np.maximum.accumulate(np.take_along_axis(lasts, order, 0), axis=0)
-    # Bags without the topic are sorted to the end, and are no break.
-    before = firsts[1:] < MAX_NS
-    breaks = before & (np.where(before, firsts[1:], reach[:-1]) - reach[:-1] > SHORTEST_NS)
-    whole = [*zip(firsts[0].tolist(), reach[-1].tolist(), strict=True)]
-    broken = frozenset(np.flatnonzero(breaks.any(axis=0)).tolist())
-    for topic, (first, last) in enumerate(whole):
-        at = np.flatnonzero(breaks[:, topic]) if topic in broken else _NOWHERE
-        begins = [first, *firsts[1:][at, topic].tolist()]
-        ends = [*reach[at, topic].tolist(), last]
-        yield tuple(zip(begins, ends, strict=True))
-
-
-def _spacings(counts: _Times, spans: _Times) -> Iterator[dict[int, Spacing]]:
-    """Yields for each topic the spacings of its bags, by the part of an octave of the period."""
-    bag, topic = np.nonzero((counts >= _FEWEST) & (spans > 0))
-    span, intervals = spans[bag, topic], counts[bag, topic] - 1
-    octave = (np.log2(span / intervals) * _PER_OCTAVE).astype(np.int64).clip(0, _OCTAVES - 1)
-    key = topic * _OCTAVES + octave
-    order = np.argsort(key, kind="stable")
-    parts, at = np.unique(key[order], return_index=True)
-    found: list[dict[int, Spacing]] = [{} for _ in range(counts.shape[1])]
-    bounds = pairwise([*at.tolist(), len(order)])
-    for part, (begin, end) in zip(parts.tolist(), bounds, strict=True):
-        rows = order[begin:end]
-        found[part // _OCTAVES][part % _OCTAVES] = Spacing(
-            end - begin, int(span[rows].sum()), int(intervals[rows].sum())
-        )
-    return iter(found)
+def _spacings(counts: _Times, spans: _Times) -> dict[int, Spacing]:
+    """Returns the spacings of the bags with a topic, by the part of an octave of the period."""
+    shown = (counts >= _FEWEST) & (spans > 0)
+    spans, intervals = spans[shown], counts[shown] - 1
+    octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
+    return {
+        octave: Spacing(int(here.sum()), int(spans[here].sum()), int(intervals[here].sum()))
+        for octave in sorted({*octaves.tolist()})
+        for here in [octaves == octave]
+    }

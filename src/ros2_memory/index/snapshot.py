@@ -9,18 +9,20 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import (
     LONGEST_OFF_NS,
+    Presence,
+    Silence,
     joined,
     shortest_silence,
     silences,
     usual_period,
 )
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import united, without
-from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.index.clock_faults import check_dates
-from ros2_memory.index.holes import Rhythm, pauses_between
+from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates
+from ros2_memory.index.holes import Pause, Rhythm, pauses_between
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
@@ -37,11 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.silences import Presence, Silence
-    from ros2_memory.core.model import BagFile, SetAside
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.clock_faults import ClockFault, Dating
-    from ros2_memory.index.holes import Pause
 
 _MAX_PLACED: Final = 500
 

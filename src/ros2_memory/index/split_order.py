@@ -61,10 +61,15 @@ class SplitRange(NamedTuple):
 _BY_NUMBER: Final = attrgetter("number")
 
 
+def stem_of(file: str) -> str:
+    """Returns the path of a bag without its suffixes."""
+    stem = file.removesuffix(COMPRESSED)
+    return stem[: stem.rfind(".")]
+
+
 def split_of(file: str) -> tuple[Series, int] | None:
     """Returns the series of a bag file and its number there; None where its name has no number."""
-    stem = file.removesuffix(COMPRESSED)
-    stem = stem[: stem.rfind(".")]
+    stem = stem_of(file)
     series = stem.rstrip("0123456789")
     return None if series == stem else (series, int(stem[len(series) :]))
 

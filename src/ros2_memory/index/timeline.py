@@ -15,11 +15,13 @@ from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
 from ros2_memory.core.memo import Memo
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import overlap_spans, united
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import Spans, overlap_spans, united
 from ros2_memory.index.segment import (
     Pace,
     Segment,
+    Span,
+    TopicExtent,
     TopicTotals,
     add_totals,
     folder_of,
@@ -33,10 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.segment import Span, TopicExtent
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
@@ -195,13 +194,11 @@ class Timeline:
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
-        totals, extents = [], []
-        for segment in self.segments:
-            extent = segment.extent_of(recording)
-            if extent is not None:
-                extents.append(extent)
-                totals.append(segment.totals_in(topic, recording))
-        return Pace(reduce(TopicTotals.__or__, filter(None, totals)), *reduce(wider, extents))
+        folder = str(recording)
+        segments = [segment for segment in self.segments if folder in segment.folders]
+        totals = filter(None, (segment.totals_in(topic, folder) for segment in segments))
+        extents = (segment.folder_spans[folder] for segment in segments)
+        return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
 
     @cached_property
     def silent(self) -> frozenset[str]:
@@ -241,13 +238,14 @@ class Timeline:
         Those of a bag that a crash left open reach to the last time that its file was written to,
         if that was within a day.
         """
-        return [
-            bag
-            for segment in self._faulty_segments
-            if segment.bags[0].start < window.stop
-            for bag in segment.faulty
-            if window.overlaps(bag.start, _lost_until(bag))
-        ]
+        found = []
+        for segment in self._faulty_segments:
+            for bag in segment.faulty if segment.bags[0].start < window.stop else ():
+                is_cut = bag.state is BagState.INCOMPLETE
+                is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
+                if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
+                    found.append(bag)
+        return found
 
     @cached_property
     def _faulty_segments(self) -> list[Segment]:
@@ -274,12 +272,6 @@ class Timeline:
             for bag in segment.bags
             if any(held.type == type_name for held in bag.summary.of(topic))
         )
-
-
-def _lost_until(bag: BagFile) -> Ns:
-    """Returns until when (inclusive) a bag may have recorded what cannot be read of it."""
-    is_cut = bag.state is BagState.INCOMPLETE and bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
-    return bag.mtime_ns if is_cut else bag.end
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:

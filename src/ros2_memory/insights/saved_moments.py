@@ -8,20 +8,17 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
-from ros2_memory.bag_dir.moment_file import stored_moments_in
-from ros2_memory.bag_dir.request_queue import PendingRequest
+from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, stored_moments_in
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ns_from_unix
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns, ns_from_unix
 from ros2_memory.history.view import View
 from ros2_memory.results import FiredRule, MomentList, RememberedMoment, ShownMoment
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.bag_dir.request_queue import Outcome
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
 
 ANSWER_TIMEOUT_S: Final = 5.0

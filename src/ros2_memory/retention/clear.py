@@ -30,8 +30,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
 
 MOST_FAULTS: Final = 100
@@ -49,12 +47,25 @@ class Cleared:
     faults: list[str] = field(default_factory=list)
     more: int = 0
 
-    def add_fault(self, sentence: str) -> None:
+    def add_fault(self, path: Path, error: OSError, verb: str = "deleted") -> None:
         """Adds a sentence, or only counts it once there are `MOST_FAULTS`."""
         if len(self.faults) < MOST_FAULTS:
-            self.faults.append(sentence)
+            self.faults.append(f"{path} cannot be {verb}: {error.strerror}")
         else:
             self.more += 1
+
+    def delete(self, path: Path, folder: int) -> None:
+        """Deletes a file; `folder` is its open directory."""
+        try:
+            size = os.stat(path.name, dir_fd=folder, follow_symlinks=False).st_size
+            os.unlink(path.name, dir_fd=folder)
+        except FileNotFoundError:
+            return
+        except OSError as error:
+            self.add_fault(path, error)
+        else:
+            self.files += 1
+            self.bytes += size
 
 
 def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
@@ -64,8 +75,7 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
         RecorderError: the directory is `/`, a home directory or above one.
     """
     refuse_homes(bag_dir)
-    root = bag_dir.resolve()
-    cleared = Cleared()
+    root, cleared = bag_dir.resolve(), Cleared()
     try:
         if own is not None:
             own.names()
@@ -74,7 +84,7 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
     except FileNotFoundError:
         return cleared
     except OSError as error:
-        cleared.add_fault(f"{root} cannot be listed: {error.strerror}")
+        cleared.add_fault(root, error, "listed")
         return cleared
     # Names, not paths: a path may be longer than the system takes (PATH_MAX), and `opened` finds
     # each directory again from the root, so that few files are open however deep it lies.
@@ -88,14 +98,15 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
                 if os.fstat(folder).st_dev != device:
                     continue
                 had_bags, below = _clear_folder(folder, parts, path, own, cleared)
-            if had_bags and parts:
-                emptied.append(path)
-            waiting.extend((*parts, name) for name in below)
         except FileNotFoundError:
             continue
         except OSError as error:
-            cleared.add_fault(f"{path} cannot be deleted: {error.strerror}")
-    _remove_emptied(root, reversed(emptied), cleared)
+            cleared.add_fault(path, error)
+            continue
+        if parts and (had_bags or (parts[0] == MOMENTS_FOLDER and len(parts) <= 2)):
+            emptied.append(path)
+        waiting.extend((*parts, name) for name in below)
+    _remove_emptied(root, emptied, cleared)
     return cleared
 
 
@@ -141,76 +152,48 @@ def _clear_folder(
 ) -> tuple[bool, list[str]]:
     """Deletes the bags in an open directory, which has this path and these names below the root.
 
-    Returns whether it may go when it is empty, and the directories in it that are not hidden.
+    Returns whether there were any, and the directories in it that are not hidden.
     """
-    with os.scandir(folder) as listing:
-        entries = list(listing)
-    in_moments = parts[:1] == (MOMENTS_FOLDER,) and len(parts) <= 2
-    bags = [entry for entry in entries if _is_bag(entry)]
+    bags, files, below = _listed(folder)
     going = bags
     if own is not None:
         holds = own.judge("/".join(parts), identity_at(folder))
-        going = [entry for entry in bags if holds(_bag_name(entry.name))]
-    names = RECORDING_FILES if bags and going == bags else frozenset()
-    if not parts:
-        names |= OWN_FILES
-    beside = [each for each in entries if each.name in names]
-    for entry in going + [each for each in beside if each.is_file(follow_symlinks=False)]:
-        _delete(folder, path, entry, cleared)
-    below = [
-        entry.name
-        for entry in entries
-        if not entry.name.startswith(".") and entry.is_dir(follow_symlinks=False)
-    ]
-    return in_moments or bool(bags), below
+        # A journal goes with its bag.
+        going = {
+            name for name in bags if holds(name.rpartition("-")[0] if is_journal(name) else name)
+        }
+    beside = RECORDING_FILES if bags and going == bags else frozenset()
+    for name in going | files & (beside if parts else beside | OWN_FILES):
+        cleared.delete(path / name, folder)
+    return bool(bags), [name for name in below if not name.startswith(".")]
 
 
-def _remove_emptied(root: Path, emptied: Iterable[Path], cleared: Cleared) -> None:
-    """Deletes directories that are empty, the deepest first."""
-    for path in emptied:
-        if path.parent == root / MOMENTS_FOLDER:
-            _clear_moment(root, path, cleared)
+def _remove_emptied(root: Path, emptied: list[Path], cleared: Cleared) -> None:
+    """Deletes directories that are empty, but for the file of a moment of which no bag is left."""
+    # The deepest first.
+    for path in reversed(emptied):
         with suppress(OSError), directories.opened(root, path.parent) as above:
+            if path.parent == root / MOMENTS_FOLDER:
+                with directories.opened(root, path) as folder:
+                    bags, files, below = _listed(folder)
+                    if MOMENT_FILE in files and not bags and not below:
+                        cleared.delete(path / MOMENT_FILE, folder)
             os.rmdir(path.name, dir_fd=above)
 
 
-def _clear_moment(root: Path, path: Path, cleared: Cleared) -> None:
-    """Deletes the file of a saved moment of which no bag is left."""
-    with suppress(OSError), directories.opened(root, path) as folder:
-        with os.scandir(folder) as listing:
-            entries = {entry.name: entry for entry in listing}
-        is_left = any(_is_bag(each) or each.is_dir() for each in entries.values())
-        if MOMENT_FILE in entries and not is_left:
-            _delete(folder, path, entries[MOMENT_FILE], cleared)
-
-
-def _delete(folder: int, path: Path, entry: os.DirEntry[str], cleared: Cleared) -> None:
-    """Deletes a file in an open directory, which has this path."""
-    try:
-        size = entry.stat(follow_symlinks=False).st_size
-        os.unlink(entry.name, dir_fd=folder)
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        cleared.add_fault(f"{path / entry.name} cannot be deleted: {error.strerror}")
-    else:
-        cleared.files += 1
-        cleared.bytes += size
-
-
-def _bag_name(name: str) -> str:
-    """Returns the name of a bag; of a journal, that of its bag."""
-    return name.rpartition("-")[0] if is_journal(name) else name
+def _listed(folder: int) -> tuple[set[str], set[str], list[str]]:
+    """Returns the names of bags and their journals, of files, and of directories in a directory."""
+    with os.scandir(folder) as entries:
+        found = [*entries]
+    files = {entry.name for entry in found if entry.is_file(follow_symlinks=False)}
+    below = [entry.name for entry in found if entry.is_dir(follow_symlinks=False)]
+    return {name for name in files if bag_kind(name) or is_journal(name)}, files, below
 
 
 def _is_worthless(entry: os.DirEntry[str]) -> bool:
     """Whether a file of a recording means nothing where that has no bag with content."""
-    if entry.name == HANDOVER_FILE:
-        return entry.is_file(follow_symlinks=False)
-    empty = entry.is_file(follow_symlinks=False) and not entry.stat(follow_symlinks=False).st_size
-    return empty and (_is_bag(entry) or entry.name == METADATA_FILE)
-
-
-def _is_bag(entry: os.DirEntry[str]) -> bool:
-    named = bag_kind(entry.name) is not None or is_journal(entry.name)
-    return named and entry.is_file(follow_symlinks=False)
+    if not entry.is_file(follow_symlinks=False):
+        return False
+    known = bag_kind(entry.name) or is_journal(entry.name) or entry.name == METADATA_FILE
+    empty = not entry.stat(follow_symlinks=False).st_size
+    return entry.name == HANDOVER_FILE or bool(known and empty)

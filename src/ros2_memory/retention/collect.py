@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import time
+from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -17,25 +18,28 @@ import structlog
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.metadata_yaml import bare_name
-from ros2_memory.bag_dir.state_files import append_deleted, deleted_of, unshipped
+from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.inventory import Inventory
-from ros2_memory.retention.policy import ages, plan_deletions
-from ros2_memory.retention.recorded_time import relative_recording
+from ros2_memory.retention.policy import (
+    RetentionLimits,
+    RetentionStock,
+    StoredBag,
+    ages,
+    plan_deletions,
+)
+from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.bag_dir.state_files import Deleted
     from ros2_memory.core.timebase import Ns
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
-    from ros2_memory.retention.policy import RetentionLimits, RetentionStock, StoredBag
-    from ros2_memory.retention.recorded_time import RecordedTime
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
@@ -87,7 +91,7 @@ class Collected:
 
 @dataclass(slots=True)
 class _Pass:
-    """The state of one pass.
+    """The state of one pass; bags are paths.
 
     Attributes:
         urgent: whether it does not wait until carried messages have been known for long enough.
@@ -97,6 +101,7 @@ class _Pass:
         deleted: bags that were deleted.
         remaining: bags that stay.
         saved: those of the deleted bags whose files are saved in moments.
+        unshipped: those that had to be shipped, in the order in which they were deleted.
     """
 
     urgent: bool
@@ -105,7 +110,8 @@ class _Pass:
     result: Collected = field(default_factory=Collected)
     deleted: set[str] = field(default_factory=set)
     remaining: set[str] = field(default_factory=set)
-    saved: set[Path] = field(default_factory=set)
+    saved: set[str] = field(default_factory=set)
+    unshipped: list[str] = field(default_factory=list)
 
 
 class GarbageCollector:
@@ -183,25 +189,19 @@ class GarbageCollector:
         if free_bytes_wanted is not None:
             limits = replace(limits, min_free_bytes=free_bytes_wanted)
         run = _Pass(urgent=free_bytes_wanted is not None)
-        needed = self._needed(snapshot)
-        lost: list[str] = []
+        result, needed = run.result, self._needed(snapshot)
         while True:
-            stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
-            stock = replace(stock, needed=needed, unshipped=self._unshipped(stock))
+            stock = replace(self._stock(known, limits, run), needed=needed)
             if free_bytes_wanted is not None:
                 stock = replace(stock, free_bytes=self._measure_free(self._bag_dir))
-            stock = self._with_clocks(stock, limits, run)
             plan = plan_deletions(stock, limits)
-            run.result.foreign_bytes = stock.foreign_bytes
-            run.result.state_bytes = stock.state_bytes
-            run.result.saved_bytes = sum(each.size for each in stock.saved)
-            run.result.total_bytes, run.result.fits = plan.total_bytes, plan.fits
-            run.result.most_free = plan.most_free
+            result.foreign_bytes, result.state_bytes = stock.foreign_bytes, stock.state_bytes
+            result.saved_bytes = sum(file.size for file in stock.saved)
+            result.total_bytes, result.fits, result.most_free = plan[1:]
             to_delete = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
-                saved = {file.inode for file in stock.saved}
-                self._delete_all(to_delete, saved, snapshot, run)
-                lost += sorted(stock.unshipped & run.deleted)
+                self._delete_all(to_delete, stock, snapshot, run)
+                run.unshipped += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
             else:
@@ -209,35 +209,34 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
-        run.result.needed = len(needed & run.deleted)
-        run.result.unshipped = tuple(
-            relative_recording(path, self._bag_dir) for path in lost if Path(path) not in run.saved
+        result.needed = len(needed & run.deleted)
+        result.unshipped = tuple(
+            relative_recording(path, self._bag_dir)
+            for path in run.unshipped
+            if path not in run.saved
         )
-        return run.result
+        return result
 
-    def _unshipped(self, stock: RetentionStock) -> frozenset[str]:
-        """Returns the bags that are in no lake, where they must be."""
-        if not self._limits.require_shipped:
-            return frozenset()
+    def _stock(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> RetentionStock:
+        """Returns what is stored, how long was recorded after it, and where the clock was right."""
+        stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self._bag_dir}{os.sep}"
-        bags = ((bag.path.removeprefix(root), bag.size) for bag in stock.bags)
-        return frozenset(root + path for path in unshipped(self._bag_dir, bags))
-
-    def _with_clocks(
-        self, stock: RetentionStock, limits: RetentionLimits, run: _Pass
-    ) -> RetentionStock:
-        """Adds how long was recorded after each, their order, and where the clock was right."""
         names = {
             bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
         }
         since = self._recorded.since(names.values())
         doubtful = self._recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self._own.in_order())}
+        missing = frozenset[str]()
+        if limits.require_shipped:
+            bags = ((bag.path.removeprefix(root), bag.size) for bag in stock.bags)
+            missing = frozenset(root + path for path in unshipped(self._bag_dir, bags))
         stock = replace(
             stock,
             recorded_since={path: since[name] for path, name in names.items()},
             doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
+            unshipped=missing,
         )
         old = ages(stock, limits)
         # Asking starts a program, so only where it matters.
@@ -247,50 +246,47 @@ class GarbageCollector:
             if run.synchronised:
                 self._recorded.confirm_clock()
         synchronised = bool(run.synchronised)
-        run.result.held = len(old.held(synchronised=synchronised) - stock.unshipped)
+        run.result.held = len(old.held(synchronised=synchronised) - missing)
         return replace(stock, synchronised=synchronised)
 
     def _delete_all(
-        self,
-        to_delete: Sequence[StoredBag],
-        saved: set[tuple[int, int]],
-        snapshot: Snapshot,
-        run: _Pass,
+        self, to_delete: Sequence[StoredBag], stock: RetentionStock, snapshot: Snapshot, run: _Pass
     ) -> None:
-        paths = {Path(bag.path) for bag in to_delete} | {Path(path) for path in run.deleted}
-        latched = {str(bag.path) for bag in self._carrier.with_latched(snapshot, paths)}
+        saved = {file.inode for file in stock.saved}
+        run.saved |= {
+            bag.path for bag in to_delete if any(file.inode in saved for file in bag.files)
+        }
+        paths = {Path(path) for path in (*run.deleted, *(bag.path for bag in to_delete))}
+        latched = {bag.file for bag in self._carrier.with_latched(snapshot, paths)}
         try:
-            run.saved |= {
-                Path(bag.path)
-                for bag in to_delete
-                if any(each.inode in saved for each in bag.files)
-            }
-            carried = self._carrier.carry(snapshot, paths, run.saved)
+            carried = self._carrier.carry(snapshot, paths, {*map(Path, run.saved)})
         except (EpisodicError, OSError) as error:
             # Bags without latched messages can still be deleted, and may free enough space.
-            reason = f"its latched messages cannot be carried on: {error}"
-            for each in to_delete:
-                if each.path in latched:
-                    self._keep(each.path, reason, run)
+            for bag in to_delete:
+                if bag.path in latched:
+                    self._keep(bag, f"its latched messages cannot be carried on: {error}", run)
         else:
             run.result.carried = run.result.carried if carried is None else carried
-        for each in to_delete:
-            if each.path in latched and self._is_in_grace(each.path, run):
-                run.remaining.add(each.path)
-                run.waiting.add(each.path)
-        going = [each for each in to_delete if each.path not in run.remaining]
+        now = self._monotonic()
+        for path in (bag.path for bag in to_delete if bag.path in latched):
+            # Queries may still look for latched messages there, though they are carried.
+            since = self._carried_since.setdefault(path, now)
+            if not run.urgent and now - since < self._grace_s:
+                run.remaining.add(path)
+                run.waiting.add(path)
+        going = [bag for bag in to_delete if bag.path not in run.remaining]
         self._note(going)
-        for each in going:
-            self._delete(each, run)
+        for bag in going:
+            self._delete(bag, run)
         # Where the disk was full, there is room now.
         self._note(())
 
     def _note(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
-        splits: dict[str, list[tuple[str, Ns, Ns]]] = {}
-        for each in going:
-            name = relative_recording(each.recording, self._bag_dir)
-            splits.setdefault(name, []).append((bare_name(each.path), each.start, each.end))
+        splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
+        for bag in going:
+            name = relative_recording(bag.recording, self._bag_dir)
+            splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         if not self._unwritten:
             return
@@ -303,22 +299,16 @@ class GarbageCollector:
         else:
             self._unwritten.clear()
 
-    def _is_in_grace(self, path: str, run: _Pass) -> bool:
-        """Whether queries may still look for latched messages in a bag, though they are carried."""
-        now = self._monotonic()
-        since = self._carried_since.setdefault(path, now)
-        return not run.urgent and now - since < self._grace_s
-
     def _delete(self, bag: StoredBag, run: _Pass) -> None:
         size = 0
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
                 freed = remove_bag(self._bag_dir, Path(path), file.inode)
-                size += 0 if Path(path) in run.saved else freed
+                size += 0 if path in run.saved else freed
             except FileNotFoundError:
                 continue
             except OSError as error:
-                self._keep(bag.path, str(error), run)
+                self._keep(bag, str(error), run)
                 return
         self._reported.discard(bag.path)
         self._carried_since.pop(bag.path, None)
@@ -328,9 +318,8 @@ class GarbageCollector:
 
     def _remove_emptied(self, known: KnownBags, run: _Pass) -> None:
         """Deletes what is left of recordings without a bag, except those being written."""
-        named = {self._bag_dir / name for name in known.named}
         self._emptied |= {Path(path).parent for path in run.deleted}
-        for recording in self._emptied - named:
+        for recording in self._emptied - {self._bag_dir / name for name in known.named}:
             try:
                 remove_emptied(self._bag_dir, recording)
             except OSError as error:
@@ -339,10 +328,10 @@ class GarbageCollector:
                 self._emptied.discard(recording)
                 run.result.recordings += not recording.exists()
 
-    def _keep(self, path: str, reason: str, run: _Pass) -> None:
-        run.remaining.add(path)
+    def _keep(self, bag: StoredBag, reason: str, run: _Pass) -> None:
+        run.remaining.add(bag.path)
         run.result.failed += 1
-        self._report(path, reason)
+        self._report(bag.path, reason)
 
     def _report(self, path: str, reason: str) -> None:
         """Reports a fault once, until the bag is deleted."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.handover_file import (
+    MessageList,
     handover_to_change,
     message_id,
     read_handover,
@@ -50,22 +51,27 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.delete import repair_name
-from ros2_memory.retention.repair import open_files
-from ros2_memory.retention.rewriting import Identity, beside, left_in, replace_file, rewritten
-from ros2_memory.storage.base import Closing
+from ros2_memory.retention.repair import (
+    Identity,
+    beside,
+    left_in,
+    open_files,
+    opened_folder,
+    replace_file,
+    rewritten,
+)
+from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-    from ros2_memory.bag_dir.handover_file import MessageList
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import BagReader, BagWriter
 
 NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
+_Window = tuple[str, int, int]
 
 
 @dataclass(slots=True)
@@ -83,7 +89,7 @@ class Holder:
     paths: tuple[Path, ...]
     inode: Identity
     counts: Counter[str] = field(default_factory=Counter)
-    windows: Counter[tuple[str, Ns, Ns]] = field(default_factory=Counter)
+    windows: Counter[_Window] = field(default_factory=Counter)
     ids: Ids = field(default_factory=dict)
 
 
@@ -200,39 +206,42 @@ class Eraser:
         Raises:
             OSError: what goes cannot be written down; nothing is changed then.
         """
+        taken = {path: holder.counts for holder in survey.holders for path in holder.paths}
         if not erasure.files:
-            erasure = self._with_files(erasure, survey)
+            windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
+            counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
+            erasure = replace(erasure, files=tuple(map(self._name, taken)), counts=counts)
         ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
-        left = self._left_by_recording(survey)
+        recordings = {holder.paths[0].parent for holder in survey.holders}
+        left = {recording: left_in(recording, self._reader, taken) for recording in recordings}
         for holder in survey.holders:
             try:
                 self._erase_in(holder, erasure, left[holder.paths[0].parent], kept)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._name(holder.paths[0])}: {_reason_of(error)}")
-        files = [self._bag_dir / each for each in erasure.files]
-        notes = [*self._correct_metadata({each.parent for each in files})]
+        files = [self._bag_dir / name for name in erasure.files]
+        notes = [*self._correct_metadata({path.parent for path in files})]
         try:
-            for path in files:
-                self._remove_leftover(path)
+            for path in files:  # what an interrupted erasure left beside a bag
+                with (
+                    suppress(FileNotFoundError, NotADirectoryError),
+                    directories.opened(self._bag_dir, path.parent) as folder,
+                ):
+                    os.unlink(repair_name(path.name), dir_fd=folder)
             forgotten(erasure)
-            self._record_deletion(erasure)
+            # So that answers report it.
+            known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
+            losses = [
+                Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
+                for gone in erasure.counts
+            ]
+            append_losses(self._bag_dir, [loss for loss in losses if loss not in known])
             if not kept:
                 ERASING.remove(self._bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(_reason_of(error))
         return Kept(tuple(kept), tuple(notes))
-
-    def _record_deletion(self, erasure: Erasure) -> None:
-        """Records the deletion, so that answers report it.
-
-        Raises:
-            OSError: it cannot be written down.
-        """
-        known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
-        counts = [(each.topic, each.start, each.stop, each.count) for each in erasure.counts]
-        losses = [Loss(*each, "forgotten") for each in counts]
-        append_losses(self._bag_dir, [each for each in losses if each not in known])
 
     def _files(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
@@ -300,23 +309,6 @@ class Eraser:
         lists = (handover.also_counts, handover.counts_elsewhere)
         return {topic for each in lists for topic in each.get(path.name, ())}
 
-    def _left_by_recording(self, survey: Survey) -> dict[Path, dict[str, Counter[str]]]:
-        """Returns what is left of each file of the recordings that change, by topic."""
-        gone = {path: each.counts for each in survey.holders for path in each.paths}
-        recordings = {each.paths[0].parent for each in survey.holders}
-        return {each: left_in(each, self._reader, gone) for each in recordings}
-
-    def _with_files(self, erasure: Erasure, survey: Survey) -> Erasure:
-        counts = Counter[tuple[str, int, int]]()
-        for holder in survey.holders:
-            counts.update(holder.windows)
-        files = [self._name(path) for each in survey.holders for path in each.paths]
-        return replace(
-            erasure,
-            files=tuple(files),
-            counts=tuple(Erased(*key, count) for key, count in sorted(counts.items())),
-        )
-
     def _erase_in(
         self,
         holder: Holder,
@@ -362,11 +354,9 @@ class Eraser:
 
     def _link(self, new: Path, path: Path, inode: Identity) -> None:
         """Puts a new file in place of one name of the old one."""
-        with directories.opened(self._bag_dir, path.parent) as folder:
-            here = Path(f"/proc/self/fd/{folder}", path.name)
-            with beside(here) as name:
-                os.link(new, name, follow_symlinks=False)
-                replace_file(name, here, inode)
+        with opened_folder(self._bag_dir, path) as here, beside(here) as name:
+            os.link(new, name, follow_symlinks=False)
+            replace_file(name, here, inode)
 
     def _clear_sidecar(self, path: Path, ids: Ids) -> None:
         """Takes messages of a file out of the sidecar in its folder.
@@ -416,18 +406,6 @@ class Eraser:
                     f"{name} still counts deleted messages ({error}); `ros2 bag reindex "
                     f"{recording}` rewrites it"
                 )
-
-    def _remove_leftover(self, path: Path) -> None:
-        """Deletes what an interrupted erasure left beside a bag.
-
-        Raises:
-            OSError: it cannot be deleted.
-        """
-        with (
-            suppress(FileNotFoundError, NotADirectoryError),
-            directories.opened(self._bag_dir, path.parent) as folder,
-        ):
-            os.unlink(repair_name(path.name), dir_fd=folder)
 
     def _name(self, path: Path) -> str:
         return os.path.relpath(path, self._bag_dir)

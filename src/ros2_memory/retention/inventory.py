@@ -9,13 +9,11 @@ from __future__ import annotations
 
 import sys
 from contextlib import suppress
-from enum import Enum, auto
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
-    CARRY_FILE,
     DELETED_FILE,
     LOCK_FILE,
     MOMENT_FILE,
@@ -28,7 +26,7 @@ from ros2_memory.bag_dir.layout import (
     split_number,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.file_state import FileState
+from ros2_memory.index.file_state import Classification, FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
@@ -40,7 +38,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
-    from ros2_memory.index.file_state import Classification
     from ros2_memory.index.scan import Stamp
 
 OWN_FOLDERS: Final = (".episodic", ROS_LOG_DIR)
@@ -50,26 +47,11 @@ COMPLETE_AFTER_NS: Final[Ns] = 120 * NS_PER_S
 _UNDATED: Final = (MAX_NS, MIN_NS)
 
 
-class Deletable(Enum):
-    """Whether a bag may be deleted, and what counts if not."""
-
-    YES = auto()
-    IF_UNNAMED = auto()  # unless the recorder names its recording in the heartbeat
-    NO = auto()
-    DAMAGED = auto()  # no; counts if the recorder made it
-    UNREAD = auto()  # no, and does not count
-    SAVED = auto()  # no; a file of a moment, which counts with the others there
-
-
-_BY_STATE: Final = {
-    FileState.CLOSED: Deletable.YES,
-    FileState.EMPTY: Deletable.YES,
-    FileState.INCOMPLETE: Deletable.IF_UNNAMED,
-    FileState.DAMAGED: Deletable.DAMAGED,
-    FileState.UNREAD: Deletable.UNREAD,
-    # Else a disk too full for its cuts would stay full.
-    FileState.HELD_BACK: Deletable.IF_UNNAMED,
-}
+_CLOSED: Final = frozenset({FileState.CLOSED, FileState.EMPTY})
+"""May be deleted."""
+_LEFT_OPEN: Final = frozenset({FileState.INCOMPLETE, FileState.HELD_BACK})
+"""May be deleted unless the recorder names the recording in the heartbeat; held back ones, too,
+else a disk too full for their cuts would stay full."""
 
 
 class _Entry(NamedTuple):
@@ -78,7 +60,6 @@ class _Entry(NamedTuple):
     classification: Classification
     stamp: Stamp
     bag: StoredBag
-    deletable: Deletable
 
 
 class _Folder(NamedTuple):
@@ -130,31 +111,34 @@ class Inventory:
         """
         bags: list[StoredBag] = []
         others = state_bytes = state_bytes_in(self._root)
+        foreign_bytes = 0
         occupied: set[str] = set()
         mixed: set[str] = set()
-        foreign: dict[tuple[int, int], int] = {}
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
         owned: dict[str, Callable[[str], bool]] = {}
-        for deletable, bag in chain(self._changing(known), self._settled(known)):
-            path = bag.path
+        for state, bag in chain(self._changing(known), self._settled(known)):
+            path, recording = bag.path, bag.recording
             if path in deleted:
                 continue
-            holds = owned.get(bag.recording)
-            if holds is None:
-                holds = owned[bag.recording] = self._judge(bag.recording)
-            own = holds(path[len(bag.recording) + 1 :])
-            if not (own or deletable is Deletable.SAVED or self._is_new(bag, named)):
-                mixed.add(bag.recording)
-                foreign.update((each.inode, each.size) for each in bag.files)
-                continue
-            unnamed = deletable is Deletable.IF_UNNAMED and bag.recording not in named
-            if own and (deletable is Deletable.YES or unnamed) and path not in remaining:
+            if recording not in owned:
+                owned[recording] = self._judge(recording)
+            name = path[len(recording) + 1 :]
+            own, is_named = owned[recording](name), recording in named
+            is_saved = path in known.saved
+            # One is listed moments after it appears.
+            is_new = is_named and split_number(recording, name) is not None
+            is_closed = state in _CLOSED and not is_carried(path)
+            may_go = is_closed or (state in _LEFT_OPEN and not is_named)
+            if not (own or is_saved or is_new):
+                mixed.add(recording)
+                foreign_bytes += sum(file.size for file in bag.files)
+            elif own and may_go and not is_saved and path not in remaining:
                 bags.append(bag)
             else:
-                occupied.add(bag.recording)
-                if self._counts(deletable, bag):
+                occupied.add(recording)
+                if self._counts(state, bag) and not is_saved:
                     others += sum(file.size for file in bag.files)
         self._forget(known)
         occupied |= mixed & {bag.recording for bag in bags}
@@ -169,23 +153,24 @@ class Inventory:
             sidecars,
             others,
             saved=saved,
-            foreign_bytes=sum(foreign.values()),
+            foreign_bytes=foreign_bytes,
             state_bytes=state_bytes,
         )
 
-    def _changing(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
+    def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags that the index has notes on."""
         for path, classification in known.counted.items():
             entry = self._entries.get(path)
             stamp = known.files[path].stamp
             if not (entry and entry.classification is classification and entry.stamp is stamp):
-                entry = self._entries[path] = self._entry(path, classification, known)
-            yield entry.deletable, entry.bag
+                bag = self._stored(path, classification, known)
+                entry = self._entries[path] = _Entry(classification, stamp, bag)
+            yield classification.state, entry.bag
 
-    def _settled(self, known: KnownBags) -> Iterator[tuple[Deletable, StoredBag]]:
+    def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags of which the index keeps rows."""
         rows = self._unchanged
-        for bag, inode in known.unchanged.rows():
+        for bag, inode in known.unchanged.values():
             stored = rows.get(bag.file)
             if stored is None or (stored.inode, stored.size, stored.written) != (
                 inode,
@@ -197,32 +182,18 @@ class Inventory:
                 span, file = self._span(bag), (device, inode, bag.size)
                 stored = StoredBag(bag.file, recording, *span, bag.mtime_ns, *file)
                 rows[bag.file] = stored
-            yield (Deletable.NO if bag.file.endswith(CARRY_FILE) else Deletable.YES), stored
+            yield FileState.CLOSED, stored
 
     def _judge(self, recording: str) -> Callable[[str], bool]:
         """Returns what decides by its name whether a bag in a directory may be deleted."""
         return (lambda _: True) if self._own is None else self._own.judge_of(recording)
 
-    def _is_new(self, bag: StoredBag, named: Collection[str]) -> bool:
-        """Whether a bag that is not listed as own counts: it is listed moments after it appears."""
-        name = bag.path[len(bag.recording) + 1 :]
-        return split_number(bag.recording, name) is not None and bag.recording in named
-
-    def _counts(self, deletable: Deletable, bag: StoredBag) -> bool:
+    def _counts(self, state: FileState, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""
-        if deletable is Deletable.DAMAGED:
+        if state is FileState.DAMAGED:
             # Where all bags may be deleted, only its name shows whether the recorder made it.
             return self._own is not None or has_own_name(Path(bag.recording).name)
-        return deletable not in {Deletable.SAVED, Deletable.UNREAD}
-
-    def _entry(self, path: str, classification: Classification, known: KnownBags) -> _Entry:
-        bag = self._stored(path, classification, known)
-        deletable = _BY_STATE.get(classification.state, Deletable.NO)
-        if path in known.saved:
-            deletable = Deletable.SAVED
-        elif deletable is Deletable.YES and is_carried(path):
-            deletable = Deletable.NO
-        return _Entry(classification, known.files[path].stamp, bag, deletable)
+        return state is not FileState.UNREAD
 
     def _saved(self, known: KnownBags) -> tuple[StoredFile, ...]:
         """Returns the files of moments, each once."""
@@ -232,7 +203,7 @@ class Inventory:
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         except OSError:
             device = -1
-        stamps = {known.files[path].stamp.inode: known.files[path].stamp for path in known.saved}
+        stamps = {stamp.inode: stamp for stamp in known.saved.values()}
         return tuple(_file(device, stamp) for stamp in stamps.values())
 
     def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
@@ -254,22 +225,19 @@ class Inventory:
 
     def _span(self, bag: BagFile) -> tuple[Ns, Ns]:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
-        spans = [
-            (topic.first, topic.last)
-            for topic in bag.summary.topics
-            if not self._is_received_again(topic)
-        ]
-        if not spans:
+        dating = [topic for topic in bag.summary.topics if not self._is_received_again(topic)]
+        if not dating:
             return _UNDATED
-        start, end = min(first for first, _ in spans), max(last for _, last in spans)
+        start, end = min(topic.first for topic in dating), max(topic.last for topic in dating)
         # The bag's own numbers where they are equal, which take no memory.
         return bag.start if start == bag.start else start, bag.end if end == bag.end else end
 
     def _is_received_again(self, topic: TopicSummary) -> bool:
         """Whether all messages of a topic in a bag may be repeated by each recording."""
-        pace = Pace(TopicTotals(topic.first, topic.last, topic.count), topic.first, topic.last)
-        rare = topic.latched and pace.is_rare
-        return rare or topic.topic in self._static_topics
+        if topic.topic in self._static_topics:
+            return True
+        totals = TopicTotals(topic.first, topic.last, topic.count)
+        return topic.latched and Pace(totals, topic.first, topic.last).is_rare
 
     def _folder(self, path: str, now: Ns) -> _Folder:
         known = self._folders.get(path)

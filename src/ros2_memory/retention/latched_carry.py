@@ -4,7 +4,7 @@ A latched message is valid until the next one, so an answer about today may need
 ago: a transform of `/tf_static` is only in the split in which it was received. Messages that are
 still needed are therefore copied into one small bag, `latched/carried.mcap`, before their split is
 deleted. Nothing of a message changes but its file, so that answers stay the same to the nanosecond;
-its channel records from which recordings it came (see `bag_dir.carried_origin`).
+its channel records from which recordings it came (see `Origin`).
 
 These messages are needed, of those that would otherwise be gone:
 
@@ -21,22 +21,22 @@ A superseded message is left out when the bag is written the next time, so the b
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from bisect import bisect_left
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.bag_dir.carried_origin import Origin, origin_of, with_origin
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -44,14 +44,49 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.storage.base import BagReader, BagWriter, Record
+    from ros2_memory.storage.base import BagReader, BagWriter, Channel, Record
 
 RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
+_RECORDINGS: Final = "ros2_memory_recordings"
+_OFTEN: Final = "ros2_memory_often"
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where a carried message came from.
+
+    Attributes:
+        recordings: folders, relative to the bag directory, of the recordings that received it: the
+            first one, and those that still had bags when their own copy was deleted.
+        often: whether the first one had messages of the topic often, so that it is not latched.
+    """
+
+    recordings: tuple[str, ...]
+    often: bool
+
+
+def with_origin(record: Record, origin: Origin) -> Record:
+    """Returns the message with its origin in place of any that its channel names."""
+    channel = record.channel
+    rest = tuple(each for each in channel.metadata if each[0] not in {_RECORDINGS, _OFTEN})
+    new = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
+    return record._replace(channel=replace(channel, metadata=(*rest, *new)))
+
+
+def origin_of(channel: Channel) -> Origin | None:
+    """Returns the origin of a carried message; None where its channel names none."""
+    metadata = dict(channel.metadata)
+    try:
+        recordings = json.loads(metadata.get(_RECORDINGS, "null"))
+    except ValueError:
+        return None
+    if not isinstance(recordings, list) or not recordings:
+        return None
+    return Origin(tuple(map(str, recordings)), metadata.get(_OFTEN) == "true")
 
 
 class MessageIdentity(NamedTuple):

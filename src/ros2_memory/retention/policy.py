@@ -29,8 +29,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import accumulate, islice
-from operator import attrgetter, eq
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -72,10 +71,7 @@ class RetentionLimits:
 
 
 class StoredFile(NamedTuple):
-    """One file of a bag. Files that share an inode (device and number) count once.
-
-    `size` is what the budget counts.
-    """
+    """One file of a bag, by its inode (device and number); `size` is what the budget counts."""
 
     inode: tuple[int, int]
     size: int
@@ -110,6 +106,15 @@ class StoredBag(NamedTuple):
     def has_dates(self) -> bool:
         """Whether it has messages by which it can be dated."""
         return self.start <= self.end
+
+    @property
+    def date(self) -> Ns:
+        """The log time of the last message that dates it, else when its file was written."""
+        return self.end if self.has_dates else self.written
+
+    def dated(self, at: Ns) -> StoredBag:
+        """Returns it with another date."""
+        return self._replace(start=at, end=at) if self.has_dates else self._replace(written=at)
 
     @property
     def file(self) -> StoredFile:
@@ -215,88 +220,69 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
 
 def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPlan, int | None]:
     """Returns a plan, and how much of the disk is free after it."""
-    plan = _Plan(stock)
-    total = plan.total
+    left = _Left(stock)
+    total = left.total
     eras = _eras(stock, limits)
     old = _ages(stock, eras, limits.max_age_ns)
     aged = old.by_dates if stock.synchronised else old.by_recording
     aged -= stock.needed | stock.unshipped
-    if not aged and plan.fits(limits):
-        return DeletionPlan((), total, fits=True), plan.free
-    order = _oldest_first(stock, limits, eras[-1] if eras else [], shared=plan.shared)
-    # Deleting a bag that shares a file with the one that stays would free nothing.
-    staying = _inodes(_newest(order, eras))
-    to_delete: set[str] = set()
+    if not aged and left.fits(limits):
+        return DeletionPlan((), total, fits=True), left.free
+    order = _oldest_first(stock, limits, eras[-1] if eras else [])
+    # What stays: the newest dated bag, else the last written one with messages.
+    dated = eras[-1] if eras else [bag for bag in order if bag.has_dates]
+    newest = (
+        max(dated, key=attrgetter("end", "path")) if eras else next(reversed(dated or order), None)
+    )
+    going = {bag.path for bag in order if bag.path in aged and bag is not newest}
     for bag in order:
-        if bag.path in aged and staying.isdisjoint(_inodes(bag)):
-            to_delete.add(bag.path)
-            plan.delete(bag)
+        if bag.path in going:
+            left.delete(bag)
     for bag in order:
-        if plan.fits(limits):
+        if left.fits(limits):
             break
-        if bag.path not in aged and staying.isdisjoint(_inodes(bag)) and plan.frees(bag):
-            to_delete.add(bag.path)
-            plan.delete(bag)
-    deleted = tuple(bag for bag in order if bag.path in to_delete)
-    return DeletionPlan(deleted, total, fits=plan.fits(limits)), plan.free
+        if bag.path not in aged and bag is not newest and left.frees(bag):
+            going.add(bag.path)
+            left.delete(bag)
+    deleted = tuple(bag for bag in order if bag.path in going)
+    return DeletionPlan(deleted, total, fits=left.fits(limits)), left.free
 
 
-class _Plan:
+class _Left:
     """Counts what is left when some bags are deleted."""
 
     def __init__(self, stock: RetentionStock) -> None:
-        # A file of a moment stays when every other name of it is deleted.
-        self._saved = {each.inode for each in stock.saved}
-        self.shared = _may_share(stock)
-        self._links: Counter[tuple[int, int]] = Counter()
-        if self.shared:
-            self._links.update(each.inode for bag in stock.bags for each in bag.files)
-            sizes = {each.inode: each.size for bag in stock.bags for each in bag.files}
-            sizes.update((each.inode, each.size) for each in stock.saved)
-            total = sum(sizes.values())
-        else:
-            total = sum(each.size for each in stock.saved) + sum(bag.size for bag in stock.bags)
+        # A file of a moment counts once, and stays when its other name is deleted.
+        self._saved = {file.inode for file in stock.saved}
         self._bags_in = Counter(bag.recording for bag in stock.bags)
         self._sidecars = stock.sidecars
-        self.total = stock.other_bytes + total + sum(stock.sidecars.values())
+        bags = sum(file.size for bag in stock.bags for file in self._freed_by(bag))
+        saved = sum(file.size for file in stock.saved)
+        self.total = stock.other_bytes + saved + bags + sum(stock.sidecars.values())
         self.free = stock.free_bytes
 
-    def delete(self, bag: StoredBag) -> None:
-        """Takes one bag away."""
-        for each in bag.files:
-            self._links[each.inode] -= 1
-            if self._links[each.inode] <= 0 and each.inode not in self._saved:
-                self._release(each.size, each.disk)
-        self._bags_in[bag.recording] -= 1
-        if not self._bags_in[bag.recording]:
-            size = self._sidecars.get(bag.recording, 0)
-            self._release(size, size)
+    def _freed_by(self, bag: StoredBag) -> list[StoredFile]:
+        return [file for file in bag.files if file.inode not in self._saved]
 
     def frees(self, bag: StoredBag) -> bool:
         """Whether deleting a bag frees any of its files."""
-        return not self._saved or any(each.inode not in self._saved for each in bag.files)
+        return bool(self._freed_by(bag))
+
+    def delete(self, bag: StoredBag) -> None:
+        """Takes one bag away."""
+        freed = [(file.size, file.disk) for file in self._freed_by(bag)]
+        self._bags_in[bag.recording] -= 1
+        if not self._bags_in[bag.recording]:
+            freed.append((self._sidecars.get(bag.recording, 0),) * 2)
+        for size, disk in freed:
+            self.total -= size
+            if self.free is not None:
+                self.free += disk
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""
         enough = self.free is None or self.free >= limits.min_free_bytes
         return enough and self.total <= limits.max_total_bytes
-
-    def _release(self, size: int, disk: int) -> None:
-        self.total -= size
-        if self.free is not None:
-            self.free += disk
-
-
-def _may_share(stock: RetentionStock) -> bool:
-    """Returns whether several names may lead to one file: by the numbers of their inodes.
-
-    Most often none do, and finding that out takes little memory.
-    """
-    inodes = [bag.inode for bag in stock.bags]
-    inodes += [each.inode[1] for each in stock.saved]
-    inodes.sort()
-    several = any(bag.second is not None for bag in stock.bags)
-    return several or any(map(eq, inodes, islice(inodes, 1, None)))
 
 
 def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
@@ -309,38 +295,25 @@ def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
         return stock
     newest: dict[str, Ns] = {}
     for bag in _dated(stock, limits):
-        if bag.end > newest.get(bag.recording, MIN_NS):
-            newest[bag.recording] = bag.end
+        newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     names = sorted(stock.places, key=stock.places.__getitem__)
-    latest = [newest.get(name, MIN_NS) for name in names]
-    reached = dict(zip(names, accumulate(latest, max, initial=MIN_NS), strict=False))
+    since, least = {**stock.recorded_since}, MAX_NS
+    reached, latest = dict[str, Ns](), MIN_NS
+    for name in names:
+        reached[name] = latest  # by the recordings before it
+        latest = max(latest, newest.get(name, MIN_NS))
+        if name in since:
+            least = since[name] = min(least, since[name])
     instead: dict[str, Ns] = {}
-    following = max(latest)
     for name in reversed(names):
         if reached[name] <= newest.get(name, MIN_NS):
-            following = newest.get(name, following)
-        instead[name] = following
+            latest = newest.get(name, latest)
+        instead[name] = latest
     bags = [
-        _dated_anew(bag, instead[bag.recording])
-        if _date_of(bag) < reached.get(bag.recording, MIN_NS)
-        else bag
+        bag.dated(instead[bag.recording]) if bag.date < reached.get(bag.recording, MIN_NS) else bag
         for bag in stock.bags
     ]
-    since = stock.recorded_since
-    counted = [name for name in names if name in since]
-    least = accumulate((since[name] for name in counted), min)
-    return replace(
-        stock, bags=bags, recorded_since={**since, **dict(zip(counted, least, strict=True))}
-    )
-
-
-def _date_of(bag: StoredBag) -> Ns:
-    """Returns the log time of the last message that dates a bag, else when its file was written."""
-    return bag.end if bag.has_dates else bag.written
-
-
-def _dated_anew(bag: StoredBag, at: Ns) -> StoredBag:
-    return bag._replace(start=at, end=at) if bag.has_dates else bag._replace(written=at)
+    return replace(stock, bags=bags, recorded_since=since)
 
 
 _Era: TypeAlias = "list[StoredBag]"
@@ -401,29 +374,11 @@ def _aged(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[st
     return aged
 
 
-def _oldest_first(
-    stock: RetentionStock, limits: RetentionLimits, present: _Era, *, shared: bool
-) -> list[StoredBag]:
-    """Sorts all bags, oldest first.
-
-    A bag that shares a file counts as old as the newest that does: deleting it earlier frees
-    nothing.
-    """
+def _oldest_first(stock: RetentionStock, limits: RetentionLimits, present: _Era) -> list[StoredBag]:
+    """Sorts all bags, oldest first."""
     odd = _without(stock.bags, present)
     keys = {bag.path: _written(bag, stock.now, limits) for bag in odd}
-    if shared:
-        keys.update((bag.path, (bag.end, bag.end)) for bag in present)
-        newest: dict[tuple[int, int], tuple[Ns, Ns]] = {}
-        for bag in stock.bags:
-            key = keys[bag.path]
-            for each in bag.files:
-                newest[each.inode] = max(key, newest.get(each.inode, key))
-        keys = {bag.path: max(newest[each.inode] for each in bag.files) for bag in stock.bags}
-    # One key after the other, the last one first: pairs of them would take much memory.
-    order = sorted(stock.bags, key=attrgetter("path"))
-    for part in (1, 0):
-        order.sort(key=lambda bag: keys[bag.path][part] if bag.path in keys else bag.end)
-    return order
+    return sorted(stock.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path))
 
 
 def _without(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
@@ -444,15 +399,3 @@ def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
         return (MAX_NS if bag.written < FIRST_BAGS_NS else bag.written), bag.written
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     return (MIN_NS if bag.written > now + longest else bag.written), bag.written
-
-
-def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
-    """Returns the bag that stays: the newest dated one, else the last written with messages."""
-    if eras:
-        return max(eras[-1], key=attrgetter("end", "path"))
-    candidates = [bag for bag in order if bag.has_dates] or order
-    return candidates[-1] if candidates else None
-
-
-def _inodes(bag: StoredBag | None) -> set[tuple[int, int]]:
-    return set() if bag is None else {each.inode for each in bag.files}

@@ -1,4 +1,4 @@
-"""Repairs bags that a crash left open: each keeps its name and is whole afterwards.
+"""Rewrites bags in place: those that a crash left open, and those of which messages go.
 
 A file of 0 bytes is removed: nothing had reached the disk. A truncated file is rewritten beside
 itself from all that can be read of it, read back, compared and flushed. Only then does it take the
@@ -9,22 +9,27 @@ from __future__ import annotations
 
 import os
 import stat
-from contextlib import suppress
+from collections import Counter
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention.rewriting import beside, give_attributes
-from ros2_memory.storage.base import Closing
+from ros2_memory.retention.delete import repair_name
+from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Mapping
 
-    from ros2_memory.storage.base import BagReader, BagWriter, Rewritten
+    from ros2_memory.core.timebase import Ns
+
+Identity = tuple[int, int]
+_CONTENT: Final = ("st_ino", "st_size", "st_mtime_ns")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,9 +79,7 @@ class Repairer:
             BagError: it cannot be repaired, and is unchanged.
         """
         try:
-            with directories.opened(self._root, path.parent.absolute()) as folder:
-                # The open directory itself, even if something else takes its name meanwhile.
-                here = Path(f"/proc/self/fd/{folder}", path.name)
+            with opened_folder(self._root, path.absolute()) as here:
                 return self._repair(here, path, progress)
         except BagError as error:
             # With the name of the file in place of that of the open directory.
@@ -103,18 +106,113 @@ class Repairer:
             return Repaired(0)
         if self._reader.closing(path) is Closing.CLOSED:
             return None
-        return self._rewrite(here, before, progress)
-
-    def _rewrite(
-        self, path: Path, before: os.stat_result, progress: Callable[[int], None] | None
-    ) -> Repaired:
-        with beside(path) as new:
-            rewritten = self._writer.rewrite(path, new, progress)
+        with beside(here) as new:
+            rewritten = self._writer.rewrite(here, new, progress)
             give_attributes(new, before, before.st_mtime_ns)
-            _require_same(path, before)
-            new.replace(path)
-        flush(path.parent)
-        return Repaired(before.st_size, path.stat().st_size, rewritten)
+            after = _status(here)
+            if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
+                raise BagError(str(here), "it was written to while it was being repaired")
+            new.replace(here)
+        flush(here.parent)
+        return Repaired(before.st_size, here.stat().st_size, rewritten)
+
+
+@contextmanager
+def opened_folder(root: Path, path: Path) -> Iterator[Path]:
+    """Yields the path of a file in its open folder, even if another takes that one's name.
+
+    Raises:
+        OSError: the folder cannot be opened, or lies behind a link below the root.
+    """
+    with directories.opened(root, path.parent) as folder:
+        yield Path(f"/proc/self/fd/{folder}", path.name)
+
+
+@contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Yields a name beside a bag for its new content; nothing has that name after the block.
+
+    Raises:
+        OSError: what an interrupted block left under that name cannot be deleted.
+    """
+    new = path.with_name(repair_name(path.name))
+    new.unlink(missing_ok=True)
+    try:
+        yield new
+    finally:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
+
+
+def give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:
+    """Gives a file the mode and, where that is allowed, the owner of another; and its times."""
+    new.chmod(stat.S_IMODE(before.st_mode))
+    with suppress(OSError):
+        os.chown(new, before.st_uid, before.st_gid)
+    os.utime(new, ns=(before.st_atime_ns, mtime_ns))
+
+
+@contextmanager
+def rewritten(
+    bag_dir: Path,
+    path: Path,
+    before: os.stat_result,
+    writer: BagWriter,
+    *,
+    takes: Callable[[str, Ns, Ns], bool],
+    expected: Counter[str],
+    left_of: Mapping[str, Counter[str]],
+) -> Iterator[Path]:
+    """Yields the new file, beside the old one; it takes the name of the old one after the block.
+
+    Args:
+        bag_dir: the bag directory, behind no link in which the file must lie.
+        path: the old file.
+        before: its status; the file must still be the same at the end.
+        writer: rewrites it.
+        takes: whether a message goes, by topic, log time and publish time.
+        expected: how many messages go, by topic.
+        left_of: what every file of the recording holds afterwards, see `recounted`.
+
+    Raises:
+        EpisodicError: it cannot be rewritten; nothing is changed.
+        OSError: likewise, or it is another file now.
+    """
+    with opened_folder(bag_dir, path) as here, beside(here) as new:
+        taken = writer.cut(here, new, takes, lambda text: recounted(text, left_of))
+        if taken != expected:
+            raise BagError(str(path), "its contents changed meanwhile")
+        # A nanosecond later: nobody may take the new file for the old one.
+        give_attributes(new, before, before.st_mtime_ns + 1)
+        yield new
+        replace_file(new, here, (before.st_dev, before.st_ino))
+
+
+def replace_file(new: Path, path: Path, inode: Identity) -> None:
+    """Gives a file the name of another, which must still be the one that was read.
+
+    Raises:
+        OSError: it is not, or has gone.
+    """
+    status = path.lstat()
+    if (status.st_dev, status.st_ino) != inode:
+        raise OSError(f"{path.name} is not the file that was read")
+    new.replace(path)
+    flush(path.parent)
+
+
+def left_in(
+    recording: Path, reader: BagReader, gone: Mapping[Path, Counter[str]]
+) -> dict[str, Counter[str]]:
+    """Returns how many messages of each topic are left in each file that can be read, by name."""
+    files: dict[str, Counter[str]] = {}
+    for path in filter(lambda each: bag_kind(each.name), recording.iterdir()):
+        with suppress(BagError):
+            counts = Counter[str]()
+            for topic in reader.summarize(path).topics:
+                counts[topic.topic] += topic.count
+            files[bare_name(path.name)] = counts - gone.get(path, Counter())
+    return files
 
 
 def open_files() -> frozenset[tuple[int, int]]:
@@ -140,10 +238,3 @@ def _status(path: Path) -> os.stat_result:
     if not stat.S_ISREG(status.st_mode):
         raise BagError(str(path), "not a regular file")
     return status
-
-
-def _require_same(path: Path, before: os.stat_result) -> None:
-    after = _status(path)
-    for each in ("st_ino", "st_size", "st_mtime_ns"):
-        if getattr(after, each) != getattr(before, each):
-            raise BagError(str(path), "it was written to while it was being repaired")

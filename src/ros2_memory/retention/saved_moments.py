@@ -14,7 +14,7 @@ import os
 import re
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -26,27 +26,26 @@ from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
+    Outcome,
+    RequestQueue,
     SavedMoment,
+    SaveRequest,
     StoredMoment,
     make_moment_folder,
     moments_of,
     stored_moments_in,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import Outcome, RequestQueue
 from ros2_memory.core import directories
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, iso_local
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from ros2_memory.bag_dir.moment_file import SaveRequest
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
 
 REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
@@ -70,9 +69,9 @@ class NeededBags(NamedTuple):
     waits: bool
 
 
-def window_of(start: Ns, end: Ns) -> TimeWindow:
-    """Returns the window of a moment from `start` to `end`, both included."""
-    return TimeWindow(start, min(end + 1, MAX_NS))
+def window_of(request: SaveRequest) -> TimeWindow:
+    """Returns the window of a moment, both ends included."""
+    return TimeWindow(request.start, min(request.end + 1, MAX_NS))
 
 
 def needed_bags(
@@ -104,47 +103,49 @@ def needed_bags(
     return NeededBags(tuple(ready), waits and abs(now - asked) < LONGEST_WAIT_NS)
 
 
-def fitting(
-    files: Iterable[tuple[int, int]], stored: Mapping[int, int], share: int
-) -> dict[int, int]:
-    """Adds files in their order to those that moments store, as long as the share has room.
+@dataclass(slots=True)
+class Share:
+    """What some moments may store together.
 
-    Args:
-        files: inodes and sizes (bytes).
-        stored: what moments store, by inode, in bytes.
-        share: how many bytes they may store.
+    Attributes:
+        most: how much, in bytes.
+        key: the setting that says so.
+        stored: what they store, by inode, in bytes.
     """
-    taken = dict(stored)
-    total = sum(taken.values())
-    for inode, size in files:
-        if inode not in taken and total + size <= share:
-            taken[inode] = size
-            total += size
-    return taken
 
+    most: int
+    key: str = _SHARE
+    stored: dict[int, int] = field(default_factory=dict)
 
-def no_room(
-    files: Iterable[tuple[int, int]],
-    stored: Mapping[int, int],
-    share: int,
-    expected: int = 0,
-    key: str = _SHARE,
-) -> str | None:
-    """Describes why a moment is refused for want of room; None if all of its files fit.
+    def take(self, inode: int, size: int) -> bool:
+        """Adds a file if there is room for it; returns whether it is among those stored."""
+        if inode not in self.stored and sum(self.stored.values()) + size <= self.most:
+            self.stored[inode] = size
+        return inode in self.stored
 
-    `files`, `stored` and `share` as for `fitting`; `expected` are the bytes of open files, `key`
-    names the setting that limits them.
-    """
-    used = sum(stored.values())
-    new = {inode: size for inode, size in files if inode not in stored}
-    more = sum(new.values()) + expected
-    if used + more <= share:
-        return None
-    return (
-        f"moments may take {share / GB:.3g} GB, {used / GB:.3g} GB of that are "
-        f"used, and this one takes {more / GB:.3g} GB more; delete folders in moments/ of the bag "
-        f"directory, raise {key}, or ask for fewer seconds"
-    )
+    def refusal(self, files: Iterable[tuple[int, int]], expected: int = 0) -> str | None:
+        """Describes why a moment is refused for want of room; None if all of its files fit.
+
+        Args:
+            files: inodes and sizes (bytes).
+            expected: the bytes of open files.
+        """
+        used = sum(self.stored.values())
+        new = {inode: size for inode, size in files if inode not in self.stored}
+        more = sum(new.values()) + expected
+        if used + more <= self.most:
+            return None
+        return (
+            f"moments may take {self.most / GB:.3g} GB, {used / GB:.3g} GB of that are "
+            f"used, and this one takes {more / GB:.3g} GB more; delete folders in moments/ of the "
+            f"bag directory, raise {self.key}, or ask for fewer seconds"
+        )
+
+    @property
+    def exhausted(self) -> str:
+        """What is said of a moment of which only part had room."""
+        what = f"the share of moments ({_SHARE})" if self.key == _SHARE else self.key
+        return f"{what} was used up: only part of the moment is saved"
 
 
 def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
@@ -202,18 +203,27 @@ class MomentKeeper:
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        self._remove_unbegun()
-        now = self._clock.now()
-        stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
+        now, stored = self._clock.now(), self._stored()
         for name, moment in stored.items():
             if moment.moment.pending:
                 stored[name] = self._advance(moment, stored, snapshot)
-        numbers = {each.moment.request.number: each for each in stored.values()}
         for request in self._queue.take(now) if self._queue.has_requests() else ():
-            known = numbers.get(request.number)
-            outcome = _outcome_of(known) if known else self._grant(request, stored, snapshot)
+            known: StoredMoment | str | None = _of_number(request, stored)
+            if known is None:
+                try:
+                    known = self._begin(SavedMoment(request), stored, snapshot)
+                except OSError as error:
+                    known = (
+                        f"the bags cannot be saved in {moments_of(self._bag_dir)} by hard links: "
+                        f"{error.strerror or error}"
+                    )
+            if isinstance(known, str):
+                _log.warning("moment_refused", label=request.label, reason=known)
+                outcome = Outcome(refused=known)
+            else:
+                outcome = Outcome(known.folder.name, len(known.files), known.moment.pending)
             self._queue.answer(request, outcome)
-        self._waiting = any(each.moment.pending for each in stored.values())
+        self._waiting = any(moment.moment.pending for moment in stored.values())
 
     def keep_for_rule(
         self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot
@@ -225,28 +235,20 @@ class MomentKeeper:
         Raises:
             OSError: it cannot be stored; the same request may be made again.
         """
-        self._remove_unbegun()
-        stored = {each.folder.name: each for each in stored_moments_in(self._bag_dir)}
+        stored = self._stored()
         wanted = SavedMoment(request, rule=rule, matches=matches)
-        for each in stored.values():
-            known = each.moment
-            if known.request.number != request.number:
-                continue
-            if known.matches < matches or known.request.end < request.end:
-                write_saved_moment(each.folder, replace(wanted, missing=known.missing))
-                extended = StoredMoment(
-                    each.folder, replace(wanted, missing=known.missing), each.files
-                )
-                self._advance(extended, stored, snapshot)
-                self._waiting = True
-            return None
-        need = self._needed(request, snapshot)
-        refused = self._refusal(wanted, need, stored, snapshot)
-        if refused is None:
-            moment = self._begin(wanted, need)
+        known = _of_number(request, stored)
+        if known is None:
+            begun = self._begin(wanted, stored, snapshot)
+            if isinstance(begun, str):
+                return begun
             self._waiting = True
-            _log.info("moment_kept", folder=moment.folder.name, bags=len(moment.files), rule=rule)
-        return refused
+        elif known.moment.matches < matches or known.moment.request.end < request.end:
+            extended = known._replace(moment=replace(wanted, missing=known.moment.missing))
+            write_saved_moment(extended.folder, extended.moment)
+            self._advance(extended, stored, snapshot)
+            self._waiting = True
+        return None
 
     def update_sidecars(self) -> None:
         """Links the sidecars of recordings again that were rewritten; a fault is reported.
@@ -264,153 +266,127 @@ class MomentKeeper:
             except OSError as error:
                 _log.error("moment_not_followed", path=root, reason=str(error))
 
-    def _grant(
-        self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
-    ) -> Outcome:
-        """Begins a moment and adds it to `stored`, or refuses it."""
-        need = self._needed(request, snapshot)
-        refused = self._refusal(SavedMoment(request), need, stored, snapshot)
-        if refused is None:
-            try:
-                moment = self._begin(SavedMoment(request), need)
-            except OSError as error:
-                refused = (
-                    f"the bags cannot be saved in {moments_of(self._bag_dir)} by hard links: "
-                    f"{error.strerror or error}"
-                )
-            else:
-                stored[moment.folder.name] = moment
-                _log.info("moment_kept", folder=moment.folder.name, bags=len(moment.files))
-                return _outcome_of(moment)
-        _log.warning("moment_refused", label=request.label, reason=refused)
-        return Outcome(refused=refused)
+    def _stored(self) -> dict[str, StoredMoment]:
+        """Returns the moments by the names of their folders."""
+        self._remove_unbegun()
+        return {moment.folder.name: moment for moment in stored_moments_in(self._bag_dir)}
 
-    def _refusal(
-        self,
-        moment: SavedMoment,
-        need: NeededBags,
-        stored: dict[str, StoredMoment],
-        snapshot: Snapshot,
-    ) -> str | None:
-        group = self._group(moment, stored)
-        most = MAX_MOMENTS // (1 + len(self._rule_bytes))
-        if len(group) >= most:
+    def _begin(
+        self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
+    ) -> StoredMoment | str:
+        """Begins a moment and adds it to `stored`, or returns why it is refused."""
+        need = self._needed(begun.request, snapshot)
+        group = self._group(begun, stored)
+        if len(group) >= MAX_MOMENTS // (1 + len(self._rule_bytes)):
             return (
                 f"there are {len(group)} moments, the maximum; delete folders in "
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
             return "nothing was recorded then: ask for a time at which something was"
-        files = filter(None, (_file_of(bag.path) for bag in need.bags))
-        expected = self._open_bytes(moment.request, snapshot) if need.waits else 0
-        share, key = self._share_of(moment)
-        return no_room(files, _all_files(group), share, expected, key)
-
-    def _group(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> list[StoredMoment]:
-        """Returns the moments that share a limit with one: of its rule, or of no configured one."""
-        rule = moment.rule if moment.rule in self._rule_bytes else None
-        return [
-            each
-            for each in stored.values()
-            if (each.moment.rule if each.moment.rule in self._rule_bytes else None) == rule
+        window = window_of(begun.request)
+        # Those that may belong to the moment, as large as they are now.
+        growing = [
+            size_of(aside.path)
+            for aside in snapshot.active
+            if need.waits and _may_overlap(snapshot.unread_spans[aside], window)
         ]
-
-    def _share_of(self, moment: SavedMoment) -> tuple[int, str]:
-        """Returns how much such moments may take together, in bytes, and the key that sets it."""
-        if moment.rule is not None and moment.rule in self._rule_bytes:
-            return self._rule_bytes[moment.rule], f"max_gb of the rule {moment.rule}"
-        return max(self._share - sum(self._rule_bytes.values()), 0), _SHARE
-
-    def _begin(self, begun: SavedMoment, need: NeededBags) -> StoredMoment:
+        share = self._share_of(begun, group)
+        files = filter(None, (_file_of(bag.path) for bag in need.bags))
+        refused = share.refusal(files, sum(growing))
+        if refused is not None:
+            return refused
         folder = make_moment_folder(self._bag_dir, begun.request)
         try:
             write_saved_moment(folder, begun)
-            missing, files = self._link(folder, need.bags, None)
-            missing = (*missing, *_holes(begun, need))
-            moment = replace(begun, pending=need.waits, missing=missing)
-            if moment != begun:
-                write_saved_moment(folder, moment)
+            links = self._link(folder, need.bags, share)
+            made = _linked(StoredMoment(folder, begun, {}), need, *links)
+            if made.moment != begun:
+                write_saved_moment(folder, made.moment)
         except OSError:
             directories.remove(folder)
             raise
         flush(folder.parent)
-        return StoredMoment(folder, moment, files)
+        stored[folder.name] = made
+        if begun.rule is None:
+            _log.info("moment_kept", folder=folder.name, bags=len(made.files))
+        else:
+            rule = begun.rule
+            _log.info("moment_kept", folder=folder.name, bags=len(made.files), rule=rule)
+        return made
 
     def _advance(
-        self, stored: StoredMoment, all_stored: Mapping[str, StoredMoment], snapshot: Snapshot
+        self, before: StoredMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment:
         """Continues a pending moment; its file lists what cannot be kept."""
-        before = stored.moment
-        need = self._needed(before.request, snapshot)
-        share, key = self._share_of(before)
-        files = _all_files(self._group(before, all_stored))
+        need = self._needed(before.moment.request, snapshot)
+        share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
-            missing, linked = self._link(stored.folder, need.bags, (files, share, key))
+            after = _linked(before, need, *self._link(before.folder, need.bags, share))
         except OSError as error:
-            missing, linked = (f"not all can be saved: {error.strerror or error}",), {}
-        missing = tuple(dict.fromkeys((*before.missing, *missing, *_holes(before, need))))
-        after = replace(before, pending=need.waits, missing=missing)
-        files_now = {**stored.files, **linked}
-        if after != before:
+            after = _linked(before, need, [f"not all can be saved: {error.strerror or error}"], {})
+        if after.moment != before.moment:
             try:
-                write_saved_moment(stored.folder, after)
+                write_saved_moment(after.folder, after.moment)
             except OSError as error:
-                _log.error("moment_not_written", folder=str(stored.folder), reason=str(error))
-                return StoredMoment(stored.folder, before, files_now)
-            if not after.pending:
-                _log.info("moment_complete", folder=stored.folder.name, missing=list(missing))
-        return StoredMoment(stored.folder, after, files_now)
+                _log.error("moment_not_written", folder=str(after.folder), reason=str(error))
+                return after._replace(moment=before.moment)
+            if not after.moment.pending:
+                missing = list(after.moment.missing)
+                _log.info("moment_complete", folder=after.folder.name, missing=missing)
+        return after
+
+    def _group(self, moment: SavedMoment, stored: Mapping[str, StoredMoment]) -> list[StoredMoment]:
+        """Returns the moments that share a limit with one: of its rule, or of no configured one."""
+        rule = self._rule_of(moment)
+        return [other for other in stored.values() if self._rule_of(other.moment) == rule]
+
+    def _rule_of(self, moment: SavedMoment) -> str | None:
+        return moment.rule if moment.rule in self._rule_bytes else None
+
+    def _share_of(self, moment: SavedMoment, group: Sequence[StoredMoment]) -> Share:
+        """Returns what such moments, of which there are these, may take together."""
+        stored = {inode: size for other in group for inode, size in other.files.items()}
+        rule = self._rule_of(moment)
+        if rule is not None:
+            return Share(self._rule_bytes[rule], f"max_gb of the rule {rule}", stored)
+        return Share(max(self._share - sum(self._rule_bytes.values()), 0), _SHARE, stored)
 
     def _needed(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
-        window = window_of(moment.start, moment.end)
+        window = window_of(moment)
         open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
         bags = snapshot.timeline.overlapping(window)
         return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
-    def _open_bytes(self, request: SaveRequest, snapshot: Snapshot) -> int:
-        """Returns the present size of the open files that may belong to the moment, in bytes."""
-        window = window_of(request.start, request.end)
-        return sum(
-            size_of(aside.path)
-            for aside in snapshot.active
-            if _may_overlap(snapshot.unread_spans[aside], window)
-        )
-
     def _link(
-        self,
-        folder: Path,
-        bags: Sequence[BagFile],
-        limit: tuple[Mapping[int, int], int, str] | None,
-    ) -> tuple[tuple[str, ...], dict[int, int]]:
-        """Links bags into a moment's folder.
+        self, folder: Path, bags: Sequence[BagFile], share: Share
+    ) -> tuple[Iterable[str], dict[int, int]]:
+        """Links bags into a moment's folder, as far as the share has room for them.
 
-        Returns why some could not be linked, and the sizes of the links by inode. `limit`, where
-        there is one, is what moments that share it store, how much they may, and what says so.
+        Returns why some could not be linked, and the sizes of the links by inode.
 
         Raises:
             OSError: a link cannot be made.
         """
         missing: dict[str, None] = {}
         linked: dict[int, int] = {}
-        files = [_file_of(bag.path) for bag in bags]
-        allowed = None if limit is None else fitting(filter(None, files), limit[0], limit[1])
         linking: defaultdict[Path, list[tuple[Path, tuple[int, int]]]] = defaultdict(list)
-        for bag, file in zip(bags, files, strict=True):
+        for bag in bags:
             name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
-            target = folder / name
+            target, file = folder / name, _file_of(bag.path)
             if file is None:
                 # `forget` deletes in another process, since the index was made.
                 if not target.exists():
                     missing[_gone(name)] = None
-            elif limit is not None and allowed is not None and file[0] not in allowed:
-                missing[_used_up(limit[2])] = None
-            else:
+            elif share.take(*file):
                 linking[target.parent].append((bag.path, file))
+            else:
+                missing[share.exhausted] = None
         for parent, here in linking.items():
             directories.make(self._bag_dir, parent)
             # Listed first, so that `forget`, in another process, knows whose the new links are.
             free = (
-                each.name for each, file in here if _file_of(parent / each.name) in {None, file}
+                path.name for path, file in here if _file_of(parent / path.name) in {None, file}
             )
             self._own.hold(parent, free)
             for recorded, file in here:
@@ -421,7 +397,7 @@ class MomentKeeper:
                 else:
                     missing[_gone(str(target.relative_to(folder)))] = None
             flush(parent)
-        return tuple(missing), linked
+        return missing, linked
 
     def _remove_unbegun(self) -> None:
         """Removes files of a moment that a crash interrupted before it started."""
@@ -451,25 +427,25 @@ def _gone(name: str) -> str:
     return f"{name} is missing, or another file has its name"
 
 
-def _used_up(key: str) -> str:
-    what = f"the share of moments ({key})" if key == _SHARE else key
-    return f"{what} was used up: only part of the moment is saved"
+def _of_number(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
+    """Returns the moment that a request has already."""
+    return next(
+        (moment for moment in stored.values() if moment.moment.request.number == request.number),
+        None,
+    )
 
 
-def _holes(moment: SavedMoment, need: NeededBags) -> tuple[str, ...]:
-    """Returns what was never recorded of a rule's moment for which no bag is to come."""
-    if moment.rule is None or need.waits:
-        return ()
-    return unrecorded(window_of(moment.request.start, moment.request.end), need.bags)
-
-
-def _all_files(moments: Iterable[StoredMoment]) -> dict[int, int]:
-    """Returns the sizes of all files in moments by inode, so that each counts once."""
-    return {inode: size for each in moments for inode, size in each.files.items()}
-
-
-def _outcome_of(stored: StoredMoment) -> Outcome:
-    return Outcome(stored.folder.name, len(stored.files), stored.moment.pending)
+def _linked(
+    before: StoredMoment, need: NeededBags, missing: Iterable[str], linked: Mapping[int, int]
+) -> StoredMoment:
+    """Returns a moment with new links, and what could not be linked."""
+    moment, holes = before.moment, tuple[str, ...]()
+    # Of a rule's moment for which no bag is to come: what was never recorded of it.
+    if moment.rule is not None and not need.waits:
+        holes = unrecorded(window_of(moment.request), need.bags)
+    missing = dict.fromkeys((*moment.missing, *missing, *holes))
+    after = replace(moment, pending=need.waits, missing=tuple(missing))
+    return StoredMoment(before.folder, after, {**before.files, **linked})
 
 
 def _link_bag(bag: Path, target: Path, inode: int) -> bool:

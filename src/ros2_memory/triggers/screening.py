@@ -50,7 +50,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
-from ros2_memory.retention.rewriting import left_in, rewritten
+from ros2_memory.retention.repair import left_in, rewritten
 from ros2_memory.storage.base import Closing
 from ros2_memory.triggers.exclusion import (
     Cut,

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.request_queue import PendingRequest, RequestQueue
+from ros2_memory.bag_dir.moment_file import PendingRequest, RequestQueue
 from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, build_server
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from ros2_memory.bag_dir.handover_file import (
     Counting,
     CutClock,
-    Exclusion,
     Handover,
     Overlap,
     read_handover,
@@ -102,13 +101,6 @@ class TestCounting:
         in_new = not excluded(new, "b_0.mcap", publish_time, log_times[1])
         assert in_old != in_new
 
-    def test_an_exclusion_is_half_open_in_both_times(self) -> None:
-        window = Exclusion(10, 20, 100, 200)
-        inside = [(10, 100), (19, 199)]
-        outside = [(9, 100), (20, 100), (10, 99), (10, 200)]
-        assert [window.excludes(*each) for each in inside] == [True, True]
-        assert [window.excludes(*each) for each in outside] == [False] * 4
-
 
 class TestFile:
     @given(handover=HANDOVERS)
@@ -129,11 +121,6 @@ class TestFile:
             "rec_1",
             "rec_3",
         )
-
-    def test_it_leaves_nothing_else_behind(self, tmp_path: Path) -> None:
-        write_handover(tmp_path, FULL)
-        write_handover(tmp_path, Handover())
-        assert [path.name for path in tmp_path.iterdir()] == [HANDOVER_FILE]
 
     def test_one_that_cannot_be_written_is_told(self, tmp_path: Path) -> None:
         with pytest.raises(RecorderError, match=r"handover\.json cannot be written"):

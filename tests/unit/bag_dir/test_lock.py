@@ -38,12 +38,6 @@ def test_the_file_says_who_holds_it(tmp_path: Path) -> None:
     lock.release()
 
 
-def test_it_can_be_taken_again_once_released(tmp_path: Path) -> None:
-    BagDirLock.acquire(tmp_path).release()
-    BagDirLock.acquire(tmp_path).release()
-    assert (tmp_path / LOCK_FILE).is_file()
-
-
 def test_a_longer_text_of_the_holder_before_is_replaced_whole(tmp_path: Path) -> None:
     (tmp_path / LOCK_FILE).write_text("x" * 500)
     BagDirLock.acquire(tmp_path).release()
@@ -57,12 +51,6 @@ def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Pa
     os.close(descriptor)
     assert f"process {os.getppid()} on {socket.gethostname()}" in sentence
     assert str(tmp_path) in sentence
-
-
-def test_two_cannot_hold_it(tmp_path: Path) -> None:
-    lock = BagDirLock.acquire(tmp_path)
-    refusal(tmp_path)
-    lock.release()
 
 
 def test_a_holder_on_another_machine_counts_as_alive(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import pytest
 import structlog
 
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
-from ros2_memory.bag_dir.request_queue import (
+from ros2_memory.bag_dir.moment_file import (
     MAX_AT_ONCE,
     STALE_NS,
     Outcome,
@@ -47,13 +47,6 @@ def test_a_request_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> 
     posted.close()
     assert names(tmp_path) == []
     assert not queue.has_requests()
-
-
-def test_a_refusal_is_an_answer(tmp_path: Path) -> None:
-    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
-    [request] = queue.take(T0)
-    queue.answer(request, Outcome(refused="there is no room"))
-    assert posted.outcome() == Outcome(refused="there is no room")
 
 
 def test_a_request_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:

@@ -32,17 +32,6 @@ def _bag(
     return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
 
 
-def test_bags_are_ordered_by_time_and_never_by_name() -> None:
-    bags = [_bag(f"rec/rec_{n}.mcap", ("/odom", n * 10, n * 10 + 9)) for n in range(12)]
-    ordered = Timeline.of(reversed(bags)).bags
-    assert [bag.path.name for bag in ordered] == [f"rec_{n}.mcap" for n in range(12)]
-
-
-def test_ties_are_broken_by_end_and_then_by_path() -> None:
-    bags = [_bag("b", ("/a", 1, 5)), _bag("c", ("/a", 1, 4)), _bag("a", ("/a", 1, 5))]
-    assert [bag.path.name for bag in Timeline.of(bags).bags] == ["c", "a", "b"]
-
-
 def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
     empty = Snapshot()
     assert (empty.earliest, empty.latest, empty.timeline.topics()) == (None, None, ())
@@ -67,11 +56,6 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
     assert Timeline().disk_use == (0, 0)
 
 
-def test_the_latest_message_may_stand_in_a_bag_that_began_earlier() -> None:
-    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 100)), _bag("b", ("/odom", 10, 20)))))
-    assert (snapshot.earliest, snapshot.latest) == (0, 100)
-
-
 def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> None:
     both = _bag("b", ("/x", 10, 19), ("/odom", 10, 19))
     second = replace(both.summary.topics[0], type="std_msgs/msg/String", first=12, last=17)
@@ -85,46 +69,6 @@ def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> No
     ]
     assert snapshot.timeline.types_of("/x") == (ODOM, "std_msgs/msg/String")
     assert snapshot.timeline.types_of("/nothing") == ()
-
-
-def test_a_topic_is_transient_local_where_any_bag_says_so() -> None:
-    snapshot = Snapshot(Timeline.of((_bag("a", ("/tf_static", 0, 0), ("/tf", 0, 9)),)))
-    assert snapshot.timeline.transient_local == {"/tf_static"}
-
-
-def test_heard_topics_come_sorted_without_the_silent_ones() -> None:
-    snapshot = Snapshot(
-        Timeline.of((_bag("a", ("/tf", 0, 9), ("/odom", 0, 9), silent=("/scan",)),))
-    )
-    assert snapshot.timeline.topics() == ("/odom", "/tf")
-
-
-@pytest.mark.parametrize(
-    ("window", "names"),
-    [
-        ((0, 10), ["a"]),
-        ((0, 11), ["a", "b"]),
-        ((9, 10), ["a"]),
-        ((19, 20), ["b"]),
-        ((20, 30), []),
-        ((-5, 0), []),
-        ((5, 5), []),
-        ((-(2**63), 2**63 - 1), ["a", "b"]),
-    ],
-)
-def test_a_window_overlaps_the_bags_that_have_a_moment_in_it(
-    window: tuple[int, int], names: list[str]
-) -> None:
-    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 9)), _bag("b", ("/odom", 10, 19)))))
-    assert [bag.path.name for bag in snapshot.timeline.overlapping(TimeWindow(*window))] == names
-    held = snapshot.timeline.extents("/odom", TimeWindow(*window))
-    assert [bag.path.name for bag, *_ in held] == names
-
-
-def test_a_window_counts_for_a_topic_by_the_times_of_that_topic_alone() -> None:
-    snapshot = Snapshot(Timeline.of((_bag("a", ("/odom", 0, 99), ("/tf_static", 3, 3)),)))
-    assert len([*snapshot.timeline.extents("/tf_static", TimeWindow(3, 4))]) == 1
-    assert [*snapshot.timeline.extents("/tf_static", TimeWindow(4, 99))] == []
 
 
 def test_removing_a_bag_that_is_not_there_is_refused() -> None:

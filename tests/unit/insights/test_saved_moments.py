@@ -12,12 +12,12 @@ import pytest
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
+    PendingRequest,
     SavedMoment,
     SaveRequest,
     make_moment_folder,
     write_saved_moment,
 )
-from ros2_memory.bag_dir.request_queue import PendingRequest
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord, TriggerState
 from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings

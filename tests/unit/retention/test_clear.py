@@ -47,8 +47,11 @@ def test_bags_of_every_kind_go_with_what_lies_beside_them(tmp_path: Path) -> Non
 def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:
     make(tmp_path, "rec_1/rec_1_0.mcap", "rec_1/notes.txt", "map.pgm", "metadata.yaml")
     make(tmp_path, "not_a_bag/metadata.yaml", "not_a_bag/handover.json", "x/recorder.json")
+    make(tmp_path, ".cache/a.mcap", "recorder.lock")
     clear_bags(tmp_path)
     assert left(tmp_path) == [
+        ".cache",
+        ".cache/a.mcap",
         "map.pgm",
         "metadata.yaml",
         "not_a_bag",
@@ -56,21 +59,10 @@ def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -
         "not_a_bag/metadata.yaml",
         "rec_1",
         "rec_1/notes.txt",
+        "recorder.lock",
         "x",
         "x/recorder.json",
     ]
-
-
-def test_the_lock_stays(tmp_path: Path) -> None:
-    make(tmp_path, "recorder.lock", "rec_1/rec_1_0.mcap")
-    clear_bags(tmp_path)
-    assert left(tmp_path) == ["recorder.lock"]
-
-
-def test_hidden_directories_stay(tmp_path: Path) -> None:
-    make(tmp_path, ".cache/a.mcap")
-    clear_bags(tmp_path)
-    assert left(tmp_path) == [".cache", ".cache/a.mcap"]
 
 
 def test_links_are_neither_followed_nor_deleted(tmp_path: Path) -> None:

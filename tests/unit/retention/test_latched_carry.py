@@ -55,6 +55,12 @@ def recording(bag_dir: Path, name: str, *splits: Iterable[Msg]) -> None:
         write_mcap(bag_dir / name / f"{name}_{number}.mcap", messages, LAYOUT)
 
 
+def at_home(bag_dir: Path, splits: int = 2) -> None:
+    """A recording whose first split has a latched message."""
+    odometry = [drive(T0 + n * 10 * S, T0 + (n + 1) * 10 * S) for n in range(splits)]
+    recording(bag_dir, "rec", [docked(T0, "home"), *odometry[0][:-1]], *odometry[1:])
+
+
 def keep_only(bag_dir: Path, *kept: str) -> None:
     """Has all bags deleted but these, which are the newest."""
     sidecars = {(bag_dir / name).with_name("handover.json") for name in kept}
@@ -165,12 +171,7 @@ class TestTheBagOfCarriedMessages:
         assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
 
     def test_it_is_never_deleted_itself(self, tmp_path: Path) -> None:
-        recording(
-            tmp_path,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-        )
+        at_home(tmp_path)
         keep_only(tmp_path, "rec/rec_1.mcap")
         keeper_of(tmp_path, max_bytes=0, max_age_h=0.001).apply()
         assert "latched/carried.mcap" in files_in(tmp_path)
@@ -185,12 +186,7 @@ class TestTheBagOfCarriedMessages:
     def test_a_link_in_its_place_is_not_followed_and_nothing_is_lost(self, tmp_path: Path) -> None:
         bags, elsewhere = tmp_path / "bags", tmp_path / "elsewhere"
         elsewhere.mkdir()
-        recording(
-            bags,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-        )
+        at_home(bags)
         (bags / "latched").symlink_to(elsewhere, target_is_directory=True)
         keeper_of(bags, max_bytes=1).apply()
         assert not list(elsewhere.iterdir())
@@ -205,13 +201,7 @@ class TestTheBagOfCarriedMessages:
             ) -> None:
                 raise BagError(str(path), "it cannot be written: No space left on device")
 
-        recording(
-            tmp_path,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-            drive(T0 + 20 * S, T0 + 30 * S),
-        )
+        at_home(tmp_path, splits=3)
         keeper_of(tmp_path, max_bytes=1, writer=FullDisk()).apply()
         assert files_in(tmp_path) == ["rec", "rec/rec_0.mcap", "rec/rec_2.mcap"]
         keeper_of(tmp_path, max_bytes=1).apply()
@@ -220,14 +210,7 @@ class TestTheBagOfCarriedMessages:
     def test_a_bag_stays_until_nobody_looks_for_latched_messages_in_it(
         self, tmp_path: Path
     ) -> None:
-        recording(
-            tmp_path,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-            drive(T0 + 20 * S, T0 + 30 * S),
-            drive(T0 + 30 * S, T0 + 40 * S),
-        )
+        at_home(tmp_path, splits=4)
         budget = 3 * (tmp_path / "rec/rec_0.mcap").stat().st_size + 1
         keeper_of(tmp_path, max_bytes=budget, grace_s=10**6).apply()
         left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
@@ -240,25 +223,15 @@ class TestTheBagOfCarriedMessages:
         keeper_of(tmp_path, max_bytes=budget, grace_s=0).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
 
-    def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(self, tmp_path: Path) -> None:
-        recording(
-            tmp_path,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-        )
-        keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply()
-        assert "rec/rec_0.mcap" not in files_in(tmp_path)
-        assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
-
-    def test_on_a_full_disk_nothing_is_waited_for(self, tmp_path: Path) -> None:
-        recording(
-            tmp_path,
-            "rec",
-            [docked(T0, "home"), *drive(T0, T0 + 9 * S)],
-            drive(T0 + 10 * S, T0 + 20 * S),
-        )
-        keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(1)
+    @pytest.mark.parametrize("is_full", [False, True])
+    def test_where_no_other_bag_can_go_in_its_place_it_goes_at_once(
+        self, tmp_path: Path, is_full: bool
+    ) -> None:
+        at_home(tmp_path)
+        if is_full:
+            keeper_of(tmp_path, grace_s=10**6, measure_free=lambda _: 0).make_room(1)
+        else:
+            keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
 

@@ -22,17 +22,14 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import (
     LONGEST_WAIT_NS,
     REPAIRED_WITHIN_NS,
     MomentKeeper,
-    fitting,
+    Share,
     needed_bags,
-    no_room,
-    window_of,
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
@@ -384,7 +381,7 @@ def span_of(
 
 
 def window(start: int, end: int) -> TimeWindow:
-    return window_of(AT + start * S, AT + end * S)
+    return TimeWindow(AT + start * S, AT + end * S + 1)
 
 
 class TestWhatIsNeeded:
@@ -429,44 +426,38 @@ class TestWhatIsNeeded:
         carried = span_of(0, 9, name="latched/carried.mcap")
         assert needed_bags(window(0, 5), AT, [carried], [], AT + 60 * S).bags == ()
 
-    def test_a_window_ends_with_time_itself(self) -> None:
-        assert window_of(0, MAX_NS).stop == MAX_NS
-
 
 class TestTheShare:
     def test_a_file_that_is_stored_already_takes_nothing_more(self) -> None:
-        stored = {1: 60}
-        assert no_room([(1, 60), (2, 40)], stored, 100) is None
-        assert no_room([(1, 60), (2, 41)], stored, 100) is not None
-        assert no_room([(2, 40), (2, 40)], stored, 100) is None
-        assert fitting([(1, 60), (2, 40)], stored, 100) == {1: 60, 2: 40}
+        share = Share(100, stored={1: 60})
+        assert share.refusal([(1, 60), (2, 40)]) is None
+        assert share.refusal([(1, 60), (2, 41)]) is not None
+        assert share.refusal([(2, 40), (2, 40)]) is None
+        assert share.take(1, 60)
+        assert share.take(2, 40)
+        assert not share.take(3, 1)
 
     def test_what_is_still_being_written_is_expected(self) -> None:
-        assert no_room([(2, 40)], {}, 100, expected=60) is None
-        assert no_room([(2, 40)], {}, 100, expected=61) is not None
+        assert Share(100).refusal([(2, 40)], expected=60) is None
+        assert Share(100).refusal([(2, 40)], expected=61) is not None
 
     @given(FILES, FILES, st.integers(0, 150))
     def test_what_is_granted_or_fits_never_passes_it(
         self, files: list[tuple[int, int]], before: list[tuple[int, int]], share: int
     ) -> None:
-        stored: dict[int, int] = {}
-        for inode, size in before:
-            if no_room([(inode, size)], stored, share) is None:
-                stored[inode] = size
-        assert sum(stored.values()) <= share
-        if no_room(files, stored, share) is None:
+        moments = Share(share)
+        for file in before:
+            assert (moments.refusal([file]) is None) == moments.take(*file)
+        stored = {**moments.stored}
+        if moments.refusal(files) is None:
             assert sum({**stored, **dict(files)}.values()) <= share
-        taken = fitting(files, stored, share)
-        assert taken.items() >= stored.items()
-        assert sum(taken.values()) <= share
-
-    @given(FILES, st.integers(0, 150))
-    def test_all_that_is_granted_fits(self, files: list[tuple[int, int]], share: int) -> None:
-        if no_room(files, {}, share) is None:
-            assert fitting(files, {}, share) == dict(files)
+        for file in files:
+            moments.take(*file)
+        assert moments.stored.items() >= stored.items()
+        assert sum(moments.stored.values()) <= share
 
     def test_a_refusal_says_what_is_used_and_what_to_do(self) -> None:
-        refused = no_room([(2, 200_000_000)], {1: 900_000_000}, 10**9)
+        refused = Share(10**9, stored={1: 900_000_000}).refusal([(2, 200_000_000)])
         assert refused is not None
         assert "may take 1 GB, 0.9 GB of that are used, and this one takes 0.2 GB more" in refused
         assert "retention.max_moments_gb" in refused

@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, excluded_between, read_gate
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.retention import rewriting
+from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
@@ -352,7 +352,7 @@ def interrupted_at(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
         return call
 
-    for module, name in ((SCREENED, "write"), (rewriting, "replace_file")):
+    for module, name in ((SCREENED, "write"), (repair, "replace_file")):
         real = getattr(module, name)
         monkeypatch.setattr(module, name, dying(dying(real, after=True), after=False))
     monkeypatch.setattr(McapWriter, "cut", dying(McapWriter.cut, after=True))
