@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, partial
+from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
@@ -167,8 +168,10 @@ def slices_of_poses(
     def key_of(stretch: Stretch) -> FragmentKey | None:
         around = stretch.window.widened(beside)
         near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
-        left_out = [(str(one.other), one.span, sorted(one.bags)) for one in near]
-        return stretch.key(f"{settings} {left_out}" if near else settings)
+        if not near:
+            return stretch.key(settings)
+        left_out = repr([(str(one.other), one.span, sorted(one.bags)) for one in near])
+        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
 
     yield from joined_back(
         view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
