@@ -127,14 +127,17 @@ class Backfill:
         snapshot = self._memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
             return False
-        make_fragments(self._memory, self.filling.whole_since())
+        coverage = self._memory.columns.coverage(snapshot.timeline)
+        missing = () if coverage is None else coverage.missing
+        waiting = [bag.start for bag in missing]
+        make_fragments(self._memory, self.filling.whole_since(), waiting)
         self.filling.thin()
         self.filling.trim()
         if self._of_others is None:
             self._of_others = self._memory.columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
         windows = [TimeWindow(start, start + PART_NS) for start in now]
-        make_fragments(self._memory, windows, self._of_others)
+        make_fragments(self._memory, windows, [*waiting, *self._of_others])
         return bool(self._of_others)
 
     def look_after(self, *, thorough: bool = False) -> None:
@@ -177,8 +180,8 @@ def make_fragments(
 ) -> None:
     """Makes what follows from the parts of some times; stores it, and what questions made of it.
 
-    It is joined by stretches of the clock, but for those in which slices are `waiting`: log times
-    (ns) where they begin.
+    It is joined by stretches of the clock, but for those in which bags or slices are `waiting`: log
+    times (ns) where they begin.
     """
     around = [window.widened(PART_NS) for window in windows]
     ends = {(one.start // STRETCH_NS, one.stop // STRETCH_NS) for one in around}
