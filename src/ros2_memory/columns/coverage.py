@@ -97,6 +97,16 @@ class Coverage:
             found = self._of_parts[part] = self.among(numbers)
         return found
 
+    def counts(self, groups: Sequence[IntArray]) -> IntArray:
+        """Returns of how many bags of each group, which has one at least, rows count."""
+        if not groups:
+            return np.zeros(0, np.int64)
+        begins = np.cumsum([0, *(group.size for group in groups)])[:-1]
+        counting: IntArray = np.add.reduceat(
+            self.positions(np.concatenate(groups)) >= 0, begins, dtype=np.int64
+        )
+        return counting
+
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
         if number not in self._bags:

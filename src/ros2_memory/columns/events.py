@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import json
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import IntervalTable
-from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents
+from ros2_memory.analysis.topic_events import (
+    Change,
+    KnownState,
+    Report,
+    TopicEvents,
+    joined_events,
+)
 from ros2_memory.columns.fragments import Fragment, Kind
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ros2_memory.core.model import JsonValue
 
 
 def _fragment(events: TopicEvents) -> Fragment:
@@ -28,17 +39,31 @@ def _fragment(events: TopicEvents) -> Fragment:
 def _events(fragment: Fragment) -> TopicEvents:
     head = json.loads(fragment.head)
     first, last = head["span"]
+    words: dict[str, str] = {}
+
+    def rows(name: str) -> list[list[JsonValue]]:
+        """Returns the rows of a list; equal words are one object, as there are thousands."""
+        return [
+            [words.setdefault(one, one) if isinstance(one, str) else one for one in row]
+            for row in head[name]
+        ]
+
     return TopicEvents(
         first,
         last,
         IntervalTable(tuple(head["labels"]), fragment.arrays["visible"].tobytes()),
-        tuple(KnownState(*row) for row in head["known"]),
-        tuple(Change(*row) for row in head["changes"]),
-        tuple(Report(*row) for row in head["errors"]),
-        tuple(Report(*row) for row in head["reports"]),
+        tuple(map(KnownState._make, rows("known"))),
+        tuple(map(Change._make, rows("changes"))),
+        tuple(map(Report._make, rows("errors"))),
+        tuple(map(Report._make, rows("reports"))),
         *head["counts"],
     )
 
 
-EVENTS: Final = Kind("events", _fragment, _events)
+def _joined(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
+    whole = joined_events(found)
+    return [] if whole is None else [whole]
+
+
+EVENTS: Final = Kind("events", _fragment, _events, _joined)
 """What came into view, changed or failed on a topic in a part."""

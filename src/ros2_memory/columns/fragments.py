@@ -15,25 +15,26 @@ import numpy as np
 
 from ros2_memory.columns.pack import compressed, decompressed
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.columns.store import ColumnStore
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.cache import ByteLru
 
     Array: TypeAlias = NDArray[np.generic[object]]
     Floats: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
     Vectors: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 
-DAY_NS: Final[Ns] = 86_400 * NS_PER_S
-"""Fragments are read from the store a day of the clock at a time."""
 _MOST_WAITING: Final = 1_024
 """Fragments that wait to be stored; of more the oldest are made again."""
+
+_KEY_BYTES: Final = 400
+"""About how much memory it takes to remember a fragment, besides its own."""
 
 log = get_logger(__name__)
 
@@ -97,11 +98,20 @@ class Fragment(NamedTuple):
 
 
 class Kind(NamedTuple, Generic[T]):
-    """A kind of fragments: what tells it apart from others in the file, and how it is stored."""
+    """A kind of fragments: what tells it apart from others in the file, and how it is stored.
+
+    Attributes:
+        name: of the kind.
+        store: returns what is stored.
+        load: returns what was stored.
+        join: returns fewer fragments that say the same as those of a stretch of the clock, in
+            order. Without it these stay as they are.
+    """
 
     name: str
     store: Callable[[T], Fragment]
     load: Callable[[Fragment], T]
+    join: Callable[[Sequence[T]], Sequence[T]] = lambda found: found
 
 
 class FragmentKey(NamedTuple):
@@ -118,6 +128,46 @@ class FragmentKey(NamedTuple):
     parts: tuple[int, ...]
 
 
+class Joined(NamedTuple, Generic[T]):
+    """The fragments of a stretch of the clock, joined."""
+
+    found: Sequence[T]
+
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory they take."""
+        return 100 + sum(one.memory_bytes for one in self.found)
+
+
+def joining(kind: Kind[T]) -> Kind[Joined[T]]:
+    """Returns how the joined fragments of a kind are stored: each array of all in one."""
+
+    def store(joined: Joined[T]) -> Fragment:
+        every = [kind.store(one) for one in joined.found]
+        rows = [
+            (one.head, {name: len(array) for name, array in one.arrays.items()}) for one in every
+        ]
+        arrays: dict[str, list[Array]] = {}
+        for one in every:
+            for name, array in one.arrays.items():
+                arrays.setdefault(name, []).append(array)
+        whole = {name: np.concatenate(several) for name, several in arrays.items()}
+        return Fragment(json.dumps(rows), whole)
+
+    def load(fragment: Fragment) -> Joined[T]:
+        found: list[T] = []
+        ends = dict.fromkeys(fragment.arrays, 0)
+        for head, lengths in json.loads(fragment.head):
+            arrays = {}
+            for name, length in lengths.items():
+                arrays[name] = fragment.arrays[name][ends[name] : ends[name] + length]
+                ends[name] += length
+            found.append(kind.load(Fragment(head, arrays)))
+        return Joined(found)
+
+    return Kind(f"{kind.name}-joined", store, load)
+
+
 class Fragments(Generic[T]):
     """The fragments of one kind. Thread-safe.
 
@@ -125,35 +175,33 @@ class Fragments(Generic[T]):
         store: where they are stored; None where they are remembered alone.
         kind: see there.
         settings: what all of them depend on, as a text.
-        most_bytes: of those that are remembered.
+        remembered: those of all kinds that were asked for last.
     """
 
     def __init__(
-        self, store: ColumnStore | None, kind: Kind[T], settings: str, most_bytes: int
+        self, store: ColumnStore | None, kind: Kind[T], settings: str, remembered: ByteLru[object]
     ) -> None:
         self._store = store
         self._kind = kind
-        self._settings = settings
-        self._made: ByteLru[T] = ByteLru(most_bytes)
-        self._stored: ByteLru[bytes] = ByteLru(most_bytes)
-        self._read: dict[tuple[int, str, Ns], int] = {}
+        self._name = f"{kind.name} {settings}"
+        self._remembered = remembered
         self._waiting: deque[tuple[FragmentKey, T]] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.Lock()
 
     def get(self, key: FragmentKey) -> T | None:
         """Returns a fragment; None if it was not made yet."""
-        found = self._made.get(key)
+        # By name: each kind has one type.
+        found = cast("T | None", self._remembered.get((self._kind.name, key)))
         if found is None and self._store is not None:
-            data = self._stored.get(key) or self._read_day(self._store, key)
-            if data is not None:
-                found = self._loaded(data)
-        if found is not None:
-            self._made.put(key, found, found.memory_bytes)
+            data = self._store.fragment(self._name, key)
+            found = None if data is None else self._loaded(data)
+            if found is not None:
+                self._remember(key, found)
         return found
 
     def put(self, key: FragmentKey, made: T) -> None:
         """Remembers a fragment, which waits to be stored."""
-        self._made.put(key, made, made.memory_bytes)
+        self._remember(key, made)
         if self._store is not None:
             with self._lock:
                 self._waiting.append((key, made))
@@ -165,26 +213,10 @@ class Fragments(Generic[T]):
             self._waiting.clear()
         if self._store is not None and waiting:
             made = [(key, self._kind.store(made).to_bytes()) for key, made in waiting]
-            self._store.put_fragments(self._name(), made)
+            self._store.put_fragments(self._name, made)
 
-    def _name(self) -> str:
-        return f"{self._kind.name} {self._settings}"
-
-    def _read_day(self, store: ColumnStore, key: FragmentKey) -> bytes | None:
-        """Reads the fragments of a day that were stored since it was read last."""
-        day = key.start // DAY_NS
-        read = (store.offset, key.settings, day)
-        newest = self._read.get(read, 0)
-        data = None
-        for number, found, packed in store.fragments(
-            self._name(), key.settings, (day * DAY_NS, day * DAY_NS + DAY_NS), newest
-        ):
-            newest = max(newest, number)
-            self._stored.put(found, packed, len(packed))
-            if found == key:
-                data = packed
-        self._read[read] = newest
-        return data
+    def _remember(self, key: FragmentKey, made: T) -> None:
+        self._remembered.put((self._kind.name, key), made, made.memory_bytes + _KEY_BYTES)
 
     def _loaded(self, data: bytes) -> T | None:
         try:

@@ -11,12 +11,20 @@ import numpy as np
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-from ros2_memory.analysis.motion.standstills import BLOCK_NS, PER_METRE, Blocks, Stands
+from ros2_memory.analysis.motion.standstills import (
+    BLOCK_NS,
+    PER_METRE,
+    Blocks,
+    Stands,
+    joined_blocks,
+)
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.fragments import Fragment, Kind
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.columns.fragments import Array
     from ros2_memory.core.model import Vector3
 
@@ -142,5 +150,13 @@ def _stands_of(fragment: Fragment) -> Stands:
 
 PATHS: Final = Kind("path", _path_fragment, _path_of)
 """The path of the poses of a topic in a slice of the clock."""
-STANDS: Final = Kind("stands", _stands_fragment, _stands_of)
+
+
+def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
+    blocks = joined_blocks([stands.blocks for stands in found])
+    drops = tuple(drop for stands in found for drop in stands.drops)
+    return [Stands(blocks, drops, max(stands.last for stands in found))]
+
+
+STANDS: Final = Kind("stands", _stands_fragment, _stands_of, _joined_stands)
 """Where the robot may have stood in a slice of the clock, by the poses of a topic."""

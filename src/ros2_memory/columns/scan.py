@@ -10,22 +10,24 @@ import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
-from ros2_memory.columns.units import BagUnit, Rows, Unit
+from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.storage.base import RELATCHED_NS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from pathlib import Path
 
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.scanner import Scanner
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
 
@@ -44,6 +45,8 @@ Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
 
 _SLICE_NS: Final = 600 * NS_PER_S
 """How much of overlapping recordings is compared at a time."""
+STRETCH_NS: Final[Ns] = 4 * 3600 * NS_PER_S
+"""What follows from the rows of so much of the clock is joined once."""
 _ATTEMPTS: Final = 5
 """How often a scan looks what is stored, while that changes; then it reads the bags."""
 _MOST_LOOKED_UP: Final = 64
@@ -101,6 +104,25 @@ class _Source(NamedTuple):
     bag: BagFile | None = None
 
 
+class Stretch(NamedTuple):
+    """A stretch of the clock in a scan. No rows that begin in it overlap those of another one.
+
+    Attributes:
+        window: the stretch.
+        last: no row of a part that begins in it is later (log time, ns).
+        parts: the numbers of the whole parts that all rows in it and beside it are of; None where
+            there are others, or the scan has not all of them.
+    """
+
+    window: TimeWindow
+    last: Ns
+    parts: tuple[int, ...] | None
+
+    def key(self, settings: str = "") -> FragmentKey | None:
+        """Returns what tells apart what follows from its rows; None where that may change."""
+        return None if self.parts is None else FragmentKey(self.window.start, settings, self.parts)
+
+
 class Scan:
     """One scan of a topic: its sources, and which rows of them are copies.
 
@@ -131,8 +153,8 @@ class Scan:
         found = self._settled(reach)
         self._sources = sorted(found, key=lambda source: (source.first, source.last))
         self._firsts = np.array([source.first for source in self._sources], np.int64)
-        lasts = np.array([source.last for source in self._sources], np.int64)
-        self._latest = np.maximum.accumulate(lasts)
+        self._lasts = np.array([source.last for source in self._sources], np.int64)
+        self._latest = np.maximum.accumulate(self._lasts)
         if self._shared:
             self._shared = self._holding_copies()
         self._ends = [stop for _, stop in self._shared]
@@ -142,16 +164,23 @@ class Scan:
         """The half-open spans in which two sources may have the same messages, in order."""
         return self._shared
 
-    def rows(self, *, newest_first: bool = False) -> Iterator[Rows]:
+    @property
+    def window(self) -> TimeWindow:
+        """The window that it is of."""
+        return self._asked.window
+
+    def rows(
+        self, *, newest_first: bool = False, among: TimeWindow | None = None
+    ) -> Iterator[Rows]:
         """Yields what counts of the topic in the window.
 
         In the order of the first log time of each table, or with `newest_first` of the last, from
-        the newest on.
+        the newest on. Only of the tables that reach into `among`, where that is given.
 
         Raises:
             QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
         """
-        sources = self._sources
+        sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
         window, may_match = self._asked.window, self._asked.may_match
@@ -180,6 +209,89 @@ class Scan:
                 rows = Rows(unit, partial(self._counting, unit), may_match=may)
                 if self._asked.may_be_empty or len(rows):
                     yield rows
+
+    def stretches(self, beside: Ns = 0) -> list[Stretch]:
+        """Returns the stretches of the clock that the window consists of, the newest first.
+
+        Those of `STRETCH_NS` in which all rows are of whole parts, also those so long (ns) before
+        and after, and what lies between them.
+        """
+        found: list[Stretch] = []
+        until = self._asked.window.stop
+
+        def between(start: Ns) -> Iterator[Stretch]:
+            if start < until:
+                latest = self._latest[: np.searchsorted(self._firsts, until)].tolist()
+                yield Stretch(TimeWindow(start, until), max([until - 1, *latest[-1:]]), None)
+
+        for stretch in self._settled_stretches(beside) if self._sources else ():
+            found += [*between(stretch.window.stop), stretch]
+            until = stretch.window.start
+        return [*found, *between(self._asked.window.start)]
+
+    def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
+        """Returns the whole parts that all rows in a window are of; None where others are, too."""
+        if self._coverage is None or self._asked.relatches:
+            return None
+        begin = int(np.searchsorted(self._latest, window.start))
+        end = int(np.searchsorted(self._firsts, window.stop))
+        if self._others[end] > self._others[begin]:
+            return None
+        here = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
+        return tuple(self._numbers[here].tolist())
+
+    def recording_of(self, part: int) -> Path:
+        """Returns the recording of a whole part of which all rows count."""
+        assert self._coverage is not None  # noqa: S101 - there are no parts without one
+        bag = self._coverage.bag(int(self._heads[part].bags[0]))
+        if bag is None:
+            raise GoneError
+        return bag.recording
+
+    @cached_property
+    def _numbers(self) -> IntArray:
+        return np.array([0 if one.part is None else one.part.number for one in self._sources])
+
+    @cached_property
+    def _heads(self) -> dict[int, PartHead]:
+        return {source.part.number: source.part for source in self._sources if source.part}
+
+    @cached_property
+    def _others(self) -> IntArray:
+        """How many of the first sources are not whole parts of which all rows count."""
+        parts = [source.part for source in self._sources]
+        is_whole = np.array([part is not None and part.is_whole for part in parts], np.bool_)
+        heads = [part for part in parts if part is not None]
+        if self._coverage is not None and heads:
+            counting = self._coverage.counts([head.bags for head in heads])
+            of_all = counting == [head.bags.size for head in heads]
+            is_whole[[part is not None for part in parts]] &= of_all
+        is_whole &= self._lasts - self._firsts < STRETCH_NS
+        return np.concatenate([[0], np.cumsum(~is_whole)])
+
+    def _settled_stretches(self, beside: Ns) -> list[Stretch]:
+        """Returns the stretches of which all rows are of whole parts; see `stretches`."""
+        window, firsts, latest = self._asked.window, self._firsts, self._latest
+        newest = max((each.latest for each in self._asked.timeline.segments), default=MIN_NS)
+        starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
+        stops = starts + STRETCH_NS
+        begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
+        after, before = np.append(firsts, MAX_NS), np.append(MIN_NS, latest)
+        # What reaches over an edge overlaps nothing that begins behind it.
+        is_apart = (before[begin] < after[begin]) & (before[end] < after[end])
+        lasts = np.maximum(before[end], stops - 1)
+        is_inside = (starts - beside >= window.start) & (lasts + beside < window.stop)
+        found = []
+        for nth in np.flatnonzero(is_apart & is_inside & (stops <= newest)).tolist():
+            start, stop, last = int(starts[nth]), int(stops[nth]), int(lasts[nth])
+            around = TimeWindow(start - beside, last + beside + 1)
+            # Which rows are copies follows from those beside them, too.
+            copied = around.widened(2 * COPY_HORIZON_NS)
+            has_copies = overlaps_any(self._shared, copied.start, copied.stop)
+            parts = self.whole_parts(copied if has_copies else around)
+            if parts is not None:
+                found.append(Stretch(TimeWindow(start, stop), last, parts))
+        return found
 
     def copies(self) -> Iterator[Rows]:
         """Yields the rows that do not count, as another recording has their messages, too.
@@ -226,15 +338,11 @@ class Scan:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
-            if self._asked.stored:
-                return
             plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
             yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
             return
         for head in self._scanner.parts(topic, reach, coverage):
             yield _Source(head.first, head.last, head)
-        if self._asked.stored:
-            return
         for bag in coverage.missing_in(reach):
             if topic in bag.summary.schema.positions:
                 first, last = bag.summary.span_of([topic])
@@ -242,6 +350,8 @@ class Scan:
                     yield _Source(first, last, None, bag)
 
     def _units(self, source: _Source) -> Iterable[Unit]:
+        if source.part is None and self._asked.stored:
+            return ()
         if source.part is not None and self._coverage is not None:
             unit = self._scanner.part(source.part, self._coverage, self._together)
             return () if unit is None else (unit,)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.coverage import Covering
-from ros2_memory.columns.fragments import DAY_NS, FragmentKey, Fragments
+from ros2_memory.columns.fragments import FragmentKey, Fragments
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
@@ -22,6 +22,7 @@ from ros2_memory.columns.units import GoneError, PartUnit
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile, StampedTransform
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray
 
@@ -47,8 +47,9 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-CACHE_MB: Final = 48
-"""How much unpacked columns may take in memory, in MiB."""
+CACHE_MB: Final = 80
+"""How much unpacked columns and fragments may take in memory, in MiB."""
+DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
@@ -78,17 +79,12 @@ class _Heads:
     @classmethod
     def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
         """Returns the parts as of a coverage."""
-        live = np.zeros(len(heads), np.int64)
-        if heads:
-            sizes = np.cumsum([0, *(head.bags.size for head in heads)])
-            positions = coverage.positions(np.concatenate([head.bags for head in heads]))
-            live = np.add.reduceat(positions >= 0, sizes[:-1]).astype(np.int64)
         return cls(
             coverage,
             heads,
             np.array([head.first for head in heads], np.int64),
             np.array([head.last for head in heads], np.int64),
-            live,
+            coverage.counts([head.bags for head in heads]),
         )
 
     def within(self, window: TimeWindow) -> list[PartHead]:
@@ -111,8 +107,7 @@ class Scanner:
         bag_dir: the bag directory.
         settings: what fragments depend on besides the bags, as a text.
         large: the turn to hold much of a bag, which large columns need, too.
-        cache_mb: how much unpacked columns may take in memory, in MiB; the fragments of a kind half
-            of it, and as much again as they are stored.
+        cache_mb: how much unpacked columns and fragments may take in memory, in MiB.
 
     Attributes:
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
@@ -134,8 +129,8 @@ class Scanner:
         self.store = store
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
-        self._columns: ByteLru[Column] = ByteLru(cache_mb << 20)
-        self._known: ByteLru[Packed] = ByteLru((cache_mb << 20) // 3)
+        self._read: ByteLru[object] = ByteLru(cache_mb << 20)
+        self._known: ByteLru[Packed] = ByteLru((cache_mb << 20) // 5)
         self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.decoded: ByteLru[list[list[Table]]] = ByteLru(DECODED_BYTES)
@@ -145,14 +140,13 @@ class Scanner:
         self.sights: ByteLru[bytes] = ByteLru(16 << 20)
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
         self._settings = settings
-        self._fragment_bytes = (cache_mb << 20) // 2
         self._fragments: dict[str, object] = {}
         self._outlines = self.fragments(OUTLINE)
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            made = Fragments(self.store, kind, self._settings, self._fragment_bytes)
+            made = Fragments(self.store, kind, self._settings, self._read)
             self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
@@ -325,9 +319,9 @@ class Scanner:
         return None if known is _ABSENT else known
 
     def _column(self, part: int, path: str, packed: Packed) -> Column:
-        column = self._columns.get((part, path))
-        if column is not None:
-            return column
+        known = self._read.get((part, path))
+        if known is not None:
+            return cast("Column", known)
         assert self.store is not None  # noqa: S101 - as above
         data = b""
         # The one value of a constant is its least, unless it is a text.
@@ -339,7 +333,7 @@ class Scanner:
             self._wait_for(stored)
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        self._columns.put((part, path), column, column_bytes(column))
+        self._read.put((part, path), column, column_bytes(column))
         return column
 
     def _wait_for(self, stored: bytes) -> None:

@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.columns.database import Database, Tables
-from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import FORMAT, Packed
 from ros2_memory.columns.stored import Topic
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.fragments import FragmentKey
     from ros2_memory.columns.table import Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Definition, IntArray
@@ -438,30 +438,18 @@ class ColumnStore(Database):
 
         return self.read(ask, None)
 
-    def fragments(
-        self, kind: str, settings: str, span: tuple[Ns, Ns], after: int = 0
-    ) -> list[tuple[int, FragmentKey, bytes]]:
-        """Returns the fragments of slices that begin in a span, with their numbers.
+    def fragment(self, kind: str, key: FragmentKey) -> bytes | None:
+        """Returns a fragment of a kind; None where it is not stored."""
 
-        Args:
-            kind: of them.
-            settings: what they depend on.
-            span: half-open, log times (ns).
-            after: a number; those that were stored later are returned.
-        """
+        def ask(connection: sqlite3.Connection) -> bytes | None:
+            row = connection.execute(
+                "SELECT data FROM fragment"
+                " WHERE kind = ? AND settings = ? AND start_ns = ? AND parts = ?",
+                (kind, key.settings, key.start, self._parts_of(key)),
+            ).fetchone()
+            return None if row is None else bytes(row[0])
 
-        def ask(connection: sqlite3.Connection) -> list[tuple[int, FragmentKey, bytes]]:
-            rows = connection.execute(
-                "SELECT id, start_ns, parts, data FROM fragment WHERE kind = ? AND settings = ?"
-                " AND start_ns >= ? AND start_ns < ? AND id > ?",
-                (kind, settings, *span, after),
-            )
-            return [
-                (number, FragmentKey(start, settings, self._numbers(parts)), data)
-                for number, start, parts, data in rows
-            ]
-
-        return self.read(ask, [])
+        return self.read(ask, None)
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
         """Returns where slices begin whose fragments all depend on other settings, newest first.
@@ -489,8 +477,8 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def _numbers(self, parts: str) -> tuple[int, ...]:
-        return tuple(self.offset + part for part in json.loads(parts))
+    def _parts_of(self, key: FragmentKey) -> str:
+        return json.dumps([part - self.offset for part in key.parts])
 
     # Writing
 
@@ -501,7 +489,7 @@ class ColumnStore(Database):
             for key, data in made:
                 if not all(map(self.is_current, key.parts)):
                     continue
-                parts = json.dumps([part - self.offset for part in key.parts])
+                parts = self._parts_of(key)
                 cursor = connection.execute(
                     "INSERT OR IGNORE INTO fragment (kind, settings, start_ns, parts, data)"
                     " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="

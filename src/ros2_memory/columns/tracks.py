@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import TrackPart
+from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
 from ros2_memory.columns.fragments import Fragment, Kind
 from ros2_memory.columns.steps import METRES
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.columns.fragments import Array
     from ros2_memory.storage.base import IntArray
 
@@ -21,7 +23,7 @@ def _fragment(part: TrackPart) -> Fragment:
     numbers = {"times": part.times, "x": x, "y": y, "turns": part.turns}
     arrays: dict[str, Array] = {name: _planes(column) for name, column in numbers.items()}
     marks = {"known": part.known, "settled": part.settled}
-    return Fragment(json.dumps(part.left_out), arrays | marks)
+    return Fragment(json.dumps([part.left_out, part.recording]), arrays | marks)
 
 
 def _track(fragment: Fragment) -> TrackPart:
@@ -33,7 +35,7 @@ def _track(fragment: Fragment) -> TrackPart:
         turns,
         fragment.marks("known"),
         fragment.marks("settled"),
-        json.loads(fragment.head),
+        *json.loads(fragment.head),
     )
 
 
@@ -41,14 +43,21 @@ def _planes(numbers: IntArray) -> Array:
     """Returns the differences from one number to the next, the lowest bytes of all first."""
     steps = np.diff(numbers, prepend=0)
     folded = (steps << 1) ^ (steps >> 63)  # small ones of either sign have high bytes of 0
-    return np.ascontiguousarray(folded.astype("<i8").view(np.uint8).reshape(-1, 8).T)
+    return folded.astype("<i8").view(np.uint8).reshape(-1, 8).T.reshape(-1)
 
 
 def _numbers(planes: Array) -> IntArray:
-    folded = np.ascontiguousarray(planes.T).view("<u8").reshape(-1)
+    folded = np.ascontiguousarray(planes.reshape(8, -1).T).view("<u8").reshape(-1)
     steps = (folded >> np.uint64(1)).astype(np.int64) ^ -(folded & np.uint64(1)).astype(np.int64)
     return np.cumsum(steps)
 
 
-TRACKS: Final = Kind("track", _fragment, _track)
-"""Where the poses of a part have the robot in a frame."""
+def _joined(found: Sequence[TrackPart]) -> Sequence[TrackPart]:
+    by_recording: dict[str, list[TrackPart]] = {}
+    for part in found:
+        by_recording.setdefault(part.recording, []).append(part)
+    return [*map(united_parts, by_recording.values())]
+
+
+TRACKS: Final = Kind("track", _fragment, _track, _joined)
+"""Where the poses of a part have the robot in a frame; joined, those of a recording."""

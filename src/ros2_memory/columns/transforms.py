@@ -110,14 +110,18 @@ def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntAr
 
 @dataclass(frozen=True, slots=True)
 class Statics:
-    """The static transforms of a part, in log-time order, that differ from those before."""
+    """The static transforms of a part, in log-time order, that differ from those before.
 
+    `recording` is that of the part, as `columns.store.relative` names its folder.
+    """
+
+    recording: str
     transforms: tuple[StampedTransform, ...]
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 100 + 600 * len(self.transforms)
+        return 200 + 600 * len(self.transforms)
 
 
 def _statics_fragment(statics: Statics) -> Fragment:
@@ -132,16 +136,17 @@ def _statics_fragment(statics: Statics) -> Fragment:
         ]
         for one in statics.transforms
     ]
-    return Fragment(json.dumps(rows), {})
+    return Fragment(json.dumps([statics.recording, rows]), {})
 
 
 def _statics_of(fragment: Fragment) -> Statics:
     found = []
-    for parent, child, stamp, log_time, x, y, z, *rotation in json.loads(fragment.head):
+    recording, rows = json.loads(fragment.head)
+    for parent, child, stamp, log_time, x, y, z, *rotation in rows:
         qx, qy, qz, qw = rotation
         transform = Transform((x, y, z), (qx, qy, qz, qw))
         found.append(StampedTransform(parent, child, stamp, log_time, transform, static=True))
-    return Statics(tuple(found))
+    return Statics(recording, tuple(found))
 
 
 STATICS: Final = Kind("statics", _statics_fragment, _statics_of)

@@ -244,6 +244,7 @@ class Call:
         now: what the answer's ages count from, where that is not the wall clock.
         older: up to which log time (inclusive) there are bags that it was not shown, as those of a
             lake are shown some days at a time; None where it was shown all, `MAX_NS` before any.
+        stored: whether it makes what follows from what is stored, and leaves out other bags.
     """
 
     deadline: Deadline = field(default_factory=Deadline.never)
@@ -253,6 +254,7 @@ class Call:
     rows_in: TimeWindow | None = None
     now: Ns | None = None
     older: Ns | None = MAX_NS
+    stored: bool = False
 
     def saw(self, snapshot: Snapshot) -> None:
         """Notes that the call was shown what a snapshot has."""

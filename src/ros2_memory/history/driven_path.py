@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -35,7 +35,7 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseRows, pose_rows, poses_of, slices_back
+from ros2_memory.history.poses import PoseRows, poses_of, slices_back, slices_of_poses
 from ros2_memory.history.robots import beside_path
 from ros2_memory.history.transforms import (
     decoded_transforms,
@@ -48,13 +48,16 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
+
+T = TypeVar("T", bound="Sized")
 
 _MOST_TRIED: Final = 1000
 """How many of the newest poses are tried until one can be decoded."""
@@ -150,8 +153,7 @@ def _slices_in(
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        blocks = blocks_back(view, topic, window, failures, reached)
-        for start, made in slices_of_path(view, blocks):
+        for start, made in slices_of_path(view, topic, window, failures, reached):
             since = start
             if made.poses or made.invalid:
                 found.append(made)
@@ -162,43 +164,56 @@ def _slices_in(
     return found[::-1], None
 
 
-def slices_of_path(view: View, blocks: Iterable[PoseRows]) -> Iterator[tuple[Ns, PathSlice]]:
-    """Yields the path of some poses in slices, the newest first, with the time where each begins.
-
-    Raises:
-        InvalidArgumentsError: a message carries no position.
-    """
-    fastest = view.memory.limits.max_plausible_speed_mps
-    known = view.memory.columns.fragments(PATHS)
-
-    def make(some: PoseSlice) -> PathSlice:
-        return path_slice(some.poses, fastest)
-
-    for some in slices_back(blocks, SLICE_NS):
-        yield some.start, some.remembered(known, make, str(fastest))
-
-
-def blocks_back(
+def slices_of_path(
     view: View,
     topic: str,
     window: TimeWindow,
     failures: list[UndecodableError],
     reached: Callable[[Ns], None] = lambda _: None,
-) -> Iterator[PoseRows]:
-    """Yields the poses of the robot's path in a window, the newest first; see `pose_rows`.
+) -> Iterator[tuple[Ns, PathSlice]]:
+    """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
+    fastest = view.memory.limits.max_plausible_speed_mps
+
+    def make(some: PoseSlice) -> PathSlice:
+        return path_slice(some.poses, fastest)
+
+    yield from slices_by_poses(
+        view, topic, window, PATHS, make, failures=failures, settings=str(fastest), reached=reached
+    )
+
+
+def slices_by_poses(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    kind: Kind[T],
+    make: Callable[[PoseSlice], T],
+    *,
+    failures: list[UndecodableError],
+    beside: Ns = 0,
+    settings: str = "",
+    reached: Callable[[Ns], None] = lambda _: None,
+) -> Iterator[tuple[Ns, T]]:
+    """Yields what is made of the robot's poses in slices, the newest first; see `slices_of_poses`.
 
     Of a topic of transforms they are those of the robot's body. Where two recordings have poses of
     their own, or one has a time twice, they are those that come first.
+
+    Raises:
+        InvalidArgumentsError: a message carries no position.
     """
-    if topic in view.memory.limits.tf_topics:
-        poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-        if len(poses):
-            yield PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
+    if topic not in view.memory.limits.tf_topics:
+        twice = () if view.call.stored else beside_path(view, topic, window)
+        yield from slices_of_poses(
+            view, topic, window, kind, make, failures=failures,
+            length=SLICE_NS, beside=beside, settings=settings, reached=reached, twice=twice,
+        )  # fmt: skip
         return
-    beside = beside_path(view, topic, window)
-    yield from pose_rows(
-        view, topic, window, failures, newest_first=True, reached=reached, beside=beside
-    )
+    poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
+    if len(poses):
+        every = PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
+        for some in slices_back([every], SLICE_NS, beside):
+            yield some.start, make(some)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:

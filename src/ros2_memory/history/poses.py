@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, partial
+from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
@@ -19,13 +20,21 @@ from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
-from ros2_memory.history.scan import blocks, decoded_rows, messages_of, scan
+from ros2_memory.history.scan import (
+    blocks,
+    decoded_rows,
+    joined_back,
+    messages_of,
+    open_scan,
+    scan,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.fragments import Fragments, Sized
+    from ros2_memory.columns.fragments import Fragments, Kind, Sized
+    from ros2_memory.columns.scan import Stretch
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import Beside
@@ -91,26 +100,82 @@ def pose_rows(
     window: TimeWindow,
     failures: list[UndecodableError],
     *,
-    newest_first: bool = False,
-    stored: bool = False,
-    reached: Callable[[Ns], None] = lambda _: None,
     among: Callable[[Path], bool] = lambda _: True,
-    beside: Sequence[Beside] = (),
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
     Positions are rounded to 0.1 mm, as the store has them. Why messages cannot be decoded is added
-    to `failures` as poses are read. `stored` and `reached` are as for `scan`; `among`: which
-    recordings count. Where recordings are `beside` each other, the poses are those of the first.
+    to `failures` as poses are read. `among`: which recordings count.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    reader = PoseReader(view, failures, beside)
-    scanned = scan(view, topic, window, newest_first=newest_first, stored=stored, reached=reached)
-    counting = (rows for rows in scanned if among(rows.recording))
-    for together in blocks(counting, newest_first=newest_first):
+    reader = PoseReader(view, failures)
+    counting = (rows for rows in scan(view, topic, window) if among(rows.recording))
+    for together in blocks(counting, newest_first=False):
         yield reader.block(together)
+
+
+def slices_of_poses(
+    view: View,
+    topic: str,
+    window: TimeWindow,
+    kind: Kind[T],
+    make: Callable[[PoseSlice], T],
+    *,
+    failures: list[UndecodableError],
+    length: Ns,
+    beside: Ns = 0,
+    settings: str = "",
+    reached: Callable[[Ns], None] = lambda _: None,
+    twice: Sequence[Beside] = (),
+) -> Iterator[tuple[Ns, T]]:
+    """Yields what is made of the poses of a topic in slices of the clock, the newest first.
+
+    Each with a time (log time, ns) that no pose of it is earlier than.
+
+    Args:
+        view: of the call.
+        topic: of the poses.
+        window: of log time.
+        kind: of what is made; it is remembered, and joined by stretches of the clock.
+        make: makes it.
+        failures: as for `pose_rows`.
+        length: of a slice (ns); they are counted from the epoch.
+        beside: poses so far before and after a slice (ns) are with it, too.
+        settings: what it depends on besides the poses.
+        reached: as for `scan`.
+        twice: recordings that are beside each other: the poses are those of the first.
+
+    Raises:
+        InvalidArgumentsError: while it is iterated, messages carry no position.
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
+    """
+    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    reader = PoseReader(view, failures, twice)
+    known = view.memory.columns.fragments(kind)
+
+    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
+        around = stretch.window.widened(beside)
+        rows = opened.rows(newest_first=True, among=around)
+        every = map(reader.block, blocks(rows, newest_first=True))
+        needs_all = stretch.parts is not None or not view.call.stored
+        found = (block for block in every if block.parts or needs_all)
+        for some in slices_back(found, length, beside):
+            if stretch.window.overlaps(some.start, some.stop - 1):
+                yield some.start, some.remembered(known, make, settings)
+
+    def key_of(stretch: Stretch) -> FragmentKey | None:
+        around = stretch.window.widened(beside)
+        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
+        if not near:
+            return stretch.key(settings)
+        left_out = repr([(str(one.other), one.span, sorted(one.bags)) for one in near])
+        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
+
+    yield from joined_back(
+        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
+    )
 
 
 class PoseSlice:
@@ -239,9 +304,10 @@ class PoseReader:
         is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
         parts = numbers if is_whole else None
         ordered = sorted(rows, key=lambda each: (each.first, each.last, str(each.recording)))
-        return PoseRows(span, partial(self._joined, ordered), parts, self._trouble)
+        return PoseRows(span, partial(self._joined, ordered), parts, self.trouble)
 
-    def _trouble(self) -> Hashable:
+    def trouble(self) -> Hashable:
+        """Returns what differs from before where something could not be read since."""
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:

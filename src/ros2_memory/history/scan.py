@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypedDict, TypeVar
 
 import numpy as np
 
-from ros2_memory.columns.scan import Asked, Scan
+from ros2_memory.columns.fragments import Joined, joining
+from ros2_memory.columns.scan import Asked, Scan, Stretch
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+    from typing import Unpack
 
+    from ros2_memory.columns.fragments import FragmentKey, Kind, Sized
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
@@ -23,13 +26,39 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
+T = TypeVar("T", bound="Sized")
+
 
 def scan(
+    view: View, topic: str, window: TimeWindow, *, newest_first: bool = False, **how: Unpack[How]
+) -> Iterator[Rows]:
+    """Yields the rows of a topic in a window; see `open_scan` and `columns.scan.Scan.rows`.
+
+    Raises:
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
+    """
+    return open_scan(view, topic, window, **how).rows(newest_first=newest_first)
+
+
+class How(TypedDict, total=False):
+    """What `open_scan` may be told."""
+
+    columns: bool
+    copies: bool
+    shared: Sequence[tuple[Ns, Ns]] | None
+    may_match: Callable[[PartZones], bool | Mask] | None
+    may_not_match: bool
+    may_be_empty: bool
+    within: Sequence[tuple[Ns, Ns]] | None
+    stored: bool
+    reached: Callable[[Ns], None]
+
+
+def open_scan(
     view: View,
     topic: str,
     window: TimeWindow,
     *,
-    newest_first: bool = False,
     columns: bool = True,
     copies: bool = False,
     shared: Sequence[tuple[Ns, Ns]] | None = None,
@@ -39,8 +68,8 @@ def scan(
     within: Sequence[tuple[Ns, Ns]] | None = None,
     stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
-) -> Iterator[Rows]:
-    """Yields the rows of a topic in a window; see `columns.scan.Scan.rows`.
+) -> Scan:
+    """Returns the scan of a topic in a window.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
@@ -48,9 +77,6 @@ def scan(
     a message counts in each recording that holds it. `shared` are the spans in which recordings
     may hold copies, where the caller knows them. With `stored` bags that are not stored have no
     rows. `may_match`, `may_not_match`, `may_be_empty` and `within` are as in `Asked`.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
@@ -76,7 +102,50 @@ def scan(
         relatches=not copies and view.stream.may_be_relatched([topic]),
         check=check,
     )
-    return Scan(view.memory.columns, asked).rows(newest_first=newest_first)
+    return Scan(view.memory.columns, asked)
+
+
+def joined_back(
+    view: View,
+    opened: Scan,
+    kind: Kind[T],
+    make: Callable[[Stretch], Iterable[tuple[Ns, T]]],
+    key_of: Callable[[Stretch], FragmentKey | None] = Stretch.key,
+    *,
+    beside: Ns = 0,
+    trouble: Callable[[], Hashable] = lambda: None,
+) -> Iterator[tuple[Ns, T]]:
+    """Yields what follows from the rows of a scan, the newest first, each with a time.
+
+    Nothing of it is earlier than that (log time, ns). What follows from whole parts alone is joined
+    by stretches of the clock, and remembered.
+
+    Args:
+        view: of the call.
+        opened: the scan.
+        kind: of what is made.
+        make: returns what follows from the rows that begin in a stretch, the newest first. Of one
+            without parts the call may leave out what is not `stored`.
+        key_of: returns under which key that of a stretch is remembered; None: under none.
+        beside: how far before and after a stretch (ns) rows are part of it, too.
+        trouble: differs from before where something could not be read since.
+    """
+    known = view.memory.columns.fragments(joining(kind))
+    for stretch in opened.stretches(beside):
+        key = key_of(stretch)
+        if key is None:
+            yield from make(stretch._replace(parts=None))
+            continue
+        view.bags.check_deadline()
+        joined = known.get(key)
+        if joined is None:
+            before = trouble(), view.notes.added
+            made = [one for _, one in make(stretch)]
+            joined = Joined(kind.join(made[::-1]) if made else [])
+            if before == (trouble(), view.notes.added):
+                known.put(key, joined)
+        for one in reversed(joined.found):
+            yield stretch.window.start, one
 
 
 def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:

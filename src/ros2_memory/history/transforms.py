@@ -6,6 +6,7 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 
 from __future__ import annotations
 
+from collections import deque
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -21,6 +22,7 @@ from ros2_memory.analysis.frames import (
     static_at,
 )
 from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.store import relative
 from ros2_memory.columns.transforms import (
     STATICS,
     Pair,
@@ -54,13 +56,14 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import decoded_rows, messages_of, scan
+from ros2_memory.history.scan import decoded_rows, joined_back, messages_of, open_scan, scan
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
@@ -76,6 +79,8 @@ _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CA
 _LONGER_NS: Final[Ns] = 3600 * NS_PER_S
 """How far around the moment frames are looked for that are unknown then."""
 
+_FEW_SESSIONS: Final = 4
+"""Sessions of which static transforms are looked up one by one."""
 _BORROWED: Final = Reason(
     "is placed by transforms of another recording of the same time; no handover proves that both "
     "are of one robot",
@@ -237,6 +242,11 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     if kept is not None and kept[0] is timeline:
         sessions.statics[among] = kept[1]
         return kept[1]
+    if len(sessions.statics) == _FEW_SESSIONS:
+        # Who has asked for so many asks for more.
+        _find_all_statics(view, topics)
+        if among in sessions.statics:
+            return sessions.statics[among]
     before = view.notes.added
     found = [each for topic in topics for each in _received(view, topic, among)]
     found.sort(key=lambda one: one.log_time)
@@ -248,6 +258,43 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     return static
 
 
+def _find_all_statics(view: View, topics: Sequence[str]) -> None:
+    """Finds the static transforms of all sessions that are stored, unless some are carried."""
+    sessions, root = sessions_of(view), view.memory.index.bag_dir
+    coverage = view.memory.columns.coverage(view.snapshot.timeline)
+    recordings = [path for topic in topics for path in view.snapshot.timeline.recordings(topic)]
+    if coverage is None or any(map(sessions.holds_carried, recordings)):
+        return
+    found: dict[Session, list[StampedTransform]] = {}
+    for topic in topics:
+        for one in _statics_back(view, topic, TimeWindow.everything()):
+            found.setdefault(sessions.of(root / one.recording), []).extend(one.transforms)
+    for session in {sessions.of(bag.recording) for bag in coverage.missing}:
+        found.pop(session, None)
+    for session, received in found.items():
+        received.sort(key=lambda one: one.log_time)
+        sessions.statics[session] = _changes(received)
+
+
+def make_statics(view: View, window: TimeWindow) -> None:
+    """Makes the static transforms of the parts in a window."""
+    for topic in _recorded(view, view.memory.limits.tf_static_topics):
+        deque(_statics_back(view, topic, window), maxlen=0)
+
+
+def _statics_back(view: View, topic: str, window: TimeWindow) -> Iterator[Statics]:
+    """Yields the static transforms of a topic in a window, of bags that are stored."""
+    opened = open_scan(view, topic, window, copies=True, stored=True)
+
+    def make(stretch: Stretch) -> Iterator[tuple[Ns, Statics]]:
+        for rows in opened.rows(newest_first=True, among=stretch.window):
+            if stretch.window.contains(max(rows.first, window.start)):
+                yield rows.first, _changes_in(view, rows)
+
+    for _, statics in joined_back(view, opened, STATICS, make):
+        yield statics
+
+
 def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
     """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
@@ -257,7 +304,7 @@ def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransfo
                 if sessions.has(among, found):
                     yield from decoded_transforms(view, found)
         elif sessions.folder(rows.recording) in among:
-            yield from _changes_in(view, rows)
+            yield from _changes_in(view, rows).transforms
 
 
 def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
@@ -267,11 +314,12 @@ def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
     return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
 
 
-def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
+def _changes_in(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
     scanner, part = view.memory.columns, rows.part
+    recording = relative(str(rows.recording), str(view.memory.index.bag_dir))
     if part is None:
-        return [*_decoded(view, rows)]
+        return Statics(recording, tuple(_decoded(view, rows)))
     known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
     made = known.get(key)
     if made is None:
@@ -279,10 +327,10 @@ def _changes_in(view: View, rows: Rows) -> Sequence[StampedTransform]:
         times = static_times(rows.table, rows.times, rows.index)
         new = None if times is None else np.flatnonzero(np.isin(rows.times, times))
         received = _decoded(view, rows if new is None else rows.some(new))
-        made = Statics(tuple(_changes(sorted(received, key=lambda one: one.log_time))))
+        made = Statics(recording, tuple(_changes(sorted(received, key=lambda one: one.log_time))))
         if view.notes.added == noted:
             known.put(key, made)
-    return made.transforms
+    return made
 
 
 def _decoded(view: View, rows: Rows) -> Iterator[StampedTransform]:

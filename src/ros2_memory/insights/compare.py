@@ -22,7 +22,8 @@ from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
 from ros2_memory.places.map_placement import map_placement
-from ros2_memory.places.region_visits import place_visits, places_in, track_in
+from ros2_memory.places.region_visits import places_in, track_in
+from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import parse_where, places_asked, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
@@ -250,18 +251,19 @@ def _places(
     found: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            placed = places_in(view, places, placement, window)
-            visited = place_visits(view, placed, window, passed)
-            durations = {each.place: each.duration for each in visited}
+            inside = [
+                (place.name, robot_inside(track, place.region, window))
+                for place, track in places_in(view, places, placement, window)
+            ]
         else:
-            durations = {
-                place.title: passed.among(
-                    (one.start, one.stop)
-                    for one in times_inside(view, place, placement.frame_id, window)
-                )
+            inside = [
+                (place.title, times_inside(view, place, placement.frame_id, window))
                 for place in where.each
-            }
-        found.append({name: unix_from_ns(each) / 60 for name, each in durations.items()})
+            ]
+        lasted = {
+            name: passed.among((one.start, one.stop) for one in times) for name, times in inside
+        }
+        found.append({name: unix_from_ns(each) / 60 for name, each in lasted.items()})
     return found
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -33,25 +34,24 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.clock_steps import across_steps, elapsed_in
 from ros2_memory.history.driven_path import (
-    blocks_back,
     driven_path,
     resolve_path_topic,
+    slices_by_poses,
     slices_of_path,
 )
 from ros2_memory.history.no_data import resolve_pose_topic
-from ros2_memory.history.poses import pose_rows, slices_back
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterator
 
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
-    from ros2_memory.history.poses import PoseRows
+    from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
@@ -144,16 +144,12 @@ def _standstills_in(
         InvalidArgumentsError: a message of the topic carries no position.
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    blocks = blocks_back(view, topic, window.widened(CONTEXT_NS), [])
-    stands = _stands(view, blocks)[::-1]
+    stands = [*_stands(view, topic, window.widened(CONTEXT_NS))][::-1]
     found = standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(
-        (
-            each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or each.end == last,
-        )
+        (_cut(each, start, end), each.end > end or each.end == last)
         for each in found
         if each.start < end and each.end > start
     )
@@ -167,21 +163,28 @@ def _standstills_in(
     return standstills, drops
 
 
-def _stands(view: View, blocks: Iterable[PoseRows]) -> list[Stands]:
-    """Returns what shows where the robot stood in slices of some poses, the newest first."""
-    known = view.memory.columns.fragments(STANDS)
-    return [
-        some.remembered(known, lambda part: stands_of(part.poses, part.start, part.stop))
-        for some in slices_back(blocks, SLICE_NS, BESIDE_NS)
-    ]
+def _cut(stood: Standstill, start: Ns, end: Ns) -> Standstill:
+    """Returns what of a standstill is in a time, both ends of which are inclusive."""
+    if start <= stood.start and stood.end <= end:
+        return stood
+    return stood._replace(start=max(stood.start, start), end=min(stood.end, end))
 
 
-def slice_drive(view: View, window: TimeWindow) -> None:
-    """Makes the slices of the path in a window, and of where the robot stood, by parts alone."""
+def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[Stands]:
+    """Yields what shows where the robot stood in slices of its poses, the newest first."""
+
+    def make(some: PoseSlice) -> Stands:
+        return stands_of(some.poses, some.start, some.stop)
+
+    for _, stands in slices_by_poses(
+        view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS
+    ):
+        yield stands
+
+
+def make_drive(view: View, window: TimeWindow) -> None:
+    """Makes the slices of the path in a window, and of where the robot stood."""
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)
-        rows = pose_rows(view, topic, window.widened(SLICE_NS), [], newest_first=True, stored=True)
-        blocks = [block for block in rows if block.parts is not None]
-        for _ in slices_of_path(view, blocks):
-            pass
-        _stands(view, blocks)
+        deque(slices_of_path(view, topic, window.widened(SLICE_NS), []), maxlen=0)
+        deque(_stands(view, topic, window.widened(SLICE_NS + BESIDE_NS)), maxlen=0)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
+from heapq import nsmallest
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.facts import FLAG, has_events
@@ -156,7 +157,11 @@ def recap(
     reported, things, throughout = _topic_events(
         view, window, found, there, min_score=least, most=most_events
     )
-    events = [*_stops(drive.stops(end - start), places), *_drops(drive), *reported]
+    stops = drive.stops(end - start)
+    if there is not None:
+        stops = tuple(each for each in stops if there.overlaps(each[0].start, each[0].end))
+    longest = nsmallest(most_events, stops, key=lambda each: each[0].start - each[0].end)
+    events = [*_stops(longest, places), *_drops(drive), *reported]
     events += [
         Event("gap", begin, until, _why_nothing(view, begin, until))
         for begin, until in recording_gaps(view, TimeWindow(start, end))
@@ -169,8 +174,7 @@ def recap(
     note_edges(view, window)
     _note_foxglove_logs(view, window)
     counts = Counter(each.kind for each in events)
-    if things:
-        counts["thing"] = things
+    counts |= Counter(thing=things, stop=len(stops))
     shown = _most_important(view, events, counts, most_events)
     if with_changes:
         shown = _with_changes(changes_in(view, window, found), shown)

@@ -19,13 +19,14 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import blocks, messages_of, scan
+from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.facts import State, Stated
     from ros2_memory.analysis.topic_events import Change, KnownState
+    from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
@@ -71,9 +72,24 @@ def events_back(
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     columns = StatedColumns(view.memory.extractor)
-    scanned = scan(view, topic, window, newest_first=True, reached=reached)
-    for together in blocks(scanned, newest_first=True):
-        yield from _events(view, columns, together, may_match)
+    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    if may_match is not None:
+        for together in blocks(opened.rows(newest_first=True), newest_first=True):
+            yield from _events(view, columns, together, may_match)
+        return
+
+    def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
+        rows = opened.rows(newest_first=True, among=stretch.window)
+        for together in blocks(rows, newest_first=True):
+            first = max(min(one.first for one in together), window.start)
+            is_whole = all(rows.part is not None for rows in together)
+            is_wanted = is_whole or stretch.parts is not None or not view.call.stored
+            if stretch.window.contains(first) and is_wanted:
+                for events in _events(view, columns, together):
+                    yield first, events
+
+    for _, events in joined_back(view, opened, EVENTS, make):
+        yield events
 
 
 def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> None:
@@ -82,13 +98,9 @@ def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> None:
     Raises:
         QueryTimeoutError: the deadline has passed.
     """
-    columns = StatedColumns(view.memory.extractor)
     for topic in topics:
         # What a part has before or after is of it all the same.
-        around = window.widened(PART_NS)
-        for rows in scan(view, topic, around, newest_first=True, stored=True):
-            if rows.part is not None:
-                deque(_events(view, columns, [rows], None), maxlen=0)
+        deque(events_back(view, topic, window.widened(PART_NS)), maxlen=0)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
@@ -118,14 +130,15 @@ def _events(
     view: View,
     columns: StatedColumns,
     together: list[Rows],
-    may_match: Callable[[Table], bool | Mask] | None,
+    may_match: Callable[[Table], bool | Mask] | None = None,
 ) -> Iterator[TopicEvents]:
-    """Yields the events of tables that overlap in time; those of a whole part are kept."""
-    first, part = together[0], together[0].part if len(together) == 1 else None
+    """Yields the events of tables that overlap in time; those of whole parts are remembered."""
+    first = together[0]
+    parts = tuple(rows.part for rows in together if rows.part is not None)
     known = view.memory.columns.fragments(EVENTS)
-    key = None if part is None else FragmentKey(first.first, "", (part,))
+    key = FragmentKey(first.first, "", parts) if len(parts) == len(together) else None
     events = None if key is None else known.get(key)
-    if events is None and key is not None and may_match and not may_match(first.table):
+    if events is None and len(together) == 1 and key and may_match and not may_match(first.table):
         events = TopicEvents(*first.span)
     if events is not None:
         yield events

@@ -7,8 +7,9 @@ not change any more are remembered, so a week is asked again in a tenth of a sec
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
+from collections import defaultdict, deque
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from ros2_memory.analysis.motion.robot_track import (
 from ros2_memory.analysis.poses import headings
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.steps import QUATERNION
+from ros2_memory.columns.store import relative
 from ros2_memory.columns.tracks import TRACKS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import QueryTimeoutError
@@ -40,7 +42,7 @@ from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
 from ros2_memory.history.poses import PoseReader
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import joined_back, open_scan, scan
 from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.frames import Edges, Floats, Mask, Times
     from ros2_memory.analysis.poses import Poses
+    from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import StampedTransform
@@ -143,13 +146,13 @@ class RobotTracks:
         view = self._view
         # Whole stretches, so that no vertex depends on the window; and what may reach into it.
         around = _aligned(window.widened(SILENCE_NS), STRETCH_NS)
-        found: list[tuple[Path, TrackPart]] = []
+        found: list[TrackPart] = []
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
         try:
-            for rows, part in self._parts(around, reading):
-                found.append((rows.recording, part))
-                since = rows.first
+            for start, part in self._parts(around, reading):
+                found.append(part)
+                since = start
         except QueryTimeoutError as error:
             if not found:
                 raise QueryTimeoutError(
@@ -160,46 +163,108 @@ class RobotTracks:
             since = None
         if self._failures:
             note_left_out(view, self._failures[0])
-        left_out = sum(part.left_out for _, part in found)
+        left_out = sum(part.left_out for part in found)
         one, *others = _by_robot(found)
         fastest = view.memory.limits.max_plausible_speed_mps
         tracks = tuple(joined_track(parts, fastest) for parts in others)
         return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
     def make(self, window: TimeWindow) -> None:
-        """Makes the tracks that follow from parts alone, of those in a window and beside it.
+        """Makes the tracks of those in a window and beside it.
 
         Raises:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out.
         """
-        around = window.widened(2 * PART_NS)
-        for topic in self._topics:
-            moving = None if self._is_own else _Moving(self._view, around, around)
-            for rows in scan(self._view, topic, around, newest_first=True, stored=True):
-                groups = self._groups(rows, moving)
-                if self._key(rows, groups) is not None:
-                    self._part(rows, groups, Deadline.never())
+        deque(self._parts(window.widened(2 * PART_NS), Deadline.never()), maxlen=0)
 
-    def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Rows, TrackPart]]:
-        """Yields the track table by table, the newest first."""
+    def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Ns, TrackPart]]:
+        """Yields the track, the newest first, each part with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
-        whole, within = _aligned(window, PART_NS), [(window.start, window.stop)]
+        whole = _aligned(window, PART_NS)
+        moving = [] if self._is_own else self._moving_scans(whole)
         for topic in self._topics:
-            moving = None
-            for rows in scan(self._view, topic, whole, newest_first=True, within=within):
-                if moving is None and not self._is_own:
-                    around = TimeWindow(whole.start, min(rows.last + 1, whole.stop))
-                    moving = _Moving(self._view, around, window)
-                groups = self._groups(rows, moving)
-                if window.covers(rows.first, rows.last):
-                    yield rows, self._part(rows, groups, reading)
-                    continue
-                known = self._known(self._key(rows, groups))
-                if known is not None and not known.left_out:
-                    yield rows, known.some(_inside(known.times, window))
-                elif (inside := _inside(rows.times, window)).size:
-                    yield rows, self._part(rows.some(inside), groups, reading)
+            opened = open_scan(self._view, topic, whole)
+            yield from joined_back(
+                self._view,
+                opened,
+                TRACKS,
+                partial(self._parts_in, opened, moving, window, reading),
+                partial(self._joined_key, opened, moving, window),
+                trouble=lambda: len(self._failures),
+            )
+
+    def _moving_scans(self, window: TimeWindow) -> list[Scan]:
+        """Returns the scans of the moving transforms of a window, and around it."""
+        topics = self._view.snapshot.timeline.topics()
+        around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
+        named = self._view.memory.limits.tf_topics
+        return [
+            open_scan(self._view, each, around, copies=True) for each in named if each in topics
+        ]
+
+    def _parts_in(
+        self,
+        opened: Scan,
+        scans: Sequence[Scan],
+        window: TimeWindow,
+        reading: Deadline,
+        stretch: Stretch,
+    ) -> Iterator[tuple[Ns, TrackPart]]:
+        """Yields the track table by table, of those that begin in a stretch, the newest first."""
+        among = stretch.window.intersect(window)
+        around = TimeWindow(stretch.window.start, stretch.last + 1)
+        moving = None if self._is_own else _Moving(scans, around, window)
+        for rows in opened.rows(newest_first=True, among=among):
+            if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
+                continue
+            groups = self._groups(rows, moving)
+            key = self._key(rows, groups)
+            if key is None and stretch.parts is None and self._view.call.stored:
+                continue
+            if window.covers(rows.first, rows.last):
+                yield rows.first, self._part(rows, groups, reading)
+                continue
+            known = self._known(key)
+            if known is not None and not known.left_out:
+                yield rows.first, known.some(_inside(known.times, window))
+            elif (inside := _inside(rows.times, window)).size:
+                yield rows.first, self._part(rows.some(inside), groups, reading)
+
+    def _joined_key(
+        self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
+    ) -> FragmentKey | None:
+        """Returns what the track of a stretch follows from; None where that may still change."""
+        start, last = stretch.window.start, stretch.last
+        if stretch.parts is None or not window.covers(start, last):
+            return None
+        sessions, span = sessions_of(self._view), TimeWindow(start, last + 1)
+        numbers: dict[Session, int] = {}
+        placed_by: list[object] = []
+        parts = [*stretch.parts]
+        for recording in () if self._is_own else map(opened.recording_of, stretch.parts):
+            own = sessions.of(recording)
+            if not sessions.has_all_kinds(own):
+                return None
+            if own not in numbers:
+                placed_by.append(static_in(static_transforms(self._view, own), span))
+            placed_by.append(numbers.setdefault(own, len(numbers)))
+        for scan_ in scans:
+            found = scan_.whole_parts(span.widened(TF_CACHE_NS))
+            if found is None:
+                return None
+            for recording in map(scan_.recording_of, found):
+                if sessions.holds_carried(recording):
+                    return None
+                placed_by.append(numbers.get(sessions.of(recording)))
+            parts += found
+        return FragmentKey(start, self._settings(placed_by), tuple(parts))
+
+    def _settings(self, placed_by: Sequence[object]) -> str:
+        """Returns what a track depends on besides the poses and transforms in parts, as a text."""
+        clock = self._view.memory.limits.tf_clock
+        settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
+        return hashlib.sha256(settings.encode()).hexdigest()
 
     def _known(self, key: FragmentKey | None) -> TrackPart | None:
         return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
@@ -213,7 +278,8 @@ class RobotTracks:
                 raise QueryTimeoutError("to place poses takes too long")
             noted = self._view.notes.added, len(self._failures)
             placed = self._placed(rows, groups, thins=True)
-            part = track_part(placed.times, placed.x, placed.y, placed.heading, placed.left_out)
+            recording = relative(str(rows.recording), str(self._view.memory.index.bag_dir))
+            part = track_part(*placed)._replace(recording=recording)
             is_sure = noted == (self._view.notes.added, len(self._failures))
             if key is not None and is_sure:
                 self._view.memory.columns.fragments(TRACKS).put(key, part)
@@ -238,9 +304,7 @@ class RobotTracks:
             placed_by.append((group.since, group.static, which))
         if own is None:
             return None
-        clock = self._view.memory.limits.tf_clock
-        settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
-        return FragmentKey(rows.first, hashlib.sha256(settings.encode()).hexdigest(), tuple(parts))
+        return FragmentKey(rows.first, self._settings(placed_by), tuple(parts))
 
     def _groups(self, rows: Rows, moving: _Moving | None) -> list[_Group]:
         """Returns by what the poses of some rows are placed, each since when; none: by nothing."""
@@ -278,7 +342,8 @@ class RobotTracks:
         """
         found = [NOWHERE]
         for topic in self._topics:
-            moving = None if self._is_own else _Moving(self._view, window, window)
+            scans = self._moving_scans(window)
+            moving = None if self._is_own else _Moving(scans, window, window)
             every = scan(self._view, topic, window, newest_first=True)
             found += [self._placed(rows, self._groups(rows, moving), thins=False) for rows in every]
         return _joined(found)
@@ -438,31 +503,16 @@ class _Moving:
     """The tables of moving transforms around times that are asked about, the latest first.
 
     Args:
-        view: of the call.
+        scans: of the transforms.
         window: of the times.
         placed: of those times of which poses are placed.
     """
 
-    def __init__(self, view: View, window: TimeWindow, placed: TimeWindow) -> None:
-        topics = [
-            topic
-            for topic in view.memory.limits.tf_topics
-            if topic in view.snapshot.timeline.topics()
-        ]
+    def __init__(self, scans: Sequence[Scan], window: TimeWindow, placed: TimeWindow) -> None:
         around = window.widened(TF_CACHE_NS)
-        self._waiting = [
-            scan(
-                view,
-                topic,
-                _aligned(around, PART_NS),
-                newest_first=True,
-                copies=True,
-                within=[(around.start, around.stop)],
-            )
-            for topic in topics
-        ]
+        self._waiting = [one.rows(newest_first=True, among=around) for one in scans]
         self._placed = placed.widened(TF_CACHE_NS)
-        self._held: list[list[_Source]] = [[] for _ in topics]
+        self._held: list[list[_Source]] = [[] for _ in scans]
 
     def around(self, first: Ns, last: Ns) -> list[_Source]:
         """Returns the tables that overlap log times (inclusive), none later than asked before."""
@@ -509,22 +559,25 @@ class _Pieces(NamedTuple):
     last: Ns
 
 
-def _by_robot(found: Sequence[tuple[Path, TrackPart]]) -> list[list[TrackPart]]:
+def _by_robot(found: Sequence[TrackPart]) -> list[list[TrackPart]]:
     """Returns the parts of the track in order of time, and of others what lies beside it.
 
     Where several recordings place a robot at a time, that which began first is in the track.
     """
-    parts = [(str(recording), part) for recording, part in found[::-1] if len(part.times)]
-    parts.sort(key=lambda one: int(one[1].times[0]))
+    parts = sorted(
+        (part for part in found[::-1] if len(part.times)), key=lambda part: int(part.times[0])
+    )
     by_recording: dict[str, list[TrackPart]] = defaultdict(list)
-    for recording, part in parts:
-        by_recording[recording].append(part)
+    for part in parts:
+        by_recording[part.recording].append(part)
     if len(by_recording) < 2:
-        return [[part for _, part in parts]]
+        return [parts]
     others: list[list[TrackPart]] = []
     kept: list[TrackPart] = []
     placed: list[_Pieces] = []
     for own in by_recording.values():
+        # They are in the order of their first times: no later one reaches back to the others.
+        placed = [pieces for pieces in placed if pieces.last >= own[0].times[0]]
         beside: list[TrackPart] = []
         for part in own:
             first, last = int(part.times[0]), int(part.times[-1])

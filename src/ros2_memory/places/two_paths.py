@@ -6,6 +6,7 @@ start again between the two.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -116,8 +117,8 @@ def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | N
     marks, _ = _thinned(*_sampled(other))
     near = np.concatenate(
         [
-            np.hypot(*(some[:, None, :] - marks[None, :, :]).transpose(2, 0, 1)).min(axis=1)
-            for some in np.array_split(points, len(points) // 256 + 1)
+            ((some[:, :1] - marks[:, 0]) ** 2 + (some[:, 1:] - marks[:, 1]) ** 2).min(axis=1)
+            for some in np.array_split(points, len(points) // 64 + 1)
         ]
     )
     tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
@@ -215,16 +216,23 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
     every = [(0, each) for each in this] + [(1, each) for each in other]
     every.sort(key=lambda each: (-each[1].duration, each[1]))
     middles: list[PlacedStandstill] = []
-    places = np.empty((len(every), 2))
+    in_cell: dict[tuple[int, int], list[int]] = {}
     sums: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
     for side, stand in every:
-        apart = places[: len(middles)] - (stand.x, stand.y)
-        away = (apart * apart).sum(axis=1)
-        nth = int(away.argmin()) if middles else 0
-        if not middles or away[nth] > SAME_STAND_M**2:
+        column, row = int(stand.x // SAME_STAND_M), int(stand.y // SAME_STAND_M)
+        away, nth = min(
+            (
+                ((middles[one].x - stand.x) ** 2 + (middles[one].y - stand.y) ** 2, one)
+                for x in (column - 1, column, column + 1)
+                for y in (row - 1, row, row + 1)
+                for one in in_cell.get((x, y), ())
+            ),
+            default=(math.inf, 0),
+        )
+        if away > SAME_STAND_M**2:
             nth = len(middles)
-            places[nth] = stand.x, stand.y
+            in_cell.setdefault((column, row), []).append(nth)
             middles.append(stand)
             sums.append([0, 0])
             since.append([None, None])

@@ -17,15 +17,17 @@ import anyio
 import anyio.to_thread
 
 from ros2_memory.columns.fill import Progress
+from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.history.context import Call
+from ros2_memory.history.transforms import make_statics
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
-from ros2_memory.insights.drive import slice_drive
+from ros2_memory.insights.drive import make_drive
 from ros2_memory.insights.topic_events import make_events
 from ros2_memory.places.region_visits import make_tracks
 from ros2_memory.queries import list_recorded_topics
@@ -125,13 +127,17 @@ class Backfill:
         snapshot = self._memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
             return False
-        make_fragments(self._memory, self.filling.whole_since())
+        coverage = self._memory.columns.coverage(snapshot.timeline)
+        missing = () if coverage is None else coverage.missing
+        waiting = [bag.start for bag in missing]
+        make_fragments(self._memory, self.filling.whole_since(), waiting)
         self.filling.thin()
         self.filling.trim()
         if self._of_others is None:
             self._of_others = self._memory.columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
-        make_fragments(self._memory, [TimeWindow(start, start + PART_NS) for start in now])
+        windows = [TimeWindow(start, start + PART_NS) for start in now]
+        make_fragments(self._memory, windows, [*waiting, *self._of_others])
         return bool(self._of_others)
 
     def look_after(self, *, thorough: bool = False) -> None:
@@ -169,16 +175,33 @@ class Backfill:
             self._memory.store_listings(snapshot)
 
 
-def make_fragments(memory: Memory, windows: Sequence[TimeWindow]) -> None:
-    """Makes what follows from the parts of some times; stores it, and what questions made of it."""
-    for nth, window in enumerate(windows, 1):
+def make_fragments(
+    memory: Memory, windows: Sequence[TimeWindow], waiting: Sequence[Ns] = ()
+) -> None:
+    """Makes what follows from the parts of some times; stores it, and what questions made of it.
+
+    It is joined by stretches of the clock, but for those in which bags or slices are `waiting`: log
+    times (ns) where they begin.
+    """
+    around = [window.widened(PART_NS) for window in windows]
+    ends = {(one.start // STRETCH_NS, one.stop // STRETCH_NS) for one in around}
+    touched = {number for first, last in ends for number in range(first, last + 1)}
+    touched -= {start // STRETCH_NS for start in waiting}
+    # What is joined of a stretch needs all parts of it, and those that reach into it.
+    stretches = [
+        TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
+        for number in sorted(touched, reverse=True)
+    ]
+    for nth, window in enumerate([*windows, *stretches], 1):
         try:
-            view = View(memory, Call())
-            slice_drive(view, window)
+            view = View(memory, Call(stored=True))
+            make_statics(view, window)
+            make_drive(view, window)
             make_tracks(view, window)
-            Watching(view).make(window)
             make_events(view, window, topics_with_changes(view))
-            memory.columns.make_outlines(view.snapshot.timeline, window)
+            if nth <= len(windows):
+                Watching(view).make(window)
+                memory.columns.make_outlines(view.snapshot.timeline, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.

@@ -25,7 +25,7 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.large_reads import LargeReads, return_free_memory
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
 from ros2_memory.core.text import abbreviate
@@ -61,6 +61,8 @@ _IDLE_S: Final = 1.0
 """How long nobody must have asked until work in advance begins."""
 _LONGEST_IN_ADVANCE_S: Final = 120.0
 _REPORTED_WAIT_S: Final = 0.5
+_LONG_S: Final = 0.1
+"""An answer that took longer used so much memory that what is free of it goes back."""
 _LOGGED_CHARS: Final = 300
 _LONGEST_NAME: Final = 64
 
@@ -300,9 +302,14 @@ class Dispatcher:
     def _asked(self, answer: Callable[[], Reply], call: Call, wait: _Wait) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""
         wait.end()
-        # Around all of it: an error keeps what was read alive until it has become a reply.
-        with call.reading(self._large):
-            return self._outcome_of(answer, wait)
+        begun = time.monotonic()
+        try:
+            # Around all of it: an error keeps what was read alive until it has become a reply.
+            with call.reading(self._large):
+                return self._outcome_of(answer, wait)
+        finally:
+            if time.monotonic() - begun > _LONG_S:
+                return_free_memory()
 
     def _outcome_of(self, answer: Callable[[], Reply], wait: _Wait) -> tuple[str, Reply]:
         try:

@@ -11,14 +11,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.columns.fragments import DAY_NS, Fragment, FragmentKey, Fragments, Kind
+from ros2_memory.columns.fragments import Fragment, FragmentKey, Fragments, Kind
 from ros2_memory.columns.motion import PATHS, STANDS
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.history.driven_path import blocks_back, slices_of_path
+from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.view import View
+from ros2_memory.storage.cache import ByteLru
 from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
 
@@ -62,6 +63,10 @@ def part_of(store: ColumnStore) -> int:
     return head.number
 
 
+def words_in(store: ColumnStore, settings: str = "") -> Fragments[Words]:
+    return Fragments(store, WORDS, settings, ByteLru(10**6))
+
+
 def fragments_in(file: Path) -> int:
     with closing(sqlite3.connect(file)) as base:
         return int(base.execute("SELECT count(*) FROM fragment").fetchone()[0])
@@ -89,7 +94,7 @@ def test_a_fragment_is_the_same_once_it_was_stored(
 
 def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world: World) -> None:
     store, key = world.store, FragmentKey(T0, "any", (part_of(world.store),))
-    one, other = Fragments(store, WORDS, "", 10**6), Fragments(store, WORDS, "", 10**6)
+    one, other = words_in(store), words_in(store)
     assert other.get(key) is None
     one.put(key, Words("there"))
     assert other.get(key) is None
@@ -101,16 +106,16 @@ def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world:
 
 def test_a_fragment_of_other_parts_settings_or_days_is_another(world: World) -> None:
     part = part_of(world.store)
-    known = Fragments(world.store, WORDS, "", 10**6)
+    known = words_in(world.store)
     known.put(FragmentKey(T0, "any", (part,)), Words("there"))
     known.write()
     for other in (
         FragmentKey(T0, "any", ()),
         FragmentKey(T0, "other", (part,)),
-        FragmentKey(T0 + DAY_NS, "any", (part,)),
+        FragmentKey(T0 + S, "any", (part,)),
     ):
-        assert Fragments(world.store, WORDS, "", 10**6).get(other) is None
-    assert Fragments(world.store, WORDS, "else", 10**6).get(FragmentKey(T0, "any", (part,))) is None
+        assert words_in(world.store).get(other) is None
+    assert words_in(world.store, "else").get(FragmentKey(T0, "any", (part,))) is None
 
 
 def test_fragments_go_with_their_part(world: World, tmp_path: Path) -> None:
@@ -126,7 +131,7 @@ def test_a_fragment_of_a_part_that_went_meanwhile_is_not_stored(
     world: World, tmp_path: Path
 ) -> None:
     key = FragmentKey(T0, "any", (part_of(world.store),))
-    known = Fragments(world.store, WORDS, "", 10**6)
+    known = words_in(world.store)
     known.put(key, Words("secret"))
     world.store.delete(world.store.paths())
     known.write()
@@ -139,7 +144,7 @@ def test_a_damaged_fragment_is_made_again(world: World, tmp_path: Path) -> None:
         base.execute("UPDATE fragment SET data = x'00'")
     again = World.of(tmp_path)
     view = View(again.memory, Call())
-    slices = [*slices_of_path(view, blocks_back(view, "/odom", EVERYTHING, []))]
+    slices = [*slices_of_path(view, "/odom", EVERYTHING, [])]
     assert sum(path.poses for _, path in slices) == 3000
 
 
@@ -162,9 +167,9 @@ def test_stored_slices_of_a_path_are_those_that_are_measured_now(world: World) -
     assert scanner.store is not None
     view = View(world.memory, Call())
     window = TimeWindow(T0, T0 + 600 * S)
-    stored = [path for _, path in slices_of_path(view, blocks_back(view, "/odom", window, []))]
+    stored = [path for _, path in slices_of_path(view, "/odom", window, [])]
     plain = View(world.unstored().memory, Call())
-    made = [path for _, path in slices_of_path(plain, blocks_back(plain, "/odom", window, []))]
+    made = [path for _, path in slices_of_path(plain, "/odom", window, [])]
     assert [path.totals for path in stored] == [path.totals for path in made]
     for one, other in zip(stored, made, strict=True):
         np.testing.assert_array_equal(one.line.times, other.line.times)

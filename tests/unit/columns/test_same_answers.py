@@ -54,7 +54,8 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
         yield f"velocity {at}", partial(_velocity, moment)
         for child in ("laser", "base_link"):
             yield f"{child} {at}", partial(_transform, child, moment)
-    for first, last in (sorted(draw.sample(moments, 2)), (min(moments), max(moments))):
+    most = min(moments) - 600 * S, max(moments) + 600 * S
+    for first, last in (sorted(draw.sample(moments, 2)), (min(moments), max(moments)), most):
         span = TimeRange(start_s=first / 1e9, end_s=last / 1e9)
         for topic in ("/odom", "/chatter", "/dock"):
             yield f"{topic} in {span}", partial(_range, topic, span)

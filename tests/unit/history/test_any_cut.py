@@ -124,6 +124,7 @@ def _matches(draw: Random, condition: dict[str, Any], moments: Sequence[int]) ->
 
 def _window(draw: Random, moments: Sequence[int]) -> dict[str, Any]:
     start, end = sorted(draw.sample(moments, 2))
+    start = draw.choice([start, start, min(moments) - 600 * S])
     return {"start": start / S, "end": draw.choice([end, end, max(moments) + 60 * S]) / S}
 
 

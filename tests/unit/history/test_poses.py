@@ -48,11 +48,10 @@ def read(view: View, topic: str, window: TimeWindow) -> Poses | None:
     return poses_of(found)
 
 
-def scanned(view: View, topic: str, window: TimeWindow, *, newest_first: bool = False) -> Poses:
-    blocks = [*pose_rows(view, topic, window, [], newest_first=newest_first)]
-    ordered = blocks[::-1] if newest_first else blocks
-    assert all(before.last < after.first for before, after in pairwise(ordered))
-    return joined_poses([each.poses for each in ordered])
+def scanned(view: View, topic: str, window: TimeWindow) -> Poses:
+    blocks = [*pose_rows(view, topic, window, [])]
+    assert all(before.last < after.first for before, after in pairwise(blocks))
+    return joined_poses([each.poses for each in blocks])
 
 
 def assert_alike(found: Poses, expected: Poses) -> None:
@@ -73,9 +72,7 @@ def check(memory: Memory, window: TimeWindow = EVERYTHING) -> int:
             with pytest.raises(InvalidArgumentsError):
                 scanned(view, topic, window)
             continue
-        for newest_first in (False, True):
-            found = scanned(view, topic, window, newest_first=newest_first)
-            assert_alike(found, expected)
+        assert_alike(scanned(view, topic, window), expected)
         count += len(expected) > 0
     return count
 

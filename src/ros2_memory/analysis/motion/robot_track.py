@@ -85,6 +85,7 @@ class TrackPart(NamedTuple):
         known: whether the heading is known.
         settled: whether no other pose can be in the stretch of this one.
         left_out: poses that could not be placed.
+        recording: the folder of the recording that they are of.
     """
 
     times: Times
@@ -94,6 +95,7 @@ class TrackPart(NamedTuple):
     known: Mask
     settled: Mask
     left_out: int = 0
+    recording: str = ""
 
     @property
     def memory_bytes(self) -> int:
@@ -102,10 +104,28 @@ class TrackPart(NamedTuple):
 
     def some(self, index: NDArray[np.intp]) -> TrackPart:
         """Returns some vertices of it, in the order given."""
-        times, x, y, turns, known, settled, left_out = self
-        return TrackPart(
-            times[index], x[index], y[index], turns[index], known[index], settled[index], left_out
+        return self._replace(
+            times=self.times[index],
+            x=self.x[index],
+            y=self.y[index],
+            turns=self.turns[index],
+            known=self.known[index],
+            settled=self.settled[index],
         )
+
+
+def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
+    """Returns the vertices of some parts, of which there is one at least, as of the first one."""
+    return TrackPart(
+        np.concatenate([part.times for part in parts]),
+        np.concatenate([part.x for part in parts]),
+        np.concatenate([part.y for part in parts]),
+        np.concatenate([part.turns for part in parts]),
+        np.concatenate([part.known for part in parts]),
+        np.concatenate([part.settled for part in parts]),
+        sum(part.left_out for part in parts),
+        parts[0].recording,
+    )
 
 
 def empty_track() -> RobotTrack:
@@ -144,14 +164,7 @@ def joined_track(parts: Sequence[TrackPart], fastest_mps: float = math.inf) -> R
     """Returns the track by the poses of several tables; of two of one time the first counts."""
     if not parts:
         return empty_track()
-    whole = TrackPart(
-        np.concatenate([part.times for part in parts]),
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.turns for part in parts]),
-        np.concatenate([part.known for part in parts]),
-        np.concatenate([part.settled for part in parts]),
-    )
+    whole = united_parts(parts)
     if len(parts) > 1:
         order = np.argsort(whole.times, kind="stable")
         times = whole.times[order]

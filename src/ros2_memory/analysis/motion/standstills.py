@@ -392,27 +392,28 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     still = blocks.are_still()
     moves = _creeping(blocks, chain, still) | ~still
     found: list[Standstill] = []
-    runs = _runs(~moves, chain)
-    for begin, stop, box in zip(*runs, _boxes(blocks, *runs), strict=True):
-        start, end = int(blocks.firsts[begin]), int(blocks.lasts[stop - 1])
-        if blocks.starts[begin] != MIN_NS:
-            start = int(blocks.starts[begin])
-        if blocks.ends[stop - 1] != MIN_NS:
-            end = int(blocks.ends[stop - 1])
+    begins, stops = _runs(~moves, chain)
+    starts, ends = blocks.starts[begins], blocks.ends[stops - 1]
+    starts = np.where(starts == MIN_NS, blocks.firsts[begins], starts)
+    ends = np.where(ends == MIN_NS, blocks.lasts[stops - 1], ends)
+    runs = (column.tolist() for column in (begins, stops, starts, ends))
+    until = MIN_NS
+    for begin, stop, since, end, box in zip(*runs, _boxes(blocks, begins, stops), strict=True):
         # Ends are followed into each other's slots.
-        start = max(start, found[-1].end if found else MIN_NS)
+        start = max(since, until)
         if end - start < SHORTEST_NS:
             continue
         if box.diagonal <= LARGEST_M:
             found.append(Standstill(start, end, box))
         else:
             found += _in_run(blocks, begin, stop, start, end)
+        until = found[-1].end
     return tuple(found)
 
 
-def _boxes(blocks: Blocks, begins: Sequence[int], stops: Sequence[int]) -> Iterator[Box3]:
+def _boxes(blocks: Blocks, begins: Ints, stops: Ints) -> Iterator[Box3]:
     """Yields the boxes around some half-open ranges of blocks, which follow each other."""
-    if not begins:
+    if not begins.size:
         return
     edges = np.stack([begins, stops], axis=1).reshape(-1)
     # One row more, since the last range may end where the blocks do.
@@ -422,12 +423,11 @@ def _boxes(blocks: Blocks, begins: Sequence[int], stops: Sequence[int]) -> Itera
         yield Box3((a, b, c), (d, e, f))
 
 
-def _runs(marks: Marks, chain: Ints) -> tuple[list[int], list[int]]:
+def _runs(marks: Marks, chain: Ints) -> tuple[Ints, Ints]:
     """Returns where the ranges in one chain in which marks are set begin, and where they stop."""
     is_new = np.r_[True, (np.diff(chain) != 0) | ~marks[:-1]]
     is_over = np.r_[(np.diff(chain) != 0) | ~marks[1:], True]
-    begins, stops = np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
-    return begins.tolist(), stops.tolist()
+    return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
 
 
 def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterator[Standstill]:

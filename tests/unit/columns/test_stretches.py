@@ -1,0 +1,144 @@
+"""What follows from whole parts is joined by stretches of the clock, and goes with any of these."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from ros2_memory.columns import scan
+from ros2_memory.columns.fragments import Fragment, Joined, Kind, joining
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
+from ros2_memory.history.driven_path import slices_of_path
+from ros2_memory.history.scan import open_scan
+from ros2_memory.history.view import View
+from ros2_memory.insights.topic_events import events_in
+from ros2_memory.serving import backfill
+from tests.support.bags import boolean, odom, write_mcap
+from tests.support.column_worlds import World, store_file
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ros2_memory.columns.scan import Stretch
+
+S = NS_PER_S
+T0 = 1_700_000_400 * S
+LENGTH = 1200 * S
+"""Of a stretch in these tests: one begins at T0."""
+WINDOW = TimeWindow(T0 - LENGTH, T0 + 6 * LENGTH)
+
+
+class Numbers:
+    """A value to store: a text, and some numbers."""
+
+    def __init__(self, fragment: Fragment) -> None:
+        self.fragment = fragment
+
+    @property
+    def memory_bytes(self) -> int:
+        return 100
+
+
+NUMBERS = Kind("numbers", lambda made: made.fragment, Numbers)
+
+
+@pytest.fixture
+def world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
+    """Four stretches and a half in bags of 100 s, of three recordings."""
+    for module in (scan, backfill):
+        monkeypatch.setattr(module, "STRETCH_NS", LENGTH)
+    for number in range(54):
+        start = T0 + number * 100 * S
+        messages = [odom(start + n * 5 * S, number + n / 300, 0.1) for n in range(20)]
+        messages += [boolean(start + n * 5 * S, n % 7 > 3) for n in range(20)]
+        write_mcap(tmp_path / f"rec_{number // 18}" / f"{number}.mcap", messages)
+    world = World.of(tmp_path)
+    world.fill()
+    return world
+
+
+def stretches(world: World, window: TimeWindow = WINDOW) -> list[Stretch]:
+    return open_scan(View(world.memory, Call()), "/odom", window).stretches()
+
+
+def starts_of_settled(world: World, window: TimeWindow = WINDOW) -> list[int]:
+    return [one.window.start for one in stretches(world, window) if one.parts is not None][::-1]
+
+
+def joined_fragments(file: Path) -> int:
+    with closing(sqlite3.connect(file)) as base:
+        query = "SELECT count(*) FROM fragment WHERE kind LIKE '%-joined %'"
+        return int(base.execute(query).fetchone()[0])
+
+
+def test_stretches_are_all_of_the_window_and_those_of_whole_parts_have_these(world: World) -> None:
+    found = stretches(world)[::-1]
+    assert [found[0].window.start, found[-1].window.stop] == [WINDOW.start, WINDOW.stop]
+    assert all(one.window.stop == two.window.start for one, two in pairwise(found))
+    # The last one is not over.
+    assert starts_of_settled(world) == [T0 + n * LENGTH for n in range(4)]
+
+
+def test_a_stretch_that_the_window_cuts_is_none(world: World) -> None:
+    window = TimeWindow(T0 + 1, T0 + 4 * LENGTH - 1)
+    assert starts_of_settled(world, window) == [T0 + LENGTH, T0 + 2 * LENGTH]
+
+
+@pytest.mark.parametrize("how", ["gone", "changed"])
+def test_a_stretch_without_one_of_its_bags_is_none(world: World, tmp_path: Path, how: str) -> None:
+    bag = tmp_path / "rec_0" / "13.mcap"  # in the second stretch
+    if how == "gone":
+        bag.unlink()
+    else:
+        write_mcap(bag, [odom(T0 + 1301 * S, 0, 0)])
+    again = World.of(tmp_path)
+    assert starts_of_settled(again) == [T0, T0 + 2 * LENGTH, T0 + 3 * LENGTH]
+
+
+def test_answers_are_the_same_with_and_without_what_is_joined(world: World) -> None:
+    view, plain = View(world.memory, Call()), View(world.unstored().memory, Call())
+    assert starts_of_settled(world)
+    assert events_in(view, "/bumper", WINDOW) == events_in(plain, "/bumper", WINDOW)
+    one, other = (
+        [
+            (path.first, path.poses, path.totals)
+            for _, path in slices_of_path(each, "/odom", WINDOW, [])
+        ]
+        for each in (view, plain)
+    )
+    assert one == other
+
+
+def test_what_is_joined_is_made_while_filling_and_goes_with_any_part(
+    world: World, tmp_path: Path
+) -> None:
+    before = joined_fragments(store_file(tmp_path))
+    assert before > 0
+    for bag in (tmp_path / "rec_1").iterdir():  # half of some stretches
+        bag.unlink()
+    world.memory.index.refresh()
+    world.prune()
+    assert 0 < joined_fragments(store_file(tmp_path)) < before
+
+
+def test_joined_fragments_are_stored_as_one() -> None:
+    kind = joining(NUMBERS)
+    every = [
+        Fragment("one", {"a": np.arange(3), "b": np.arange(6.0).reshape(2, 3)}),
+        Fragment("two", {"a": np.arange(0)}),
+        Fragment("three", {"c": np.array([True]), "a": np.arange(7)}),
+    ]
+    stored = Fragment.from_bytes(kind.store(Joined([*map(Numbers, every)])).to_bytes())
+    found = [one.fragment for one in kind.load(stored).found]
+    assert [one.head for one in found] == ["one", "two", "three"]
+    for one, other in zip(found, every, strict=True):
+        assert one.arrays.keys() == other.arrays.keys()
+        for name, array in one.arrays.items():
+            np.testing.assert_array_equal(array, other.arrays[name])
