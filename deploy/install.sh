@@ -219,6 +219,18 @@ done
 for name in $services; do
   place "deploy/$name.service" "$units/$name.service" file
 done
+# Only a person says so, and only before there is a configuration that says otherwise.
+if [ "$query_only" = no ] && [ -t 0 ] && cmp -s "$here/environment" "$root$etc/environment"; then
+  printf 'Keep for a year where the robot drove, and what and whom it saw, after the recordings are deleted? [y/N] '
+  read -r answer || answer=
+  case $answer in
+    y | Y | yes)
+      sed 's/^\(MEMORY_CONFIG_OVERRIDES=".*\)"$/\1 memory.keep=true"/' "$here/environment" >"$root$etc/environment.part"
+      chmod 644 "$root$etc/environment.part"
+      mv -f "$root$etc/environment.part" "$root$etc/environment"
+      ;;
+  esac
+fi
 
 if [ -n "$kept" ]; then
   printf '\nThese differ from ours and stay; ours is beside each, as NAME.new:%s\n' "$kept"

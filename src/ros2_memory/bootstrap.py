@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.base import Housekeeper
+    from ros2_memory.recorder.memory.days import MemoryDays
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.serving.backfill import Backfill
@@ -178,7 +179,37 @@ def build_housekeeper(
         screening=_screening_of(settings, bag_dir, reader),
         static_topics=settings.data.tf_static_topics,
         grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
+        memory=_memory_days_of(settings, bag_dir, bags, own),
     )
+
+
+def _memory_days_of(
+    settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings
+) -> MemoryDays | None:
+    """Returns what writes thinned days; deletes those there are where nothing is to stay."""
+    from ros2_memory.bag_dir.layout import MEMORY_FOLDER
+
+    memory = settings.memory
+    if not memory.keep and not (bag_dir / MEMORY_FOLDER).is_dir():
+        return None
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
+    from ros2_memory.storage.mcap.writer import McapWriter
+
+    limits = MemoryLimits(
+        memory.texts,
+        memory.labels,
+        round(memory.max_share * settings.retention.max_total_gb * GB),
+        ns_from_unix(memory.max_age_d * 86_400),
+    )
+    writer = McapWriter(settings.reader.max_chunk_mb)
+    static = settings.data.tf_static_topics
+    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    days = MemoryDays(bag_dir, bags, writer, own, extractor, limits=limits, static_topics=static)
+    if memory.keep:
+        return days
+    days.clear()
+    return None
 
 
 def _watch_of(

@@ -326,6 +326,21 @@ class RetentionSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class MemorySettings:
+    """What stays of bags that retention deletes: nothing, unless `keep` is true.
+
+    `texts` are names or globs of topics of which texts stay, too; `labels` are the labels of people
+    that stay. `max_share` is of `retention.max_total_gb`.
+    """
+
+    keep: Flag
+    texts: tuple[Text, ...]
+    labels: tuple[Text, ...]
+    max_share: Annotated[float, Field(strict=True, gt=0, le=0.5)]
+    max_age_d: Positive
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class ServerSettings:
     """How the query server is reached, and what it offers. Port 0 is any free port.
 
@@ -609,6 +624,7 @@ class Settings:
     reader: ReaderSettings
     store: StoreSettings
     retention: RetentionSettings
+    memory: MemorySettings
     server: ServerSettings
     fleet: FleetSettings
     lake: LakeSettings

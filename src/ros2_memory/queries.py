@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.frames import TF_CACHE_NS
+from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
+from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -189,7 +191,7 @@ def position(
     if body is not None:
         return _position_of_body(view, body, (at, tolerance_s, moment.rest_s), now, frame_id)
     _require_kind(view, name, "position", "geodetic")
-    found = _found_at(view, name, at, tolerance_s, moment.rest_s)
+    found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     return _position_in(view, found, at, now, frame_id)
 
 
@@ -280,7 +282,7 @@ def velocity(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
-    found = _found_at(view, name, at, tolerance_s, moment.rest_s)
+    found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     _note_held(view, found, at)
     twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
     if twist is None:
@@ -626,7 +628,13 @@ def _before(before_s: float | None) -> Ns:
 
 
 def _found_at(
-    view: View, topic: str, at: Ns, tolerance_s: float | None, rest_s: float
+    view: View,
+    topic: str,
+    at: Ns,
+    tolerance_s: float | None,
+    rest_s: float,
+    *,
+    is_pose: bool = False,
 ) -> StoredMessage:
     """Returns the newest message of a topic at or before a moment: of any age where it is latched.
 
@@ -636,6 +644,12 @@ def _found_at(
     limits = view.memory.limits
     window, tolerance = _within(view, at, tolerance_s, rest_s)
     found = view.stream.newest(topic, window)
+    if found is None and tolerance_s is None and is_pose:
+        # In a thinned day the pose of some seconds before holds, unless there is a later one.
+        before = TimeWindow(max(window.start - 2 * THINNED_NS, MIN_NS), window.stop)
+        found = view.stream.newest(topic, before)
+        if found is not None and not is_thinned(found.bag.file):
+            found = None
     if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
         found = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
         if found is None:

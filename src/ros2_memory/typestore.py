@@ -98,6 +98,10 @@ class MessageType(NamedTuple):
         """Decodes a payload."""
         return self.store.deserialize_cdr(payload, self.name)
 
+    def serialize(self, message: object) -> bytes:
+        """Encodes a decoded message as CDR."""
+        return bytes(self.store.serialize_cdr(message, self.name))
+
 
 class _UnusableError(Exception):
     """A definition that no deserializer can be made of; the text is the reason."""

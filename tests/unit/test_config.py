@@ -74,6 +74,13 @@ class TestDefaults:
                 "foreign": "keep",
                 "require_shipped": False,
             },
+            "memory": {
+                "keep": False,
+                "texts": (),
+                "labels": (),
+                "max_share": 0.2,
+                "max_age_d": 400.0,
+            },
             "server": {
                 "name": "episodic",
                 "transport": "stdio",

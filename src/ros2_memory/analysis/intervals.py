@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 SILENCE_NS: Final[Ns] = 10 * NS_PER_S
 """After so long without a message an object counts as gone: many detectors publish only what
 they see."""
+THINNED_NS: Final[Ns] = 7 * NS_PER_S
+"""In a day of which only some messages stayed, each topic has one in so long, or as it had them."""
 FLICKER_NS: Final[Ns] = 3 * NS_PER_S
 """An object that is missed for less did not leave."""
 USUAL_PERIODS: Final = 3

@@ -191,6 +191,10 @@ class BagDirReader(BagReader):
         """Decodes as the adapter does."""
         return self._reader.decode(record)
 
+    def encode(self, channel: Channel, message: object) -> bytes:
+        """Encodes as the adapter does."""
+        return self._reader.encode(channel, message)
+
     def definition(self, channel: Channel) -> Definition | None:
         """Returns what the adapter returns."""
         return self._reader.definition(channel)

@@ -11,6 +11,7 @@
         metadata.yaml                      written by rosbag2 at a clean end
         handover.json                      which messages count (see `handover_file`)
       latched/carried.mcap         latched messages of deleted bags (see `retention.latched_carry`)
+      memory/20261120.mcap         what stays of the bags of a day (see `recorder.memory.days`)
       moments/                     bags that were asked to be saved (see `moment_file`)
         20261120T043012Z-charging/         one saved moment
           moment.json                      its label and its time
@@ -47,6 +48,7 @@ METADATA_FILE: Final = "metadata.yaml"
 CARRY_FOLDER: Final = "latched"
 CARRY_FILE: Final = "carried.mcap"
 _CARRIED: Final = f"/{CARRY_FOLDER}/{CARRY_FILE}"
+MEMORY_FOLDER: Final = "memory"
 MOMENTS_FOLDER: Final = "moments"
 MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
@@ -70,6 +72,7 @@ BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 COMPRESSED: Final = ".zstd"
 
 _TIME_FORMAT: Final = "%Y%m%dT%H%M%SZ"
+_DAY_FILE: Final = re.compile(r"\d{8}(?:_\d+)?\.mcap")
 _RECORDING_NAME: Final = re.compile(r"rec_(\d{8}T\d{6}Z)(?:_\d+)?")
 
 
@@ -94,12 +97,28 @@ def is_carried(bag: Path | str) -> bool:
     return f"/{bag}".endswith(_CARRIED)
 
 
+def is_thinned(bag: Path | str) -> bool:
+    """Returns whether a bag is a day of `memory/`: what stays of others that were deleted."""
+    folder, _, name = f"/{bag}".rpartition("/")
+    return folder.endswith(f"/{MEMORY_FOLDER}") and _DAY_FILE.fullmatch(name) is not None
+
+
+def utc_day(at: Ns) -> str:
+    """Returns the day of a time, as names have it: `20261120`."""
+    return utc_stamp(at).partition("T")[0]
+
+
+def memory_file(day: str, number: int = 0) -> str:
+    """Returns the name of the file of a day; of a further one, where another cannot be changed."""
+    return f"{day}_{number}.mcap" if number else f"{day}.mcap"
+
+
 def is_kept_apart(name: str) -> bool:
-    """Returns whether a path in the bag directory is of saved moments or carried messages.
+    """Returns whether a path in the bag directory is of moments, thinned days or carried messages.
 
     Those are in no list of recordings.
     """
-    return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER}
+    return name.partition("/")[0] in {MOMENTS_FOLDER, CARRY_FOLDER, MEMORY_FOLDER}
 
 
 def utc_stamp(at: Ns) -> str:

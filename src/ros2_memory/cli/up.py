@@ -17,7 +17,7 @@ from rich.live import Live
 
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
-from ros2_memory.bag_dir.layout import ROS_LOG_DIR
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, ROS_LOG_DIR
 from ros2_memory.bootstrap import build_reader
 from ros2_memory.cli.options import MB, BagDir, Overrides, load_for
 from ros2_memory.cli.output import escape, format_duration, print_line, spinner, stdout_console
@@ -60,6 +60,10 @@ EVERY_S: Final = 10.0
 _TICK_S: Final = 0.2
 _PATIENCE: Final = Patience(interrupt_s=40.0, terminate_s=5.0)
 """The recorder waits for children of its own."""
+_KEEP_FOR_A_YEAR: Final = (
+    "Keep for a year where the robot drove, and what and whom it saw, after the recordings are "
+    "deleted?"
+)
 _LOGGING: Final = ("logging.level=warning", "logging.format=pretty")
 
 
@@ -123,6 +127,8 @@ def up(
     else:
         _require_messages(robot, found)
         _propose(robot, found, disk, yes=yes)
+    if not settings.memory.keep and _remembers(bags, yes=yes):
+        robot.words.append("memory.keep=true")
     if script is not None:
         _hand_over(script, robot)
     return _run_programs(robot.words, robot.bag_dir)
@@ -216,6 +222,16 @@ def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:
             "with recording.topics_file=FILE"
         ) from error
     print_line(f"wrote {robot.list_file}")
+
+
+def _remembers(bags: Path, *, yes: bool) -> bool:
+    """Returns whether something of the bags is to outlive them: only a person says so, once."""
+    if (bags / MEMORY_FOLDER).is_dir():
+        print_line(f"{bags / MEMORY_FOLDER} goes on: memory.keep=false would delete it")
+        return True
+    if yes or not sys.stdin.isatty():
+        return False
+    return typer.confirm(_KEEP_FOR_A_YEAR, default=False)
 
 
 def _show_list(robot: _Robot, found: Survey, disk: Disk) -> None:

@@ -35,7 +35,7 @@ LABELS: Final = ("label", "class_id", "class_name", "class", "object")
 LISTS_OF_LABELS: Final = frozenset({"labels", "class_ids", "objects", "classes"})
 _FRAMES: Final = ("frame_id", "child_frame_id", "parent", "child")
 _OTHER_NAMES: Final = ("name", "names", "id", "hardware_id", "type", "encoding", "format", "skill")
-_NAMES: Final = LISTS_OF_LABELS.union(LABELS, _FRAMES, _OTHER_NAMES)
+NAMES_IN_MESSAGES: Final = LISTS_OF_LABELS.union(LABELS, _FRAMES, _OTHER_NAMES)
 """Fields of messages that hold names."""
 _NAME: Final = re.compile(r"[A-Za-z0-9_./:+-]{1,80}( [A-Za-z0-9_./:+-]{1,20})?")
 """One word, or two: `map`, `traffic light`."""
@@ -164,7 +164,7 @@ def still_quoted(text: str, *parts: str) -> str:
 def quote(value: JsonValue, field: str = "") -> JsonValue:
     """Returns a value of a message with its texts quoted; `field` is the path that it is of."""
     if isinstance(value, str):
-        is_name = not value or field.rpartition(".")[2] in _NAMES
+        is_name = not value or field.rpartition(".")[2] in NAMES_IN_MESSAGES
         return named(value) if is_name else Quoted(value)
     if isinstance(value, dict):
         return {named(name): quote(part, name) for name, part in value.items()}

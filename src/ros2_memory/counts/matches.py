@@ -257,9 +257,10 @@ def _spans_of(
 
 def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     """Returns the gaps in the recording, each until the first message of a topic after it."""
-    firsts = [each.first for each in binned.view.stream.overlapping_bags([topic], binned.counted)]
+    bags = binned.view.stream.overlapping_bags([topic], binned.counted)
+    # Within a bag that has the topic before and after it, a gap ends where it does.
     return [
-        (begin, min((each for each in firsts if each >= end), default=end))
+        (begin, min((max(bag.first, end) for bag in bags if bag.last >= end), default=end))
         for begin, end in binned.gaps
     ]
 

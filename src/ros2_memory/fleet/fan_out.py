@@ -68,7 +68,13 @@ class FanOut:
                     continue
                 own_s = min(limit_s, end_s - now_s)
                 deadline = call.deadline.within(own_s)
-                own = replace(call, deadline=deadline, stages=Stages(), used_active=False)
+                own = replace(
+                    call,
+                    deadline=deadline,
+                    stages=Stages(),
+                    used_active=False,
+                    used_thinned=False,
+                )
                 thread = _started(robot, work, own, answers)
                 running[robot.name] = thread, own, now_s + own_s + left_s * _GRACE
             if running:
@@ -147,6 +153,7 @@ def _add_costs(own: Call, call: Call) -> None:
     for stage, spent in [*own.stages.spent.items()]:
         call.stages.add(stage, spent)
     call.used_active |= own.used_active
+    call.used_thinned |= own.used_thinned
 
 
 def _too_slow(limit_s: float, *, alone: bool) -> QueryTimeoutError:

@@ -6,6 +6,7 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.columns.decode import decoded, with_all_messages
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.scanner import DECODED_BYTES
@@ -176,6 +177,7 @@ class BagAccess:
         self.check_deadline()
         part, reader = _indexed_part(bag, window), self.memory.reader
         records: Iterator[Record] | None = None
+        is_thin = is_thinned(bag.file)
         # The time between two records is the reader's; what happens at `yield` is the caller's.
         clock, spent, count = time.perf_counter_ns, 0, 0
         while True:
@@ -186,6 +188,8 @@ class BagAccess:
                 for record in records:
                     spent += clock() - begin
                     count += 1
+                    if is_thin:
+                        self.call.note_thinned(record.log_time, record.log_time)
                     if count % _DEADLINE_CHECK_INTERVAL == 0:
                         self.check_deadline()
                     yield StoredMessage(bag, record)
@@ -266,6 +270,8 @@ class BagAccess:
         with self.call.stages.timed("read"):
             try:
                 record = self.memory.reader.newest(bag.path, topic, _indexed_part(bag, window))
+                if record is not None and is_thinned(bag.file):
+                    self.call.note_thinned(record.log_time, record.log_time)
                 return None if record is None else StoredMessage(bag, record)
             except BagVanishedError as error:
                 self._note_unreadable(bag, error, window)

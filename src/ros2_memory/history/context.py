@@ -238,6 +238,8 @@ class Call:
 
     Attributes:
         used_active: whether the answer is partly from a bag that is still being written.
+        used_thinned: whether it is partly from a day of which only some messages stayed.
+        asked: what the question is about, where that is known: the rest does not count for that.
         robots: those of a fleet that it may ask about; None for all.
         rows_in: rows that end outside of it are dropped by who asks, so they may be left out; they
             count all the same. None for all.
@@ -250,6 +252,8 @@ class Call:
     deadline: Deadline = field(default_factory=Deadline.never)
     stages: Stages = field(default_factory=Stages)
     used_active: bool = False
+    used_thinned: bool = False
+    asked: TimeWindow | None = None
     robots: frozenset[str] | None = None
     rows_in: TimeWindow | None = None
     now: Ns | None = None
@@ -262,6 +266,10 @@ class Call:
             self.older = None
         else:
             self.older = min(self.older, snapshot.older)
+
+    def note_thinned(self, first: Ns, last: Ns) -> None:
+        """Records that messages between two log times are from a thinned day."""
+        self.used_thinned |= self.asked is None or self.asked.overlaps(first, last)
 
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""

@@ -94,6 +94,9 @@ def note_unread(
     ]
     for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ():
         view.notes.add(sentence)
+    if nothing or search:
+        for sentence in describe_thinned(view.snapshot, window):
+            view.notes.add(sentence)
     bag_dir = view.memory.index.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
         for sentence in (
@@ -107,6 +110,17 @@ def note_unread(
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.notes.add_remarks(odd)
+
+
+def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
+    """Yields a sentence on days of a window of which only some messages stayed, if there are."""
+    days = [bag for bag in snapshot.timeline.thinned if window.overlaps(bag.start, bag.end)]
+    if days:
+        span = f"{unix_text(days[0].start)} to {unix_text(max(bag.end for bag in days))}"
+        yield (
+            f"of {counted(len(days), 'day')} in {span} only some messages stayed: all that a topic "
+            "changed to, saw and had as extremes, and no texts but those that memory.texts names"
+        )
 
 
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
@@ -282,6 +296,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
     forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
     forgotten |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
+    forgotten |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not forgotten:
         return ()
     note_unread(view, window, nothing=True)

@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
@@ -328,10 +328,8 @@ def no_data_at(
     window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
     reason = between(view, window) if is_between else beyond(view, at)
     if older and newer and around is None and reason is NoDataReason.GAP:
-        period = _usual_period(view, older)
-        if newer.time - older.time <= 2 * period:
-            reason = NoDataReason.BETWEEN_MESSAGES
-            detail.append(f"the topic has a message every {seconds(period)}")
+        reason, why = _within_recording(view, older, newer)
+        detail += why
     detail += _advice(view, reason)
     if _is_to_come(view, at):
         detail.append(_to_come(view, at))
@@ -339,6 +337,20 @@ def no_data_at(
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def _within_recording(
+    view: View, older: StoredMessage, newer: StoredMessage
+) -> tuple[NoDataReason, list[str]]:
+    """Returns why there is no message between two that follow each other, and a sentence on it."""
+    if is_thinned(older.bag.file):
+        why = "of that time only some messages stayed: retention deleted the others"
+        return NoDataReason.DELETED, [why]
+    period = _usual_period(view, older)
+    if newer.time - older.time <= 2 * period:
+        every = f"the topic has a message every {seconds(period)}"
+        return NoDataReason.BETWEEN_MESSAGES, [every]
+    return NoDataReason.GAP, []
 
 
 def _usual_period(view: View, found: StoredMessage) -> Ns:

@@ -37,7 +37,13 @@ def scan(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    return open_scan(view, topic, window, **how).rows(newest_first=newest_first)
+
+    def noted(rows: Rows) -> Rows:
+        view.note_thinned(TimeWindow(rows.first, rows.last + 1))
+        return rows
+
+    rows = open_scan(view, topic, window, **how).rows(newest_first=newest_first)
+    return map(noted, rows) if view.snapshot.timeline.thinned else rows
 
 
 class How(TypedDict, total=False):
@@ -132,6 +138,7 @@ def joined_back(
     """
     known = view.memory.columns.fragments(joining(kind))
     for stretch in opened.stretches(beside):
+        view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
         key = key_of(stretch)
         if key is None:
             yield from make(stretch._replace(parts=None))

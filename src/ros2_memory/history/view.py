@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import TimeWindow
@@ -94,6 +95,12 @@ class View:
     def has_poses(self) -> bool:
         """Whether a topic has the robot's poses; else transforms may place it."""
         return has_poses(self)
+
+    def note_thinned(self, window: TimeWindow) -> None:
+        """Records that what was read lies in a window, where that is partly in thinned days."""
+        for day in self.snapshot.timeline.thinned:
+            if window.overlaps(day.start, day.end):
+                self.call.note_thinned(max(window.start, day.start), min(window.stop - 1, day.end))
 
     def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
@@ -274,6 +281,7 @@ def open_moment(memory: Memory, call: Call, moment: AtTime) -> tuple[View, Ns, N
         view, now = _open_now(memory, call, ago)
         at = MIN_NS if ago == MAX_NS else now - ago
     if at > MIN_NS:
+        call.asked = TimeWindow.around(at, THINNED_NS)
         return view, at, now
     earliest = view.snapshot.earliest
     begins = "" if earliest is None else f"; the memory begins at {unix_text(earliest)}"
@@ -294,12 +302,14 @@ def open_span(memory: Memory, call: Call, span: TimeRange) -> tuple[View, TimeWi
         if length <= 0:
             raise InvalidArgumentsError("seconds must be more than 0: the length of the window")
         view, now = _open_now(memory, call, 0)
-        return view, clamped(view, last_window(now, length))
+        call.asked = clamped(view, last_window(now, length))
+        return view, call.asked
     if span.start_s is None or span.end_s is None:
         raise InvalidArgumentsError("start and end must both be given, as Unix seconds")
     window = TimeWindow.from_unix(span.start_s, span.end_s)
     view = open_view(memory, call, window.stop)
-    return view, clamped(view, window)
+    call.asked = clamped(view, window)
+    return view, call.asked
 
 
 def last_window(now: Ns, length: Ns) -> TimeWindow:

@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.silences import Presence, usual_period
+from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
@@ -63,7 +64,7 @@ def pauses_within(bags: Sequence[BagFile]) -> Iterator[Pause]:
     """Yields the pauses of each bag; other bags may have messages in them."""
     for bag in bags:
         for start, end in bag.summary.schema.pauses:
-            yield Pause(start, end, (bag,), ran_on=True)
+            yield Pause(start, end, (bag,), ran_on=not is_thinned(bag.file))
 
 
 def _follows(before: BagFile, after: BagFile) -> bool:
@@ -111,7 +112,8 @@ class Rhythm:
         if several and pause.length > _GAP_PERIODS * self._slower(pause):
             return True
         if len(pause.bags) == 1:
-            return False
+            # In a thinned day every topic has a message in each slot of 5 s, or as often as it had.
+            return not pause.ran_on and pause.length > _LONGEST_LEAST_NS
         longer = max(bag.end - bag.start for bag in pause.bags)
         least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0
         return pause.length > max(least, self.shortest_gap)

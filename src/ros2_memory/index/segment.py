@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
@@ -22,7 +22,7 @@ from ros2_memory.index.split_order import Series, SplitRange, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -139,7 +139,15 @@ class Segment:
     @cached_property
     def recorded(self) -> Segment | None:
         """The bags without that of carried messages: mostly itself; None where no other is left."""
-        rest = [bag for bag in self.bags if not is_carried(bag.file)]
+        return self._without(is_carried)
+
+    @cached_property
+    def unthinned(self) -> Segment | None:
+        """The bags that have every message that was recorded; itself where all do."""
+        return self._without(is_thinned)
+
+    def _without(self, is_left_out: Callable[[str], bool]) -> Segment | None:
+        rest = [bag for bag in self.bags if not is_left_out(bag.file)]
         if len(rest) == len(self.bags):
             return self
         return Segment(rest) if rest else None

@@ -130,7 +130,7 @@ class Snapshot:
     def _presences(self) -> dict[str, Presence]:
         """When bags hold each topic; not of logs, whose lines come when something happens."""
         found: dict[str, list[Presence]] = {}
-        for part in self._dated:
+        for part in filter(None, (each.unthinned for each in self._dated)):
             for topic, presence in part.presences.items():
                 found.setdefault(topic, []).append(presence)
         is_log = self.timeline.is_log

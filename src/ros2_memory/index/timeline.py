@@ -14,6 +14,7 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_thinned
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import Spans, overlap_spans, united
@@ -152,6 +153,16 @@ class Timeline:
     def recorded(self) -> tuple[BagFile, ...]:
         """The bags of `recorded_segments`."""
         return tuple(chain.from_iterable(each.bags for each in self.recorded_segments))
+
+    @cached_property
+    def thinned(self) -> tuple[BagFile, ...]:
+        """The days of which only some messages stayed, in order."""
+        parts = [
+            part
+            for part in self.segments
+            if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in part.folders)
+        ]
+        return tuple(bag for part in parts for bag in part.bags if is_thinned(bag.file))
 
     @property
     def disk_use(self) -> tuple[int, int]:

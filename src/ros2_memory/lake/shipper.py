@@ -16,6 +16,7 @@ from ros2_memory.bag_dir.layout import (
     MOMENTS_FOLDER,
     has_recorded,
     is_carried,
+    is_thinned,
 )
 from ros2_memory.bag_dir.state_files import (
     Receipt,
@@ -245,7 +246,8 @@ class Shipper:
         closed = [
             bag
             for bag in snapshot.bags
-            if bag.state is BagState.CLOSED and not is_carried(bag.path)
+            if bag.state is BagState.CLOSED
+            if not is_carried(bag.path) and not is_thinned(bag.path)
         ]
         bags = [bag for bag in closed if is_settled(bag, robot.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]

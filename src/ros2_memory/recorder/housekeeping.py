@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.retention.collect import Outliving
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -84,6 +85,7 @@ class Housekeeping(Housekeeper):
         grace_s: for how long a query may work on an older snapshot of the bags.
         measure_free: measures what the disk has left, in bytes.
         monotonic: a clock that never steps, in seconds.
+        memory: what stays of deleted bags; None where nothing does.
     """
 
     def __init__(
@@ -105,6 +107,7 @@ class Housekeeping(Housekeeper):
         grace_s: float = 0.0,
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
+        memory: Outliving | None = None,
     ) -> None:
         self._bag_dir = bag_dir
         self._recorded = RecordedTime(bag_dir)
@@ -122,6 +125,7 @@ class Housekeeping(Housekeeper):
             needed=self._needed,
             measure_free=measure_free,
             monotonic=monotonic,
+            memory=memory,
         )
         self._index = IndexManager(
             bag_dir,

@@ -12,7 +12,7 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Protocol
 
 import structlog
 
@@ -28,6 +28,7 @@ from ros2_memory.retention.policy import (
     RetentionStock,
     StoredBag,
     ages,
+    by_hours,
     plan_deletions,
 )
 from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
+_DAY_S: Final = 86_400.0
 _WRITTEN_AT_ONCE: Final = 2
 """Recordings, during a rotation."""
 
@@ -114,6 +116,25 @@ class _Pass:
     unshipped: list[str] = field(default_factory=list)
 
 
+class Outliving(Protocol):
+    """What stays of bags that are deleted."""
+
+    def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
+        """Makes durable what stays of some bags.
+
+        Raises:
+            EpisodicError: it cannot be written.
+            OSError: likewise.
+        """
+
+    def limit(self, now: Ns) -> None:
+        """Deletes what is too old, or too much.
+
+        Raises:
+            OSError: it cannot be deleted.
+        """
+
+
 class GarbageCollector:
     """Keeps one bag directory within its limits. Not thread-safe.
 
@@ -129,6 +150,7 @@ class GarbageCollector:
         needed: gives the bags that rules may still need, which no age deletes.
         measure_free: measures what the disk of a directory has left, in bytes.
         monotonic: a clock that never steps, in seconds.
+        memory: what stays of deleted bags; None where nothing does.
     """
 
     def __init__(
@@ -145,9 +167,12 @@ class GarbageCollector:
         needed: Callable[[Snapshot], frozenset[str]] = lambda _: frozenset(),
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
+        memory: Outliving | None = None,
     ) -> None:
         self._bag_dir = bag_dir
         self._limits = limits
+        self._memory = memory
+        self._memory_fails_since: float | None = None
         self._carrier = carrier
         self._own = own
         self._recorded = recorded
@@ -197,9 +222,11 @@ class GarbageCollector:
             plan = plan_deletions(stock, limits)
             result.foreign_bytes, result.state_bytes = stock.foreign_bytes, stock.state_bytes
             result.saved_bytes = sum(file.size for file in stock.saved)
-            result.total_bytes, result.fits, result.most_free = plan[1:]
-            to_delete = plan.to_delete[: MOST_AT_ONCE - len(run.deleted)]
+            result.total_bytes, result.fits, result.most_free = plan[1:4]
+            going = plan.to_delete if self._memory is None else by_hours(plan, stock)
+            to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
+                self._outlive(to_delete, plan.aged, stock, snapshot, run)
                 self._delete_all(to_delete, stock, snapshot, run)
                 run.unshipped += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
@@ -209,6 +236,8 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
+        if run.deleted:
+            self._limit_memory(snapshot.scanned_at)
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
             relative_recording(path, self._bag_dir)
@@ -280,6 +309,40 @@ class GarbageCollector:
             self._delete(bag, run)
         # Where the disk was full, there is room now.
         self._note(())
+
+    def _outlive(
+        self,
+        to_delete: Sequence[StoredBag],
+        aged: Collection[str],
+        stock: RetentionStock,
+        snapshot: Snapshot,
+        run: _Pass,
+    ) -> None:
+        """Writes what stays of bags. Where that fails, age waits for a day, the budget does not."""
+        if self._memory is None:
+            return
+        # A moment has all messages of its bags.
+        saved = {file.inode for file in stock.saved}
+        alone = [bag for bag in to_delete if saved.isdisjoint(file.inode for file in bag.files)]
+        try:
+            self._memory.keep(snapshot, {bag.path for bag in alone})
+        except (EpisodicError, OSError) as error:
+            now = self._monotonic()
+            since = now if self._memory_fails_since is None else self._memory_fails_since
+            self._memory_fails_since = since
+            waiting = [bag for bag in to_delete if bag.path in aged and now - since < _DAY_S]
+            run.remaining |= {bag.path for bag in waiting}
+            lost = len(to_delete) - len(waiting)
+            _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)
+        else:
+            self._memory_fails_since = None
+
+    def _limit_memory(self, now: Ns) -> None:
+        try:
+            if self._memory is not None:
+                self._memory.limit(now)
+        except (EpisodicError, OSError) as error:
+            _log.error("memory_not_limited", reason=str(error))
 
     def _note(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""

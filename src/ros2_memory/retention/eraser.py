@@ -35,6 +35,7 @@ from ros2_memory.bag_dir.layout import (
     bag_kind,
     is_carried,
     is_kept_apart,
+    is_thinned,
 )
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import (
@@ -272,7 +273,7 @@ class Eraser:
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
-        elif is_carried(path) and self._recorder is not None:
+        elif (is_carried(path) or is_thinned(path)) and self._recorder is not None:
             reason = (
                 f"only the recorder may change it while it runs: {self._recorder}; stop the "
                 "recorder, and forget again"

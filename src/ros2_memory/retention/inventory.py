@@ -22,6 +22,7 @@ from ros2_memory.bag_dir.layout import (
     ROS_LOG_DIR,
     has_own_name,
     is_carried,
+    is_thinned,
     other_form,
     split_number,
 )
@@ -131,6 +132,7 @@ class Inventory:
             is_new = is_named and split_number(recording, name) is not None
             is_closed = state in _CLOSED and not is_carried(path)
             may_go = is_closed or (state in _LEFT_OPEN and not is_named)
+            may_go = may_go and not is_thinned(path)
             if not (own or is_saved or is_new):
                 mixed.add(recording)
                 foreign_bytes += sum(file.size for file in bag.files)

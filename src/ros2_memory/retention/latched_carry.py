@@ -34,7 +34,7 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried
+from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -205,7 +205,11 @@ class Carrier:
             return None
         topics = self.topics(snapshot)
         gone = {str(path) for path in {*to_delete} - {*saved}}
-        kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_carried(bag.file)]
+        kept = [
+            bag
+            for bag in snapshot.bags
+            if bag.file not in gone and not is_carried(bag.file) and not is_thinned(bag.file)
+        ]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
@@ -330,7 +334,7 @@ class Carrier:
             for bag in snapshot.bags:
                 if topic not in bag.summary.schema.positions or bag.recording in seen:
                     continue
-                if bag.path in to_delete or is_carried(bag.file):
+                if bag.path in to_delete or is_carried(bag.file) or is_thinned(bag.file):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)

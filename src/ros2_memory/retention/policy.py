@@ -43,6 +43,7 @@ SMALL_BUDGET_GB: Final = 0.1
 """Of a smaller budget, what is stored beside the bags may take a large part."""
 GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
+HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """A shorter pause never parts two eras, however little history is kept."""
 
@@ -183,16 +184,17 @@ class Ages(NamedTuple):
 class DeletionPlan(NamedTuple):
     """The deletions that the limits require.
 
-    `to_delete` has the oldest bag first. `total_bytes` is what the budget counted, each file once.
-    `fits`: whether the limits are kept once those bags are deleted. `most_free`: how much of the
-    disk would be free if all bags were deleted that may be, where that is too little; then none is
-    deleted for it.
+    `to_delete` has the oldest bag first; those in `aged` are too old, the others make room.
+    `total_bytes` is what the budget counted, each file once. `fits`: whether the limits are kept
+    once those bags are deleted. `most_free`: how much of the disk would be free if all bags were
+    deleted that may be, where that is too little; then none is deleted for it.
     """
 
     to_delete: tuple[StoredBag, ...]
     total_bytes: int
     fits: bool
     most_free: int | None = None
+    aged: frozenset[str] = frozenset()
 
 
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
@@ -245,7 +247,29 @@ def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPl
             going.add(bag.path)
             left.delete(bag)
     deleted = tuple(bag for bag in order if bag.path in going)
-    return DeletionPlan(deleted, total, fits=left.fits(limits)), left.free
+    found = DeletionPlan(deleted, total, fits=left.fits(limits), aged=aged & going)
+    return found, left.free
+
+
+def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]:
+    """Returns what a plan deletes, in whole hours, so that what stays of an hour is written once.
+
+    Age waits until all bags of an hour are too old; to make room the rest of an hour goes, too, but
+    for the newest hour.
+    """
+    hours: dict[Ns, list[StoredBag]] = {}
+    for bag in stock.bags:
+        date = bag.end if bag.has_dates else bag.written
+        hours.setdefault(date // HOUR_NS, []).append(bag)
+    going = {bag.path for bag in plan.to_delete}
+    found: list[StoredBag] = []
+    for hour, bags in sorted(hours.items()):
+        inside = [bag for bag in bags if bag.path in going]
+        if all(bag.path in plan.aged for bag in inside):
+            found += inside if len(inside) == len(bags) else ()
+        else:
+            found += inside if hour == max(hours) else bags
+    return tuple(found)
 
 
 class _Left:

@@ -23,7 +23,7 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried, is_thinned
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
     Outcome,
@@ -93,7 +93,8 @@ def needed_bags(
     waits = now < window.stop or any(_may_overlap(each, window) for each in open_files)
     ready = []
     for bag in bags:
-        if not window.overlaps(bag.start, bag.end) or is_carried(bag.file):
+        is_derived = is_carried(bag.file) or is_thinned(bag.file)
+        if not window.overlaps(bag.start, bag.end) or is_derived:
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
         if unfinished and now - asked < REPAIRED_WITHIN_NS:

@@ -295,7 +295,12 @@ class Dispatcher:
                 found = question(self._memory, call)
             except GoneError:  # the store has changed since, and is looked at anew
                 found = question(self._memory, call)
-            return self._replies.answer(found, from_active=call.used_active, now=call.now)
+            return self._replies.answer(
+                found,
+                from_active=call.used_active,
+                from_memory=call.used_thinned,
+                now=call.now,
+            )
 
         return self._asked(answer, call, wait)
 

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
-from ros2_memory.core.errors import BagError
+from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.pauses import noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
@@ -363,6 +363,14 @@ class BagReader(ABC):
             UndecodableError: no definition, a foreign encoding, or bytes that do not fit it.
         """
 
+    def encode(self, channel: Channel, message: object) -> bytes:
+        """Returns a decoded message of a channel, changed since, as a payload.
+
+        Raises:
+            UndecodableError: messages of the channel are not CDR, or this is none of them.
+        """
+        raise UndecodableError(channel.topic, channel.type, f"{message!r:.80} is not encoded")
+
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages; None if it is not CDR or has no definition.
 
@@ -461,11 +469,19 @@ class BagWriter(ABC):
     """
 
     @abstractmethod
-    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
+    def write(
+        self,
+        path: Path,
+        records: Iterable[Record],
+        *,
+        profile: str = ROS2_PROFILE,
+        dense: bool = False,
+    ) -> None:
         """Writes a bag of these messages, in the order given.
 
         Payloads, both times, definitions and the metadata of channels are unchanged; ROS 2
-        types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. The bag
+        types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. With
+        `dense` the file is a third smaller, and to read one message of it takes longer. The bag
         is on the disk when this returns. There must be no file of that name.
 
         Raises:

@@ -65,6 +65,24 @@ class Decoding:
             reason = _reason(record, error)
             raise UndecodableError(channel.topic, channel.type, reason) from error
 
+    def encode(self, channel: Channel, message: object) -> bytes:
+        """Returns a decoded CDR message, changed since, as a payload.
+
+        Raises:
+            UndecodableError: it is not of the channel's type.
+        """
+        schema = channel.schema
+        found = self._typestores.lookup(schema.name, schema.encoding, schema.text)
+        reason = f"messages encoded as {channel.encoding} are not written"
+        if channel.encoding != "cdr" or isinstance(found, str):
+            raise UndecodableError(channel.topic, channel.type, reason)
+        try:
+            return found.serialize(message)
+        # rosbags raises whatever the generated code runs into, as for `decode`.
+        except Exception as error:
+            reason = f"the message is not encoded: {' '.join(str(error).split())[:160]}"
+            raise UndecodableError(channel.topic, channel.type, reason) from error
+
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages; None if they are not CDR of a known type."""
         known = self._definitions.get(id(channel))

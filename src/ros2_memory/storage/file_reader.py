@@ -141,6 +141,10 @@ class FileReader(BagReader):
             self._large.acquire()
         return self._decoding.decode(record)
 
+    def encode(self, channel: Channel, message: object) -> bytes:
+        """Encodes a decoded message of a channel."""
+        return self._decoding.encode(channel, message)
+
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of the channel's messages, or None."""
         return self._decoding.definition(channel)

@@ -57,12 +57,18 @@ class Replies:
     max_chars: int
 
     def answer(
-        self, answer: results.Answer, *, from_active: bool = False, now: Ns | None = None
+        self,
+        answer: results.Answer,
+        *,
+        from_active: bool = False,
+        from_memory: bool = False,
+        now: Ns | None = None,
     ) -> Reply:
         """Returns an answer in the shape that the tool's description promises.
 
         `from_active`: whether messages of a split that is still being written were read, which a
-        reply that is an object shows. `now`: what its ages count from, where that is not the wall
+        reply that is an object shows. `from_memory`: likewise, days of which only some messages
+        stayed, a pose for each second. `now`: what its ages count from, where that is not the wall
         clock (`data.now=latest`).
         """
         name: str | None = None
@@ -84,6 +90,8 @@ class Replies:
             value = {**value, "notes": [*(known if isinstance(known, list) else ()), *notes]}
         if from_active:
             value = {**value, "from_active": True}
+        if from_memory:
+            value = {**value, "from": "memory", "resolution_s": 1}
         if now is not None:
             value = {"now": unix_rounded_up(now), **value}
         return self._fitted(value)

@@ -88,6 +88,42 @@ def test_who_answers_no_has_nothing_written(
     assert not (tmp_path / "bags" / "topics.yaml").exists()
 
 
+class Terminal(io.StringIO):
+    """A person at a terminal, with what they type."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("typed", "flags", "before", "remembers"),
+    [
+        ("y\ny\n", (), False, True),
+        ("y\n\n", (), False, False),
+        ("", ("--yes",), False, False),
+        ("", ("--yes",), True, True),
+    ],
+)
+def test_only_a_person_has_something_outlive_the_bags(
+    exits: Program,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: str,
+    flags: tuple[str, ...],
+    before: bool,
+    remembers: bool,
+) -> None:
+    def become(program: str, argv: list[str]) -> None:
+        raise SystemExit(0)
+
+    monkeypatch.setattr(os, "execvp", become)
+    monkeypatch.setattr(sys, "stdin", Terminal(typed))
+    if before:
+        (tmp_path / "bags" / "memory").mkdir(parents=True)
+    shown = exits(0, "up", *flags, "--install", "--bag-dir", tmp_path / "bags").out
+    assert ("memory.keep=true" in shown) is remembers
+
+
 def test_a_list_that_cannot_be_written_is_named(exits: Program, tmp_path: Path) -> None:
     file = tmp_path / "nowhere" / "topics.yaml"
     words = ["--bag-dir", tmp_path / "bags", f"recording.topics_file={file}"]

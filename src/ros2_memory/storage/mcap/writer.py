@@ -10,7 +10,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel, Record, Schema
 
+_DENSE_CHUNK_BYTES: Final = 512 << 10
 CHUNK_BYTES: Final = 64 << 10
 """Small, since a reader decompresses a whole chunk for one message."""
 LIBRARY: Final = "ros2-memory"
@@ -50,10 +51,17 @@ class McapWriter(BagWriter):
     def __init__(self, max_chunk_mb: int = MAX_CHUNK_MB) -> None:
         self._max_chunk_mb = max_chunk_mb
 
-    def write(self, path: Path, records: Iterable[Record], *, profile: str = ROS2_PROFILE) -> None:
-        """Writes a bag that holds these messages."""
+    def write(
+        self,
+        path: Path,
+        records: Iterable[Record],
+        *,
+        profile: str = ROS2_PROFILE,
+        dense: bool = False,
+    ) -> None:
+        """Writes a bag that holds these messages; a `dense` one has no message indexes."""
         with _written(path) as stream:
-            writer = _writer(stream)
+            writer = _writer(stream, dense=dense)
             writer.start(profile, LIBRARY)
 
             @cache
@@ -223,8 +231,11 @@ def _exported(channel: Channel) -> Schema:
     return replace(schema, name=full_name(schema.name))
 
 
-def _writer(stream: IO[bytes]) -> Writer:
-    return Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+def _writer(stream: IO[bytes], *, dense: bool = False) -> Writer:
+    if not dense:
+        return Writer(stream, CHUNK_BYTES, CompressionType.ZSTD)
+    indexes = IndexType.ALL & ~IndexType.MESSAGE
+    return Writer(stream, _DENSE_CHUNK_BYTES, CompressionType.ZSTD, indexes)
 
 
 @contextmanager

@@ -1,0 +1,433 @@
+"""The folder `memory/`: what stays of bags that are deleted, a file for each day (UTC).
+
+Before bags go, the messages of them that stay (see `thinning`) are on the disk in the file of their
+day, `memory/20261120.mcap`. It is a bag like any other: the index finds it, every tool answers from
+it, `forget` rewrites it. It is never changed in place: a new file takes its name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from contextlib import suppress
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from itertools import chain
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.bag_dir.durable_write import flush
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, memory_file, utc_day
+from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.detections import DetectionColumns
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import LABELS, match_topics
+from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
+from ros2_memory.messages.detections import detections_of
+from ros2_memory.recorder.memory.rounding import rounded
+from ros2_memory.recorder.memory.thinning import (
+    MINUTE_NS,
+    TopicThinning,
+    has_numbers,
+    is_said,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.columns.table import Table
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.storage.base import BagReader, BagWriter, Record
+
+_PEOPLE: Final = frozenset(
+    [
+        "person",
+        "persons",
+        "people",
+        "human",
+        "humans",
+        "pedestrian",
+        "pedestrians",
+        "man",
+        "men",
+        "woman",
+        "women",
+        "child",
+        "children",
+        "boy",
+        "boys",
+        "girl",
+        "girls",
+        "baby",
+        "babies",
+        "face",
+        "faces",
+    ]
+)
+_QOS: Final = "offered_qos_profiles"
+MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
+"""The numbers of older days have one message a minute."""
+HOUR_NS: Final[Ns] = 3600 * NS_PER_S
+_EVERYTHING: Final = TimeWindow.everything()
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryLimits:
+    """What may stay of deleted bags, and how much.
+
+    Attributes:
+        texts: names or globs of the topics of which texts may stay: speech, descriptions, logs.
+        labels: the labels of people that may stay.
+        max_bytes: what all days may take.
+        max_age_ns: how old a day may become.
+    """
+
+    texts: tuple[str, ...] = ()
+    labels: tuple[str, ...] = ()
+    max_bytes: int = 10**9
+    max_age_ns: Ns = 400 * 86_400 * NS_PER_S
+
+
+class MemoryDays:
+    """Writes and deletes the days of one bag directory, whose lock its caller holds.
+
+    Args:
+        bag_dir: the bag directory.
+        reader: reads bags, without what counts in another recording.
+        writer: writes the days.
+        own: lists the days as the recorder's own.
+        extractor: has the schema map, by which detections are found.
+        limits: what may stay.
+        static_topics: topics that are latched whatever their publishers declare.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        reader: BagReader,
+        writer: BagWriter,
+        own: OwnRecordings,
+        extractor: SchemaExtractor,
+        *,
+        limits: MemoryLimits,
+        static_topics: Collection[str] = (),
+    ) -> None:
+        self._folder = bag_dir / MEMORY_FOLDER
+        self._reader = reader
+        self._writer = writer
+        self._own = own
+        self._extractor = extractor
+        self._limits = limits
+        self._static_topics = frozenset(static_topics)
+        self._minutes: set[Path] = set()
+
+    def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
+        """Makes durable what stays of some bags, which may be deleted then.
+
+        What stays already is not written twice. What cannot be read of a bag does not stay.
+
+        Raises:
+            BagError: a day cannot be written.
+            OSError: likewise, or the list of the recorder's own bags cannot be read.
+        """
+        days: dict[str, list[BagFile]] = defaultdict(list)
+        for bag in snapshot.bags:
+            if bag.file in paths:
+                days[utc_day(bag.start)].append(bag)
+        for day, bags in days.items():
+            begun = time.perf_counter_ns()
+            chosen = self._chosen(snapshot, bags)
+            records = sorted(self._records(bags, chosen), key=attrgetter("log_time"))
+            if records:
+                self._write(day, records)
+            _log.info(
+                "memory_kept",
+                day=day,
+                bags=len(bags),
+                messages=len(records),
+                left_out=chosen.left_out,
+                duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            )
+
+    def limit(self, now: Ns) -> None:
+        """Deletes the days that are too old, then the oldest above the size; thins one further.
+
+        Raises:
+            BagError: a day cannot be written anew.
+            OSError: the folder cannot be read, or a day not be deleted.
+        """
+        days = self._days()
+        oldest_day = memory_file(utc_day(now - self._limits.max_age_ns))
+        size = sum(path.stat().st_size for path in days)
+        for path in days:
+            if path.name >= oldest_day and size <= self._limits.max_bytes:
+                break
+            size -= path.stat().st_size
+            path.unlink()
+            _log.info("memory_day_deleted", path=str(path))
+        month_ago = memory_file(utc_day(now - MONTH_NS))
+        for path in days:
+            if path.name < month_ago and path.exists() and path not in self._minutes:
+                self._minutes.add(path)
+                self._thin_to_minutes(path)
+                break
+
+    def _thin_to_minutes(self, path: Path) -> None:
+        """Writes a day anew in which numbers have one message a minute, and their extremes."""
+        detections, numbers = DetectionColumns(self._extractor), dict[str, TopicThinning]()
+        for table in _tables(self._reader, path):
+            if has_numbers(table) and not table.channel.latched:
+                thinned = TopicThinning(detections, MINUTE_NS)
+                numbers.setdefault(table.channel.topic, thinned).add(table)
+        stays = {topic: {*one.times().tolist()} for topic, one in numbers.items()}
+        before = [one.count for one in self._reader.summarize(path).topics if one.topic in stays]
+        if sum(before) > sum(map(len, stays.values())):
+            days = self._joined(path, ())
+            self._replace(path, (one for one in days if _stays(one, stays)))
+
+    def clear(self) -> None:
+        """Deletes all days, since nothing is to stay (`memory.keep`).
+
+        Raises:
+            OSError: one cannot be deleted.
+        """
+        days = self._days()
+        if days:
+            _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
+        for path in days:
+            path.unlink()
+        if days:
+            with suppress(OSError):
+                self._folder.rmdir()
+
+    def _days(self) -> list[Path]:
+        """Returns the files that the recorder wrote, the oldest first; no link is followed."""
+        if self._folder.is_symlink() or not self._folder.is_dir():
+            return []
+        found = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
+        return sorted(path for path in found if self._own.owns_bag(path))
+
+    def _chosen(self, snapshot: Snapshot, bags: Sequence[BagFile]) -> _Chosen:
+        """Returns which messages of some bags stay."""
+        chosen = _Chosen()
+        thinned: dict[tuple[str, str], TopicThinning] = {}
+        detections = DetectionColumns(self._extractor)
+        for table in chain.from_iterable(_tables(self._reader, bag.path) for bag in bags):
+            topic, kind = table.channel.topic, table.channel.type
+            if "" in table.left_out:
+                chosen.left_out[topic] = table.left_out[""]
+            elif is_said(table) and not _is_named(topic, self._limits.texts):
+                chosen.left_out[topic] = "it has texts, and memory.texts does not name it"
+            elif self._is_latched(snapshot, topic):
+                chosen.latched.add(topic)
+                chosen.times[topic].update(table.log_times.tolist())
+            elif len(table):
+                thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
+        for (topic, _), one in thinned.items():
+            chosen.times[topic].update(one.times().tolist())
+        return chosen
+
+    def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
+        """Whether all messages of a topic stay: each holds until the next, however long that is."""
+        timeline = snapshot.timeline
+        return topic in self._static_topics or (
+            timeline.is_transient_state(topic)
+            and all(timeline.pace(topic, path).is_rare for path in timeline.recordings(topic))
+        )
+
+    def _records(self, bags: Sequence[BagFile], chosen: _Chosen) -> Iterator[Record]:
+        """Yields the messages that stay, without people whose label may not."""
+        topics = [topic for topic, times in chosen.times.items() if times]
+        for bag in bags:
+            for record in _readable(self._reader, bag.path, topics):
+                channel = record.channel
+                if record.log_time not in chosen.times[channel.topic]:
+                    continue
+                if channel.latched and channel.topic not in chosen.latched:
+                    # Thinned, it would look like one whose messages hold until the next.
+                    metadata = tuple(one for one in channel.metadata if one[0] != _QOS)
+                    channel = replace(channel, latched=False, metadata=metadata)
+                stays = record._replace(channel=channel)
+                if channel.topic in chosen.latched:
+                    yield stays
+                elif (smaller := self._smaller(stays)) is not None:
+                    yield smaller
+
+    def _smaller(self, record: Record) -> Record | None:
+        """Returns a message with rounded numbers, without people whose label may not stay.
+
+        None where it cannot be parted from them.
+        """
+        try:
+            message = _without(self._reader.decode(record), self._is_hidden)
+            shown = self._extractor.exact(message, record.channel.type)
+            texts = [value for _, value in _fields(message) if isinstance(value, str)]
+            for value in (shown, *texts):
+                if any(self._is_hidden(seen.label) for seen in detections_of(value)):
+                    return None
+            left = rounded(message, self._reader.definition(record.channel))
+            return record._replace(payload=self._reader.encode(record.channel, left))
+        except UndecodableError:
+            return None
+
+    def _is_hidden(self, label: str) -> bool:
+        words = label.replace("_", " ").replace("-", " ").casefold().split()
+        return not _PEOPLE.isdisjoint(words) and label not in self._limits.labels
+
+    def _write(self, day: str, records: Sequence[Record]) -> None:
+        """Writes a day anew, with more messages.
+
+        Raises:
+            BagError: it cannot be written.
+            OSError: likewise.
+        """
+        if self._folder.is_symlink():
+            raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
+        self._folder.mkdir(exist_ok=True)
+        path = self._free(day)
+        self._own.hold(self._folder, [path.name])
+        self._replace(path, self._joined(path, records))
+        flush(self._folder.parent)
+
+    def _replace(self, path: Path, records: Iterator[Record]) -> None:
+        """Has a new file take the name of a day, once it is on the disk."""
+        beside = path.with_name(f".{path.name}.tmp")
+        beside.unlink(missing_ok=True)
+        try:
+            self._writer.write(beside, records, dense=True)
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+        flush(self._folder)
+
+    def _free(self, day: str) -> Path:
+        """Returns the file of a day that can be written anew: no damaged one, nor one of others."""
+        number = 0
+        while True:
+            path = self._folder / memory_file(day, number)
+            if not path.exists():
+                return path
+            with suppress(BagError):
+                summary = self._reader.summarize(path)
+                if summary.complete and not summary.notes and self._own.owns_bag(path):
+                    return path
+            number += 1
+
+    def _joined(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
+        """Yields the messages of a day and others, hour by hour and topic by topic, copies once.
+
+        So what is alike lies together, and compresses.
+        """
+        topics = [channel.topic for channel in self._reader.channels(path)] if path.exists() else []
+        hours: defaultdict[int, list[Record]] = defaultdict(list)
+        for record in added:
+            hours[record.log_time // HOUR_NS].append(record)
+        if topics:
+            summary = self._reader.summarize(path)
+            for hour in range(summary.start // HOUR_NS, summary.end // HOUR_NS + 1):
+                hours.setdefault(hour, [])
+        for hour in sorted(hours):
+            window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
+            found = [*self._reader.records(path, topics, window)] if topics else []
+            known: set[tuple[str, Ns, Ns, bytes]] = set()
+            for record in sorted([*found, *hours[hour]], key=_by_topic):
+                key = (record.channel.topic, *record[1:])
+                if key not in known:
+                    known.add(key)
+                    yield record
+
+
+@dataclass(slots=True)
+class _Chosen:
+    """Which messages of some bags stay.
+
+    Attributes:
+        times: their log times (ns), by topic.
+        latched: the topics of which all do.
+        left_out: of which topics none does, and why.
+    """
+
+    times: dict[str, set[Ns]] = field(default_factory=lambda: defaultdict(set))
+    latched: set[str] = field(default_factory=set)
+    left_out: dict[str, str] = field(default_factory=dict)
+
+
+def _is_named(topic: str, globs: Sequence[str]) -> bool:
+    return any(match_topics((topic,), glob) for glob in globs)
+
+
+def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
+    """Yields the messages of a bag as tables; what is lost of it is left out."""
+    groups = decoded(reader, path)
+    while True:
+        try:
+            tables = next(groups, None)
+            if tables is None:
+                return
+            yield from tables
+        except BagError as error:
+            _log.warning("memory_not_read", path=str(path), reason=error.reason)
+            if error.lost is None:
+                return
+
+
+def _readable(reader: BagReader, path: Path, topics: Sequence[str]) -> Iterator[Record]:
+    """Yields the messages of a bag that can be read."""
+    records = reader.records(path, topics, _EVERYTHING)
+    while True:
+        try:
+            yield from records
+        except BagError as error:
+            if error.lost is None:
+                return
+        else:
+            return
+
+
+def _stays(record: Record, stays: Mapping[str, Collection[Ns]]) -> bool:
+    """Returns whether a message is one of those, or of a topic that is not thinned."""
+    topic = record.channel.topic
+    return topic not in stays or record.log_time in stays[topic]
+
+
+def _by_topic(record: Record) -> tuple[str, Ns]:
+    return record.channel.topic, record.log_time
+
+
+def _labels(node: object) -> Iterator[str]:
+    """Yields the labels of an entry of a list: a name, or its `results[0].hypothesis.class_id`."""
+    if isinstance(node, str):
+        yield node
+    for name, value in _fields(node):
+        for one in value if isinstance(value, list) else [value]:
+            if name in LABELS or not isinstance(one, str):
+                yield from _labels(one)
+
+
+def _without(message: object, is_hidden: Callable[[str], bool]) -> object:
+    """Returns a decoded message without those entries of its lists that have a hidden label."""
+    changed = {
+        name: [one for one in value if not any(map(is_hidden, _labels(one)))]
+        for name, value in _fields(message)
+        if isinstance(value, list)
+    }
+    changed = {
+        name: left for name, left in changed.items() if len(left) < len(getattr(message, name))
+    }
+    if not changed or not is_dataclass(message) or isinstance(message, type):
+        return message
+    return replace(message, **changed)
+
+
+def _fields(node: object) -> Iterator[tuple[str, object]]:
+    if is_dataclass(node) and not isinstance(node, type):
+        for one in fields(node):
+            yield one.name, getattr(node, one.name)

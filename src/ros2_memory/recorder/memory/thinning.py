@@ -1,0 +1,287 @@
+"""Which messages of a topic stay when its bags are deleted: by their columns. Pure.
+
+A message that stays is as it was recorded. Those go that say again what others say:
+
+- What moves has a pose a second (`STEP_NS`), and while it stands one in each slot (`THINNED_NS`).
+- Of a boolean, a status or a name every message stays that changes it, and the last one before.
+- Of detections and transforms as few messages of each slot stay as show all labels and frames,
+  and the most of a label at once.
+- Of numbers one of each slot stays, and their least and greatest of five minutes.
+
+No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeGuard
+
+import numpy as np
+
+from ros2_memory.analysis.intervals import THINNED_NS
+from ros2_memory.columns.table import Elements, Texts
+from ros2_memory.core.text import NAMES_IN_MESSAGES
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.messages.detections import detections_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.detections import DetectionColumns, Detections
+    from ros2_memory.columns.table import Column, Numbers, Table
+    from ros2_memory.storage.base import IntArray
+
+    Name = tuple[str, int]
+    Points = NDArray[np.float64]
+
+STEP_NS: Final[Ns] = NS_PER_S
+PAUSE_NS: Final[Ns] = 3 * NS_PER_S
+"""With a slot of 7 s no more than the 10 s of a silence lie between two messages that stay."""
+MINUTE_NS: Final[Ns] = 60 * NS_PER_S
+EXTREMES_NS: Final[Ns] = 300 * NS_PER_S
+_MOVED: Final = 0.05
+"""In metres; also of each component of a unit quaternion, which is then a turn by 6 degrees."""
+_FEW: Final = 8
+_OFTEN: Final = 4
+"""Integers of more values, or that repeat less often, are measurements, times or counters."""
+_FRAME: Final = "child_frame_id"
+_POINTS: Final = ("position", "translation")
+_TURNS: Final = ("orientation", "rotation")
+_MORE_NAMES: Final = frozenset({"location", "serial_number"})
+
+
+def is_said(table: Table) -> bool:
+    """Returns whether messages say something in words: they have a text that names nothing."""
+    return any(
+        isinstance(column, Texts) and name not in NAMES_IN_MESSAGES | _MORE_NAMES
+        for name, column in _columns(table.columns, table.elements)
+    )
+
+
+def has_numbers(table: Table) -> bool:
+    """Returns whether messages are measurements: numbers with a fraction that are no pose."""
+    measured = any(_is_measured(column) for column in table.columns.values())
+    lists = any(inner.columns.keys() != {""} for inner in table.elements.values())
+    return measured and not lists and not _poses(table.columns)
+
+
+def _is_measured(column: Column) -> TypeGuard[Numbers]:
+    return not isinstance(column, Texts) and column.dtype.kind == "f"
+
+
+def _columns(
+    columns: Mapping[str, Column], elements: Mapping[str, Elements]
+) -> Iterator[tuple[str, Column]]:
+    """Yields each column with the name of its field; an element without fields has its list's."""
+    for path, column in columns.items():
+        yield path.rpartition(".")[2], column
+    for path, inner in elements.items():
+        for name, column in _columns(inner.columns, inner.elements):
+            yield name or path.rpartition(".")[2], column
+
+
+class _Extremes(NamedTuple):
+    """The least and the greatest value of a column in some minutes, and their log times."""
+
+    least: tuple[float, Ns]
+    greatest: tuple[float, Ns]
+
+
+@dataclass(slots=True)
+class _Mover:
+    """A frame or a robot, by the last pose of it that stays, and the last that was looked at."""
+
+    slot: int = -1
+    stays: Points = field(default_factory=lambda: np.full(0, np.nan))
+    before: Ns = 0
+
+    def moved(self, times: IntArray, poses: Points) -> Iterator[Ns]:
+        """Yields the log times of the poses that stay, since it moved; also of those before it did.
+
+        Args:
+            times: log times, ascending.
+            poses: a row for each, of metres and components of a unit quaternion.
+        """
+        steps = times // STEP_NS
+        for nth in np.flatnonzero(np.diff(steps, prepend=self.slot)).tolist():
+            pose, time = poses[nth], int(times[nth])
+            if self.stays.size != pose.size or not (abs(pose - self.stays) < _MOVED).all():
+                if self.before:
+                    yield self.before
+                yield time
+                self.stays = pose
+            self.before = time
+        self.slot = int(steps[-1])
+
+
+@dataclass(slots=True)
+class TopicThinning:
+    """Chooses the messages of a topic that stay; its tables are added in order of time.
+
+    `detections` finds what was seen in a table. Of measurements one message stays in
+    `numbers_ns`.
+    """
+
+    detections: DetectionColumns
+    numbers_ns: Ns = THINNED_NS
+    _last: Ns | None = None
+    _stays: list[IntArray] = field(default_factory=list)
+    _slot: int = -1
+    _named: set[Name] = field(default_factory=set)
+    _values: dict[str, tuple[object, Ns]] = field(default_factory=dict)
+    _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
+    _extremes: dict[tuple[str, int], _Extremes] = field(default_factory=dict)
+
+    def add(self, table: Table) -> None:
+        """Adds the messages of a bag, at least one."""
+        times, named = table.log_times, self._labels(table)
+        for path, column in table.columns.items():
+            if isinstance(column, Texts):
+                # A text with detections differs in each message, and is none that holds.
+                if not any(named):
+                    self._add_changes(path, column.codes, column.values(), times)
+            elif _is_discrete(column):
+                self._add_changes(path, column, column.tolist(), times)
+            elif _is_measured(column):
+                self._add_extremes(path, np.asarray(column, np.float64), times)
+        self._add_moves("", times, _poses(table.columns))
+        for inner in table.elements.values():
+            self._add_frames(inner, times, named)
+        slot_ns = self.numbers_ns if has_numbers(table) else THINNED_NS
+        if slot_ns == THINNED_NS:
+            self._add_pauses(times)
+        slots = times // slot_ns
+        starts = np.flatnonzero(np.diff(slots, prepend=-1)).tolist()
+        for start, stop in zip(starts, [*starts[1:], times.size], strict=True):
+            self._add_slot(int(slots[start]), times[start:stop], named[start:stop])
+
+    def _add_slot(self, slot: int, times: IntArray, named: Sequence[set[Name]]) -> None:
+        """Adds few messages of a slot that show all labels and frames in it; at least one."""
+        is_new = slot != self._slot
+        if is_new:
+            self._slot = slot
+            self._named.clear()
+        rows = _covering(named, self._named) or ([0] if is_new else [])
+        self._stays.append(times[np.array(rows, np.int64)])
+
+    def _add_pauses(self, times: IntArray) -> None:
+        """Adds the messages before and after each time without one."""
+        before = times[:1] if self._last is None else [self._last]
+        around = np.concatenate([before, times]).astype(np.int64)
+        after = np.flatnonzero(np.diff(around) > PAUSE_NS)
+        self._stays += [around[after], around[after + 1]]
+        self._last = int(times[-1])
+
+    def _labels(self, table: Table) -> list[set[Name]]:
+        """Returns the labels of the detections in each message, also in JSON, with their number."""
+        found = self.detections.of(table)
+        labels: list[list[str]] = [[] for _ in range(len(table))]
+        for row, label in () if found is None else _pairs(found.detections):
+            labels[row].append(label)
+        for column in table.columns.values():
+            if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
+                for row, text in enumerate(column.values()):
+                    labels[row] += [seen.label for seen in detections_of(text)]
+        return [
+            {(label, nth) for label, count in Counter(seen).items() for nth in range(count)}
+            for seen in labels
+        ]
+
+    def times(self) -> IntArray:
+        """Returns the log times (ns) of the messages that stay, ascending."""
+        extremes = [one[1] for both in self._extremes.values() for one in both]
+        return np.unique(np.concatenate([*self._stays, np.array(extremes, np.int64)]))
+
+    def _add_changes(
+        self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
+    ) -> None:
+        """Adds the messages between which a value changes; `codes` differ where `values` do."""
+        last, at = self._values.get(path, (values[0], int(times[0])))
+        later = np.flatnonzero(codes[1:] != codes[:-1])
+        self._stays += [times[later], times[later + 1]]
+        if last != values[0]:
+            self._stays.append(np.array([at, times[0]], np.int64))
+        self._values[path] = values[-1], int(times[-1])
+
+    def _add_extremes(self, path: str, numbers: Points, times: IntArray) -> None:
+        for part in np.unique(times // EXTREMES_NS).tolist():
+            inside = np.flatnonzero((times // EXTREMES_NS == part) & np.isfinite(numbers))
+            if not inside.size:
+                continue
+            found = [(float(numbers[nth]), int(times[nth])) for nth in inside.tolist()]
+            least, greatest = min(found), max(found, key=itemgetter(0))
+            known = self._extremes.get((path, part))
+            if known is not None:
+                least = min(known.least, least)
+                greatest = max(known.greatest, greatest, key=itemgetter(0))
+            self._extremes[path, part] = _Extremes(least, greatest)
+
+    def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
+        for path, rows in poses.items():
+            mover = self._movers.setdefault((path, name), _Mover())
+            self._stays.append(np.array([*mover.moved(times, rows)], np.int64))
+
+    def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
+        """Adds the moves of the frames of transforms, and to `named` the frames in each message."""
+        column = inner.columns.get(_FRAME)
+        if not isinstance(column, Texts):
+            return
+        for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
+            named[row].add((frame, 0))
+        for code, frame in enumerate(column.words):
+            own = np.flatnonzero(column.codes == code)
+            poses = {key: rows[own] for key, rows in _poses(inner.columns).items()}
+            self._add_moves(frame, times[inner.owners[own]], poses)
+
+
+def _pairs(found: Detections) -> Iterator[tuple[int, str]]:
+    return zip(found.rows.tolist(), found.labels.values(), strict=True)
+
+
+def _covering(named: Sequence[set[Name]], seen: set[Name]) -> list[int]:
+    """Returns few rows in which all names occur that were not `seen`, and adds these to them."""
+    missing: set[Name] = set().union(*named) - seen
+    seen |= missing
+    rows: list[int] = []
+    while missing:
+        best = max(range(len(named)), key=lambda row: len(named[row] & missing))
+        rows.append(best)
+        missing -= named[best]
+    return rows
+
+
+def _is_discrete(column: Column) -> TypeGuard[Numbers]:
+    """Returns whether a column of numbers has states: booleans, and integers of few values."""
+    if isinstance(column, Texts):
+        return False
+    if column.dtype.kind not in "biu" or column.dtype.itemsize == 1:
+        return column.dtype.kind in "biu"
+    distinct = np.unique(column).size
+    return distinct <= _FEW and distinct * _OFTEN <= column.size
+
+
+def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
+    """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
+    found: dict[str, Points] = {}
+    for path in columns:
+        around, _, name = path.removesuffix(".x").rpartition(".")
+        if not path.endswith(".x") or name not in _POINTS:
+            continue
+        turn = _TURNS[_POINTS.index(name)]
+        names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
+        names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
+        numbers = [columns[each] for each in names if each in columns]
+        found[path[:-2]] = np.stack(
+            [np.asarray(each, np.float64) for each in numbers if not isinstance(each, Texts)],
+            axis=1,
+        )
+    if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
+        planar = [columns[name] for name in ("x", "y", "theta")]
+        found[""] = np.stack(
+            [np.asarray(each, np.float64) for each in planar if not isinstance(each, Texts)], axis=1
+        )
+    return found

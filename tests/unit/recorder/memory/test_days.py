@@ -1,0 +1,399 @@
+"""The folder `memory/`: what stays of bags that retention deletes."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.records import Chunk
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bootstrap import build_dispatcher, build_memory
+from ros2_memory.config import load_settings
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.recorder.memory.days import MONTH_NS, MemoryDays, MemoryLimits
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.storage.base import BagWriter, Record
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    detections,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import HOUR, files_in, own_all
+from tests.support.memories import shipped_extractor
+from tests.support.program import Program, exits
+
+S = NS_PER_S
+T0 = 1_790_000_400 * S  # 13:20 on 21 September 2026
+__all__ = ["exits"]
+DAY_FILE = "memory/20260921.mcap"
+
+
+def split(
+    bag_dir: Path, start: int, *, name: str = "rec_A", labels: Sequence[str] = ("mug",)
+) -> Path:
+    """A split of a minute that begins so many seconds after `T0`; the robot drives along x."""
+    begin = T0 + start * S
+    times = range(begin, begin + 60 * S, S // 5)
+    messages: list[Msg] = [
+        tf(begin, transform(begin, "base_link", "camera", (0.1, 0, 0.3)), topic="/tf_static")
+    ]
+    for at in times:
+        messages.append(odom(at, (at - T0) / S / 4, 1.0))
+        messages.append(boolean(at, (at - T0) // (30 * S) % 2 == 1))
+    messages += [detections(at, labels) for at in times[::5]]
+    messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::5]]
+    messages.append(text(begin + 7 * S, "the code is 4711"))
+    messages.sort(key=lambda each: each.log_time)
+    return write_mcap(bag_dir / name / f"{name}_{start // 60}.mcap", messages)
+
+
+def days_of(
+    bag_dir: Path, *, writer: BagWriter | None = None, limits: MemoryLimits | None = None
+) -> MemoryDays:
+    return MemoryDays(
+        bag_dir,
+        BagDirReader(McapReader()),
+        writer or McapWriter(),
+        OwnRecordings(bag_dir),
+        shipped_extractor(),
+        limits=limits or MemoryLimits(),
+        static_topics=("/tf_static",),
+    )
+
+
+def house(
+    bag_dir: Path,
+    now: int,
+    *,
+    max_age_h: float = 10**6,
+    max_bytes: int = 10**15,
+    memory: MemoryDays | None = None,
+) -> Housekeeping:
+    return Housekeeping(
+        bag_dir,
+        BagDirReader(McapReader()),
+        McapWriter(),
+        SettableClock(now),
+        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=True),
+        is_synchronised=lambda: True,
+        split_duration_s=60.0,
+        static_topics=("/tf_static",),
+        memory=memory,
+    )
+
+
+def reply_of(bag_dir: Path, tool: str, **arguments: Any) -> Any:
+    """What a server over the shipped configuration replies."""
+    settings = load_settings(
+        [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"], env={}
+    )
+    dispatcher = build_dispatcher(settings, build_memory(settings))
+    return json.loads(asyncio.run(dispatcher.answer(tool, arguments)).text)
+
+
+def content_of(path: Path) -> bytes:
+    """The bytes of a file, and those of its chunks decompressed."""
+    data = path.read_bytes()
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, emit_chunks=True).records:
+            if isinstance(record, Chunk):
+                data += b"".join(repr(one).encode() for one in breakup_chunk(record))
+    return data
+
+
+def keep_all(days: MemoryDays, bag_dir: Path, name: str = "rec_A") -> None:
+    index = IndexManager(
+        bag_dir,
+        BagDirReader(McapReader()),
+        SettableClock(T0 + 10**6 * S),
+        refresh_s=0.0,
+        split_duration_s=60.0,
+    )
+    snapshot = index.refresh()
+    days.keep(snapshot, {bag.file for bag in snapshot.bags if bag.recording.name == name})
+
+
+def messages_in(path: Path) -> list[Record]:
+    reader = McapReader()
+    topics = [channel.topic for channel in reader.channels(path)]
+    return list(reader.records(path, topics, TimeWindow.everything()))
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    (tmp_path / "bags").mkdir()
+    return tmp_path / "bags"
+
+
+def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> None:
+    for nth in range(3):
+        split(bag_dir, 60 * nth)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    found = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    assert "/chatter" not in found
+    assert 175 <= found["/odom"] <= 200
+    assert found["/bumper"] <= 60
+    assert 20 <= found["/vision/scene/scene_objects"] <= 40
+    assert b"4711" not in (bag_dir / DAY_FILE).read_bytes()
+    assert McapReader().summarize(bag_dir / DAY_FILE).complete
+
+
+def test_texts_stay_of_topics_that_are_named(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chat*",))), bag_dir)
+    said = [each for each in messages_in(bag_dir / DAY_FILE) if each.channel.topic == "/chatter"]
+    assert len(said) == 1
+
+
+def test_people_are_taken_out_unless_their_label_is_named(bag_dir: Path) -> None:
+    split(bag_dir, 0, labels=("mug", "Person", "old man"))
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    reader = McapReader()
+    seen = Counter(
+        one.label
+        for record in messages_in(bag_dir / DAY_FILE)
+        if record.channel.topic == "/vision/scene/scene_objects"
+        for one in reader.decode(record).detections  # type: ignore[attr-defined]
+    )
+    assert seen.keys() == {"mug"}
+    assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
+    (bag_dir / DAY_FILE).unlink()
+    keep_all(days_of(bag_dir, limits=MemoryLimits(labels=("Person",))), bag_dir)
+    seen = Counter(
+        one.label
+        for record in messages_in(bag_dir / DAY_FILE)
+        if record.channel.topic == "/vision/scene/scene_objects"
+        for one in reader.decode(record).detections  # type: ignore[attr-defined]
+    )
+    assert seen.keys() == {"mug", "Person"}
+
+
+def test_what_stays_already_is_not_written_twice_and_hours_are_added(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    days = days_of(bag_dir)
+    keep_all(days, bag_dir)
+    first = messages_in(bag_dir / DAY_FILE)
+    keep_all(days, bag_dir)
+    assert messages_in(bag_dir / DAY_FILE) == first
+    split(bag_dir, 7200, name="rec_B")
+    own_all(bag_dir)
+    keep_all(days, bag_dir, "rec_B")
+    both = messages_in(bag_dir / DAY_FILE)
+    assert both[: len(first)] == first
+    assert len(both) > len(first) + 60
+
+
+def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
+    bag_dir: Path,
+) -> None:
+    (bag_dir / "memory").mkdir()
+    (bag_dir / DAY_FILE).write_bytes(b"\x89MCAP0\r\nbroken")
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    assert (bag_dir / DAY_FILE).read_bytes() == b"\x89MCAP0\r\nbroken"
+    assert messages_in(bag_dir / "memory/20260921_1.mcap")
+
+
+class Failing(McapWriter):
+    """Fails after some messages, as a full disk does."""
+
+    def __init__(self, after: int) -> None:
+        super().__init__()
+        self.left = after
+
+    def write(self, path: Path, records, **how) -> None:  # type: ignore[no-untyped-def]
+        def some() -> Iterator[Record]:
+            for record in records:
+                if not self.left:
+                    raise OSError(28, "No space left on device")
+                self.left -= 1
+                yield record
+
+        super().write(path, some(), **how)
+
+
+@pytest.mark.parametrize("after", [0, 1, 50, 150])
+def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    before = (bag_dir / DAY_FILE).read_bytes()
+    split(bag_dir, 60, name="rec_B")
+    own_all(bag_dir)
+    with pytest.raises(BagError):
+        keep_all(days_of(bag_dir, writer=Failing(after)), bag_dir, "rec_B")
+    assert (bag_dir / DAY_FILE).read_bytes() == before
+    assert [path.name for path in (bag_dir / "memory").iterdir()] == ["20260921.mcap"]
+
+
+def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
+    bag_dir: Path,
+) -> None:
+    for day in range(4):
+        split(bag_dir, 86_400 * day, name=f"rec_{day}")
+    own_all(bag_dir)
+    days = days_of(bag_dir)
+    for day in range(4):
+        keep_all(days, bag_dir, f"rec_{day}")
+    names = [f"202609{number}.mcap" for number in (21, 22, 23, 24)]
+    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names
+    size = (bag_dir / DAY_FILE).stat().st_size
+    now = T0 + 4 * 86_400 * S
+    days_of(bag_dir, limits=MemoryLimits(max_age_ns=round(3.5 * 86_400) * S)).limit(now)
+    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names[1:]
+    days_of(bag_dir, limits=MemoryLimits(max_bytes=round(2.5 * size))).limit(now)
+    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names[2:]
+    (bag_dir / "memory" / "mine.mcap").write_bytes(b"of somebody else")
+    days_of(bag_dir).clear()
+    assert [path.name for path in (bag_dir / "memory").iterdir()] == ["mine.mcap"]
+
+
+def test_after_a_month_numbers_have_one_message_a_minute(bag_dir: Path) -> None:
+    for nth in range(10):
+        split(bag_dir, 60 * nth)
+    own_all(bag_dir)
+    days = days_of(bag_dir)
+    keep_all(days, bag_dir)
+    before = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    days.limit(T0 + 2 * 86_400 * S)
+    assert Counter(each.channel.topic for each in messages_in(bag_dir / DAY_FILE)) == before
+    days.limit(T0 + MONTH_NS + 2 * 86_400 * S)
+    after = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    assert before["/battery_state"] > 80
+    assert after["/battery_state"] <= 10 + 2 * 8 + 1
+    assert before - Counter({"/battery_state": before["/battery_state"]}) == after - Counter(
+        {"/battery_state": after["/battery_state"]}
+    )
+
+
+def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
+    """Splits of 13:20 to 14:40; at 14:10 plus a day the hour from 13:00 is too old."""
+    for nth in range(80):
+        split(bag_dir, 60 * nth)
+    own_all(bag_dir)
+    asked = {"timestamp": (T0 + 600 * S) / S}
+    exact = reply_of(bag_dir, "get_position_at", **asked)
+    newest = split(bag_dir, 86_400 + 3000, name="rec_B")
+    own_all(bag_dir)
+    days = days_of(bag_dir)
+    house(bag_dir, T0 + (86_400 + 3060) * S, max_age_h=24, memory=days).apply()
+    left = sorted(path.name for path in (bag_dir / "rec_A").glob("*.mcap"))
+    assert len(left) == 40
+    assert newest.exists()
+    reply = reply_of(bag_dir, "get_position_at", **asked)
+    assert reply["from"] == "memory"
+    assert reply["resolution_s"] == 1
+    assert reply["x"] == pytest.approx(exact["x"], abs=0.3)
+    assert "from" not in reply_of(bag_dir, "get_position_at", timestamp=(T0 + 3000 * S) / S)
+    whole = reply_of(
+        bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=(T0 + 604.5 * S) / S
+    )
+    assert (whole["error"], whole["reason"]) == ("no_data", "deleted")
+
+
+def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
+    for nth in range(3):
+        split(bag_dir, 60 * nth)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chatter",))), bag_dir)
+    for path in (bag_dir / "rec_A").iterdir():
+        path.unlink()
+    wanted = {"topic": "/chatter", "condition_type": "contains"}
+    found = reply_of(bag_dir, "find_last_match", **wanted, value="4711")
+    assert (found["value"], found["from"]) == ({"value": "the code is 4711"}, "memory")
+    never = reply_of(bag_dir, "find_last_match", **wanted, value="scissors")
+    assert never["timestamp"] is None
+    assert any("only some messages stayed" in note for note in never["notes"])
+
+
+def test_the_budget_does_not_wait_and_takes_the_rest_of_an_hour(bag_dir: Path) -> None:
+    for nth in range(80):
+        split(bag_dir, 60 * nth)
+    own_all(bag_dir)
+    total = sum(path.stat().st_size for path in (bag_dir / "rec_A").iterdir())
+    now = T0 + 5000 * S
+    house(bag_dir, now, max_bytes=round(0.97 * total), memory=days_of(bag_dir)).apply()
+    left = {path.name for path in (bag_dir / "rec_A").glob("*.mcap")}
+    assert left == {f"rec_A_{nth}.mcap" for nth in range(40, 80)}
+    assert (bag_dir / DAY_FILE).exists()
+
+
+def test_without_it_no_file_is_added_and_each_bag_goes_as_it_is_too_old(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    for nth in range(80):
+        split(bag_dir, 60 * nth)
+    split(bag_dir, 86_400 + 3000, name="rec_B")
+    own_all(bag_dir)
+    house(bag_dir, T0 + (86_400 + 3060) * S, max_age_h=24).apply()
+    assert not [name for name in files_in(bag_dir) if name.startswith("memory")]
+    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 30
+
+
+def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_dir: Path) -> None:
+    for nth in range(80):
+        split(bag_dir, 60 * nth)
+    split(bag_dir, 86_400 + 3000, name="rec_B")
+    own_all(bag_dir)
+    monotonic = SettableClock(0)
+    keeper = Housekeeping(
+        bag_dir,
+        BagDirReader(McapReader()),
+        McapWriter(),
+        SettableClock(T0 + (86_400 + 3060) * S),
+        RetentionLimits(10**15, 24 * HOUR, keeps_foreign=True),
+        is_synchronised=lambda: True,
+        split_duration_s=60.0,
+        memory=days_of(bag_dir, writer=Failing(0)),
+        monotonic=lambda: monotonic.now() / S,
+    )
+    keeper.apply()
+    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 80
+    monotonic.at = 90_000 * S
+    keeper.apply()
+    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 40
+
+
+def test_forgetting_takes_it_out_of_days_to_the_byte(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    for nth in range(3):
+        split(bag_dir, 60 * nth, labels=("mug", "vodka bottle"))
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    for path in (bag_dir / "rec_A").iterdir():
+        path.unlink()
+    assert b"vodka" in content_of(bag_dir / DAY_FILE)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    window = ("--start", T0 / S, "--end", T0 / S + 3600)
+    exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
+    assert b"vodka" not in content_of(bag_dir / DAY_FILE)
+    topics = {record.channel.topic for record in messages_in(bag_dir / DAY_FILE)}
+    assert "/odom" in topics
+    assert "/vision/scene/scene_objects" not in topics

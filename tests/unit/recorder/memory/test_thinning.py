@@ -1,0 +1,153 @@
+"""Which messages of a topic stay of a day: what changes, what is seen, and enough of the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
+from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.detections import DetectionColumns
+from ros2_memory.recorder.memory.rounding import rounded
+from ros2_memory.recorder.memory.thinning import (
+    EXTREMES_NS,
+    MINUTE_NS,
+    TopicThinning,
+    is_said,
+)
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import Msg, boolean, detections, make, odom, text, write_mcap
+from tests.support.memories import shipped_extractor
+
+S = 10**9
+T0 = 1_790_000_001 * S
+
+
+def times_that_stay(
+    folder: Path, bags: Sequence[Sequence[Msg]], *, numbers_ns: int = THINNED_NS
+) -> list[int]:
+    """The log times that stay of one topic in some bags, in ns since `T0`."""
+    thinned = TopicThinning(DetectionColumns(shipped_extractor()), numbers_ns)
+    for nth, messages in enumerate(bags):
+        path = write_mcap(folder / f"{nth}.mcap", messages)
+        for tables in decoded(McapReader(), path):
+            for table in tables:
+                thinned.add(table)
+        path.unlink()
+    return [time - T0 for time in thinned.times().tolist()]
+
+
+def number(at: int, value: float) -> Msg:
+    body = make("std_msgs/msg/Float64", data=value)
+    return Msg("/level", "std_msgs/msg/Float64", at, body)
+
+
+def cut(messages: Sequence[Msg], at: Sequence[int]) -> list[Sequence[Msg]]:
+    edges = [0, *sorted(at), len(messages)]
+    parts = [messages[a:b] for a, b in pairwise(edges)]
+    return [part for part in parts if part]
+
+
+def test_a_robot_that_drives_has_a_pose_a_second_and_one_that_stands_one_a_slot(
+    tmp_path: Path,
+) -> None:
+    """Driving from 30 s to 60 s, at 0.5 m/s."""
+    at = np.arange(0, 90 * S, S // 10)
+    poses = [odom(T0 + int(t), 0.5 * min(max(t / S - 30, 0), 30), 0.0) for t in at]
+    stays = times_that_stay(tmp_path, [poses])
+    driving = [t for t in stays if 31 * S <= t < 60 * S]
+    assert len(driving) >= 29
+    assert all(after - before <= S for before, after in pairwise(driving))
+    standing = [t for t in stays if t < 29 * S or t > 62 * S]
+    assert len(standing) <= 2 * 30 * S / THINNED_NS + 4
+
+
+@given(
+    st.lists(st.booleans(), min_size=2, max_size=60),
+    st.lists(st.integers(1, 59), max_size=4, unique=True),
+)
+def test_every_change_of_a_boolean_stays_wherever_bags_are_cut(
+    tmp_path_factory: pytest.TempPathFactory, values: list[bool], at: list[int]
+) -> None:
+    messages = [boolean(T0 + n * S, value) for n, value in enumerate(values)]
+    parts = cut(messages, [edge for edge in at if edge < len(messages)])
+    stays = {t // S for t in times_that_stay(tmp_path_factory.mktemp("bags"), parts)}
+    changes = {n for n in range(1, len(values)) if values[n] != values[n - 1]}
+    assert changes | {n - 1 for n in changes} <= stays
+
+
+@given(st.lists(st.integers(S // 20, 12 * S), min_size=2, max_size=120))
+def test_no_silence_is_made_that_was_not_there(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[int]
+) -> None:
+    """Between two messages that stay lie no 10 s, unless these followed each other."""
+    at = np.cumsum(steps).tolist()
+    messages = [number(T0 + t, 1.0) for t in at]
+    stays = times_that_stay(tmp_path_factory.mktemp("bags"), cut(messages, [len(at) // 2]))
+    following = dict(pairwise(at))
+    for before, after in pairwise(stays):
+        assert after - before < SILENCE_NS or following[before] == after
+
+
+def test_the_extremes_of_numbers_stay(tmp_path: Path) -> None:
+    chance = np.random.default_rng(3)
+    numbers = chance.normal(size=3000).tolist()
+    messages = [number(T0 + n * S // 2, value) for n, value in enumerate(numbers)]
+    for numbers_ns in (THINNED_NS, MINUTE_NS):
+        parts = cut(messages, range(200, 3000, 200))
+        stays = {2 * t // S for t in times_that_stay(tmp_path, parts, numbers_ns=numbers_ns)}
+        slots: dict[int, list[int]] = {}
+        for n in range(3000):
+            slots.setdefault((T0 + n * S // 2) // EXTREMES_NS, []).append(n)
+        for inside in slots.values():
+            assert min(inside, key=numbers.__getitem__) in stays
+            assert max(inside, key=numbers.__getitem__) in stays
+        assert len(stays) <= 1500 * S // numbers_ns + 2 * len(slots) + 2
+
+
+def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path) -> None:
+    """A detector that misses: each message has a third of what is there."""
+    chance = np.random.default_rng(5)
+    there = ["mug", "mug", "chair", "chair", "chair", "book", "plant"]
+    seen = [[label for label in there if chance.random() < 0.3] for _ in range(500)]
+    messages = [detections(T0 + n * S // 5, labels) for n, labels in enumerate(seen)]
+    stays = {5 * t // S for t in times_that_stay(tmp_path, cut(messages, [130, 133, 350]))}
+    slots: dict[int, list[int]] = {}
+    for n in range(500):
+        slots.setdefault((T0 + n * S // 5) // THINNED_NS, []).append(n)
+    for inside in slots.values():
+        for label in there:
+            most = max(seen[n].count(label) for n in inside)
+            assert max(seen[n].count(label) for n in inside if n in stays) == most
+    assert len(stays) < 250
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: text(T0, "hello"), True),
+        (lambda: odom(T0, 0.0, 0.0), False),
+        (lambda: detections(T0, ["mug"]), False),
+    ],
+)
+def test_messages_say_something_if_a_text_names_nothing(
+    tmp_path: Path, make: Callable[[], Msg], said: bool
+) -> None:
+    [[table]] = decoded(McapReader(), write_mcap(tmp_path / "a.mcap", [make()]))
+    assert is_said(table) is said
+
+
+@given(st.floats(-1e6, 1e6), st.floats(0.0, 6.28))
+def test_a_rounded_pose_is_within_the_steps_of_columns(x: float, yaw: float) -> None:
+    message = odom(T0, x, -x / 3, yaw=yaw).body
+    assert not isinstance(message, bytes)
+    left = rounded(message, None)
+    before, after = message.pose.pose, left.pose.pose  # type: ignore[attr-defined]
+    assert abs(after.position.x - before.position.x) <= 0.5e-4
+    assert abs(after.orientation.z - before.orientation.z) <= 2.5e-5
