@@ -244,7 +244,7 @@ class Timeline {
   }
   /* The whole memory, and which part of it is shown. */
   drawOverview(c) {
-    const { earliest, latest, gaps } = this.view.range;
+    const { earliest, latest, gaps, thinned = [] } = this.view.range;
     const length = latest - earliest || 1;
     const x = (t) => GUTTER + (t - earliest) / length * this.wide;
     c.fillStyle = colour("soft");
@@ -253,6 +253,10 @@ class Timeline {
     c.fillRect(GUTTER, 3, this.wide, 6);
     c.fillStyle = colour("card");
     for (const [start, end] of gaps) c.fillRect(x(start), 3, Math.max(x(end) - x(start), 1), 6);
+    // Days of which only some messages stayed are paler.
+    c.globalAlpha = 0.6;
+    for (const [start, end] of thinned) c.fillRect(x(start), 3, Math.max(x(end) - x(start), 1), 6);
+    c.globalAlpha = 1;
     const left = clamp(x(this.span.start), GUTTER, GUTTER + this.wide);
     const right = clamp(x(this.span.end), left + 3, GUTTER + this.wide);
     c.strokeStyle = colour("accent");

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
+from starlette.datastructures import QueryParams
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -20,13 +21,17 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Call
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.serving.page.routes import span_request
+from ros2_memory.serving.page.span import span_shown
 from ros2_memory.storage.base import BagWriter, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import (
     Msg,
     battery,
@@ -397,3 +402,16 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
     topics = {record.channel.topic for record in messages_in(bag_dir / DAY_FILE)}
     assert "/odom" in topics
     assert "/vision/scene/scene_objects" not in topics
+
+
+def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    for path in (bag_dir / "rec_A").iterdir():
+        path.unlink()
+    words = [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"]
+    memory = build_memory(load_settings(words, env={}))
+    shown = span_shown(memory, Call(), span_request(QueryParams("last=1000")))
+    [[first, last]] = json.loads(to_json_text(shown))["range"]["thinned"]
+    assert (first, last) == pytest.approx((T0 / S, T0 / S + 60), abs=1.0)
