@@ -197,7 +197,12 @@ class TestTheBagOfCarriedMessages:
     ) -> None:
         class FullDisk(McapWriter):
             def write(
-                self, path: Path, records: Iterable[Record], *, profile: str = "ros2"
+                self,
+                path: Path,
+                records: Iterable[Record],
+                *,
+                profile: str = "ros2",
+                dense: bool = False,
             ) -> None:
                 raise BagError(str(path), "it cannot be written: No space left on device")
 

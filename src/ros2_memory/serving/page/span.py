@@ -161,10 +161,11 @@ def span_shown(
         shown["questions"] = [_question(each) for each in questions.newest(MOST_QUESTIONS)]
     if request.status:
         ranged = data_time_range(memory, call)
-        reach: JsonObject = {**render(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
-        if days := snapshot.timeline.thinned:
-            reach["thinned"] = [[_s(day.start), _s(day.end)] for day in days]
-        shown["range"] = reach
+        shown["range"] = {
+            **render(ranged, memory.index.bag_dir),
+            "gaps": _gaps(ranged),
+            "thinned": [[_s(day.start), _s(day.end)] for day in snapshot.timeline.thinned],
+        }
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
         return shown
