@@ -29,6 +29,7 @@ from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
     MIN_NS,
+    NS_PER_S,
     START_SLACK_NS,
     Ns,
     ns_from_unix,
@@ -117,6 +118,8 @@ A = TypeVar("A", results.Match, results.ValueWhen)
 
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
+_REACH_M: Final = 0.05
+"""How far a robot may have got before the next pose without a note."""
 
 
 def topic_value(
@@ -217,12 +220,31 @@ def _position_in(
         view.notes.add("the recorded orientation is not a rotation")
     if geodetic is None:
         recording = found.bag.recording
+        if is_thinned(found.bag.file):
+            _note_reach(view, found, pose)
         if frame_id is not None:
             pose = placed(view, pose, found.time, recording, frame_id)
         if memory.limits.places:
             pose = with_place(view, pose, found.time, recording)
     notes = view.notes.sentences()
     return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
+
+
+def _note_reach(view: View, found: StoredMessage, pose: Pose) -> None:
+    """Notes between which coordinates the robot was, in a second of which one pose stayed."""
+    window = TimeWindow(found.time + 1, found.time + 2 * NS_PER_S)
+    newer = view.stream.first([found.record.channel.topic], window)
+    message = None if newer is None else view.bags.decode(newer)
+    if newer is None or message is None:
+        return
+    after = view.memory.extractor.pose(message, newer.record.channel.type)
+    if after is not None and math.dist(after.position, pose.position) > _REACH_M:
+        spans = zip("xy", pose.position[:2], after.position[:2], strict=True)
+        ends = [f"{axis} {min(span):.2f} to {max(span):.2f}" for axis, *span in spans]
+        view.notes.add(
+            f"it moved: until {unix_text(newer.time)} it was within {' and '.join(ends)} m of "
+            f"{pose.frame_id or 'its frame'}; of that time one pose a second stayed"
+        )
 
 
 def _position_of_body(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -25,6 +26,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import MONTH_NS, MemoryDays, MemoryLimits
+from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
 from ros2_memory.serving.page.span import span_shown
@@ -315,6 +317,9 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     assert reply["from"] == "memory"
     assert reply["resolution_s"] == 1
     assert reply["x"] == pytest.approx(exact["x"], abs=0.3)
+    assert [
+        note for note in reply["notes"] if "it was within x 150.00 to 150.25 and y 1.00" in note
+    ]
     assert "from" not in reply_of(bag_dir, "get_position_at", timestamp=(T0 + 3000 * S) / S)
     whole = reply_of(
         bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=(T0 + 604.5 * S) / S
@@ -415,3 +420,25 @@ def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
     shown = span_shown(memory, Call(), span_request(QueryParams("last=1000")))
     [[first, last]] = json.loads(to_json_text(shown))["range"]["thinned"]
     assert (first, last) == pytest.approx((T0 / S, T0 / S + 60), abs=1.0)
+
+
+GOLDEN = Path(__file__).resolve().parents[3] / "data" / "memory_day_1.mcap"
+"""A day as the first version with this folder wrote it, of one minute."""
+
+
+def test_days_of_earlier_versions_are_read(bag_dir: Path) -> None:
+    (bag_dir / "memory").mkdir()
+    shutil.copy(GOLDEN, bag_dir / DAY_FILE)
+    reply = reply_of(bag_dir, "get_position_at", timestamp=(T0 + 30 * S) / S)
+    assert (round(reply["x"], 1), reply["from"]) == (7.5, "memory")
+    seen = {"topic": "/vision/scene/scene_objects", "condition_type": "contains"}
+    found = reply_of(bag_dir, "find_last_match", **seen, value="mug")
+    assert found["value"]["detections"][0]["label"] == "mug"
+
+
+def test_clearing_at_the_start_takes_the_days_too(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    clear_bags(bag_dir, OwnRecordings(bag_dir))
+    assert not [name for name in files_in(bag_dir) if name.endswith(".mcap")]
