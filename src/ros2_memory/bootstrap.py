@@ -186,7 +186,7 @@ def build_housekeeper(
 def _memory_days_of(
     settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings
 ) -> MemoryDays | None:
-    """Returns what writes thinned days; deletes those there are where nothing is to stay."""
+    """Returns what writes thinned days, or deletes those there are, where nothing is to stay."""
     from ros2_memory.bag_dir.layout import MEMORY_FOLDER
 
     memory = settings.memory
@@ -205,11 +205,15 @@ def _memory_days_of(
     writer = McapWriter(settings.reader.max_chunk_mb)
     static = settings.data.tf_static_topics
     extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
-    days = MemoryDays(bag_dir, bags, writer, own, extractor, limits=limits, static_topics=static)
-    if memory.keep:
-        return days
-    days.clear()
-    return None
+    return MemoryDays(
+        bag_dir,
+        bags,
+        writer,
+        own,
+        extractor,
+        limits=limits if memory.keep else None,
+        static_topics=static,
+    )
 
 
 def _watch_of(

@@ -52,7 +52,7 @@ def test_questions_are_answered_alike_when_the_first_day_is_thinned(
     size = sum(path.stat().st_size for path in going.values())
     for path in going.values():
         path.unlink()
-    assert (bag_dir / "memory" / f"{first}.mcap").stat().st_size < size / 20
+    assert (bag_dir / "memory" / f"{first}.thinned.mcap").stat().st_size < size / 20
     outcomes = asking.ask_all(asking.server_over(settings), questions(SCALE))
     missed = {each.question.id: each.why for each in outcomes if each.result != asking.RIGHT}
     assert missed.keys() <= OF_BAGS, missed

@@ -11,7 +11,7 @@
         metadata.yaml                      written by rosbag2 at a clean end
         handover.json                      which messages count (see `handover_file`)
       latched/carried.mcap         latched messages of deleted bags (see `retention.latched_carry`)
-      memory/20261120.mcap         what stays of the bags of a day (see `recorder.memory.days`)
+      memory/20261120.thinned.mcap what stays of the bags of a day (see `recorder.memory.days`)
       moments/                     bags that were asked to be saved (see `moment_file`)
         20261120T043012Z-charging/         one saved moment
           moment.json                      its label and its time
@@ -72,7 +72,7 @@ BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 COMPRESSED: Final = ".zstd"
 
 _TIME_FORMAT: Final = "%Y%m%dT%H%M%SZ"
-_DAY_FILE: Final = re.compile(r"\d{8}(?:_\d+)?\.mcap")
+_DAY_FILE: Final = re.compile(r"\d{8}(?:-\d+)?\.thinned\.mcap")
 _RECORDING_NAME: Final = re.compile(r"rec_(\d{8}T\d{6}Z)(?:_\d+)?")
 
 
@@ -110,7 +110,7 @@ def utc_day(at: Ns) -> str:
 
 def memory_file(day: str, number: int = 0) -> str:
     """Returns the name of the file of a day; of a further one, where another cannot be changed."""
-    return f"{day}_{number}.mcap" if number else f"{day}.mcap"
+    return f"{day}-{number}.thinned.mcap" if number else f"{day}.thinned.mcap"
 
 
 def is_kept_apart(name: str) -> bool:

@@ -127,7 +127,8 @@ def up(
     else:
         _require_messages(robot, found)
         _propose(robot, found, disk, yes=yes)
-    if not settings.memory.keep and _remembers(bags, yes=yes):
+    is_open = not settings.memory.keep and sources("memory.keep").startswith("in ")
+    if is_open and _remembers(bags, yes=yes):
         robot.words.append("memory.keep=true")
     if script is not None:
         _hand_over(script, robot)

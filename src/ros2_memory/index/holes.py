@@ -112,7 +112,7 @@ class Rhythm:
         if several and pause.length > _GAP_PERIODS * self._slower(pause):
             return True
         if len(pause.bags) == 1:
-            # In a thinned day every topic has a message in each slot of 5 s, or as often as it had.
+            # In a thinned day each topic has a message in every slot of 7 s, or as often as it had.
             return not pause.ran_on and pause.length > _LONGEST_LEAST_NS
         longer = max(bag.end - bag.start for bag in pause.bags)
         least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0

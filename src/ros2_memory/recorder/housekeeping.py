@@ -85,7 +85,7 @@ class Housekeeping(Housekeeper):
         grace_s: for how long a query may work on an older snapshot of the bags.
         measure_free: measures what the disk has left, in bytes.
         monotonic: a clock that never steps, in seconds.
-        memory: what stays of deleted bags; None where nothing does.
+        memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
     """
 
     def __init__(
@@ -125,8 +125,9 @@ class Housekeeping(Housekeeper):
             needed=self._needed,
             measure_free=measure_free,
             monotonic=monotonic,
-            memory=memory,
+            memory=memory if memory is not None and memory.keeps else None,
         )
+        self._memory = memory
         self._index = IndexManager(
             bag_dir,
             reader,
@@ -181,6 +182,8 @@ class Housekeeping(Housekeeper):
             is_unfinished = not size_of(directory / METADATA_FILE)
             if is_own and (directory in named or is_unfinished):
                 self._repair_recording(directory)
+        if self._memory is not None and not self._memory.keeps:
+            self._memory.clear()
 
     def make_room(self, free_bytes_wanted: int) -> None:
         """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.

@@ -119,6 +119,9 @@ class _Pass:
 class Outliving(Protocol):
     """What stays of bags that are deleted."""
 
+    keeps: bool
+    """Whether anything is to stay; otherwise all that stayed before is deleted."""
+
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
         """Makes durable what stays of some bags.
 
@@ -127,8 +130,15 @@ class Outliving(Protocol):
             OSError: likewise.
         """
 
-    def limit(self, now: Ns) -> None:
-        """Deletes what is too old, or too much.
+    def limit(self, now: Ns | None) -> None:
+        """Deletes what is too old, or too much. `now` is what age counts from; None: nothing ages.
+
+        Raises:
+            OSError: it cannot be deleted.
+        """
+
+    def clear(self) -> None:
+        """Deletes all.
 
         Raises:
             OSError: it cannot be deleted.
@@ -226,8 +236,7 @@ class GarbageCollector:
             going = plan.to_delete if self._memory is None else by_hours(plan, stock)
             to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
-                self._outlive(to_delete, plan.aged, stock, snapshot, run)
-                self._delete_all(to_delete, stock, snapshot, run)
+                self._delete_all(to_delete, stock, snapshot, run, aged=plan.aged)
                 run.unshipped += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
@@ -236,8 +245,10 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
-        if run.deleted:
-            self._limit_memory(snapshot.scanned_at)
+        if self._memory is not None:
+            # As bags do, days age by the newest that is recorded, and by a clock that is right.
+            newest = snapshot.latest if stock.synchronised else None
+            self._limit_memory(None if newest is None else min(newest, snapshot.scanned_at))
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
             relative_recording(path, self._bag_dir)
@@ -279,7 +290,13 @@ class GarbageCollector:
         return replace(stock, synchronised=synchronised)
 
     def _delete_all(
-        self, to_delete: Sequence[StoredBag], stock: RetentionStock, snapshot: Snapshot, run: _Pass
+        self,
+        to_delete: Sequence[StoredBag],
+        stock: RetentionStock,
+        snapshot: Snapshot,
+        run: _Pass,
+        *,
+        aged: Collection[str],
     ) -> None:
         saved = {file.inode for file in stock.saved}
         run.saved |= {
@@ -304,6 +321,8 @@ class GarbageCollector:
                 run.remaining.add(path)
                 run.waiting.add(path)
         going = [bag for bag in to_delete if bag.path not in run.remaining]
+        self._outlive(going, aged, stock, snapshot, run)
+        going = [bag for bag in going if bag.path not in run.remaining]
         self._note(going)
         for bag in going:
             self._delete(bag, run)
@@ -337,7 +356,7 @@ class GarbageCollector:
         else:
             self._memory_fails_since = None
 
-    def _limit_memory(self, now: Ns) -> None:
+    def _limit_memory(self, now: Ns | None) -> None:
         try:
             if self._memory is not None:
                 self._memory.limit(now)

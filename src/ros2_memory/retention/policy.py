@@ -185,6 +185,7 @@ class DeletionPlan(NamedTuple):
     """The deletions that the limits require.
 
     `to_delete` has the oldest bag first; those in `aged` are too old, the others make room.
+    `newest` is the bag that stays.
     `total_bytes` is what the budget counted, each file once. `fits`: whether the limits are kept
     once those bags are deleted. `most_free`: how much of the disk would be free if all bags were
     deleted that may be, where that is too little; then none is deleted for it.
@@ -195,6 +196,7 @@ class DeletionPlan(NamedTuple):
     fits: bool
     most_free: int | None = None
     aged: frozenset[str] = frozenset()
+    newest: str = ""
 
 
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
@@ -248,6 +250,8 @@ def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPl
             left.delete(bag)
     deleted = tuple(bag for bag in order if bag.path in going)
     found = DeletionPlan(deleted, total, fits=left.fits(limits), aged=aged & going)
+    if newest is not None:
+        found = found._replace(newest=newest.path)
     return found, left.free
 
 
@@ -255,20 +259,23 @@ def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]
     """Returns what a plan deletes, in whole hours, so that what stays of an hour is written once.
 
     Age waits until all bags of an hour are too old; to make room the rest of an hour goes, too, but
-    for the newest hour.
+    for bags that are needed, and for the hour of the newest bag. Those keep no other one.
     """
+    stays = stock.needed | stock.unshipped | {plan.newest}
+    going = {bag.path for bag in plan.to_delete}
     hours: dict[Ns, list[StoredBag]] = {}
     for bag in stock.bags:
-        date = bag.end if bag.has_dates else bag.written
-        hours.setdefault(date // HOUR_NS, []).append(bag)
-    going = {bag.path for bag in plan.to_delete}
+        if bag.path not in stays or bag.path in going:
+            date = bag.end if bag.has_dates else bag.written
+            hours.setdefault(date // HOUR_NS, []).append(bag)
+    last = next((bag.end // HOUR_NS for bag in stock.bags if bag.path == plan.newest), None)
     found: list[StoredBag] = []
     for hour, bags in sorted(hours.items()):
         inside = [bag for bag in bags if bag.path in going]
         if all(bag.path in plan.aged for bag in inside):
             found += inside if len(inside) == len(bags) else ()
         else:
-            found += inside if hour == max(hours) else bags
+            found += inside if hour == last else bags
     return tuple(found)
 
 

@@ -102,6 +102,7 @@ class Terminal(io.StringIO):
         ("y\n\n", (), False, False),
         ("", ("--yes",), False, False),
         ("", ("--yes",), True, True),
+        ("", ("--yes", "memory.keep=false"), True, False),
     ],
 )
 def test_only_a_person_has_something_outlive_the_bags(

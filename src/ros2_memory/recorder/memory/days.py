@@ -7,6 +7,7 @@ it, `forget` rewrites it. It is never changed in place: a new file takes its nam
 
 from __future__ import annotations
 
+import re
 import time
 from collections import defaultdict
 from contextlib import suppress
@@ -18,12 +19,12 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import MEMORY_FOLDER, memory_file, utc_day
+from ros2_memory.bag_dir.layout import ERASING_FILE, MEMORY_FOLDER, memory_file, utc_day
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import LABELS, match_topics
+from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.memory.rounding import rounded
@@ -32,6 +33,7 @@ from ros2_memory.recorder.memory.thinning import (
     TopicThinning,
     has_numbers,
     is_said,
+    is_sampled,
 )
 
 if TYPE_CHECKING:
@@ -70,6 +72,11 @@ _PEOPLE: Final = frozenset(
         "faces",
     ]
 )
+_WORD: Final = re.compile(r"[^\W\d_]+")
+_NAMES: Final = LISTS_OF_LABELS.union(LABELS, ("child_frame_id", "frame_id", "name", "names"))
+"""Fields that may name people."""
+_FIRST_DAY: Final = "2014"
+"""Days before it have a wrong date: there was no ROS 2."""
 _QOS: Final = "offered_qos_profiles"
 MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
 """The numbers of older days have one message a minute."""
@@ -105,7 +112,7 @@ class MemoryDays:
         writer: writes the days.
         own: lists the days as the recorder's own.
         extractor: has the schema map, by which detections are found.
-        limits: what may stay.
+        limits: what may stay; None: nothing, also of what is there.
         static_topics: topics that are latched whatever their publishers declare.
     """
 
@@ -117,7 +124,7 @@ class MemoryDays:
         own: OwnRecordings,
         extractor: SchemaExtractor,
         *,
-        limits: MemoryLimits,
+        limits: MemoryLimits | None,
         static_topics: Collection[str] = (),
     ) -> None:
         self._folder = bag_dir / MEMORY_FOLDER
@@ -125,7 +132,8 @@ class MemoryDays:
         self._writer = writer
         self._own = own
         self._extractor = extractor
-        self._limits = limits
+        self.keeps = limits is not None
+        self._limits = limits or MemoryLimits()
         self._static_topics = frozenset(static_topics)
         self._minutes: set[Path] = set()
 
@@ -138,57 +146,68 @@ class MemoryDays:
             BagError: a day cannot be written.
             OSError: likewise, or the list of the recorder's own bags cannot be read.
         """
-        days: dict[str, list[BagFile]] = defaultdict(list)
-        for bag in snapshot.bags:
-            if bag.file in paths:
-                days[utc_day(bag.start)].append(bag)
-        for day, bags in days.items():
-            begun = time.perf_counter_ns()
-            chosen = self._chosen(snapshot, bags)
-            records = sorted(self._records(bags, chosen), key=attrgetter("log_time"))
-            if records:
-                self._write(day, records)
-            _log.info(
-                "memory_kept",
-                day=day,
-                bags=len(bags),
-                messages=len(records),
-                left_out=chosen.left_out,
-                duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
-            )
+        if (self._folder.parent / ERASING_FILE).exists():
+            raise BagError(str(self._folder), "messages are being forgotten: they must not stay")
+        begun = time.perf_counter_ns()
+        bags = [bag for bag in snapshot.bags if bag.file in paths]
+        chosen = self._chosen(snapshot, bags)
+        days: dict[str, list[Record]] = defaultdict(list)
+        for record in sorted(self._records(bags, chosen), key=attrgetter("log_time")):
+            days[utc_day(record.log_time)].append(record)
+        for day, records in days.items():
+            self._write(day, records)
+        _log.info(
+            "memory_kept",
+            days=[*days],
+            bags=len(bags),
+            messages=sum(map(len, days.values())),
+            left_out=chosen.left_out,
+            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+        )
 
-    def limit(self, now: Ns) -> None:
+    def limit(self, now: Ns | None) -> None:
         """Deletes the days that are too old, then the oldest above the size; thins one further.
+
+        Age counts from `now`; without it nothing ages. Days before there was ROS 2 have a wrong
+        date, and do not age either.
 
         Raises:
             BagError: a day cannot be written anew.
             OSError: the folder cannot be read, or a day not be deleted.
         """
+        oldest = "" if now is None else memory_file(utc_day(now - self._limits.max_age_ns))
+        for path in self._days():
+            if _FIRST_DAY <= path.name < oldest:
+                self._delete(path)
         days = self._days()
-        oldest_day = memory_file(utc_day(now - self._limits.max_age_ns))
         size = sum(path.stat().st_size for path in days)
         for path in days:
-            if path.name >= oldest_day and size <= self._limits.max_bytes:
+            if size <= self._limits.max_bytes:
                 break
             size -= path.stat().st_size
-            path.unlink()
-            _log.info("memory_day_deleted", path=str(path))
-        month_ago = memory_file(utc_day(now - MONTH_NS))
-        for path in days:
-            if path.name < month_ago and path.exists() and path not in self._minutes:
+            self._delete(path)
+        month_ago = "" if now is None else memory_file(utc_day(now - MONTH_NS))
+        for path in self._days():
+            if path.name < month_ago and path not in self._minutes:
                 self._minutes.add(path)
                 self._thin_to_minutes(path)
                 break
 
+    def _delete(self, path: Path) -> None:
+        path.unlink()
+        _log.warning("memory_day_deleted", path=str(path))
+
     def _thin_to_minutes(self, path: Path) -> None:
         """Writes a day anew in which numbers have one message a minute, and their extremes."""
-        detections, numbers = DetectionColumns(self._extractor), dict[str, TopicThinning]()
+        detections = DetectionColumns(self._extractor)
+        numbers: dict[tuple[str, str], TopicThinning] = {}
         for table in _tables(self._reader, path):
             if has_numbers(table) and not table.channel.latched:
-                thinned = TopicThinning(detections, MINUTE_NS)
-                numbers.setdefault(table.channel.topic, thinned).add(table)
-        stays = {topic: {*one.times().tolist()} for topic, one in numbers.items()}
-        before = [one.count for one in self._reader.summarize(path).topics if one.topic in stays]
+                key = (table.channel.topic, table.channel.type)
+                numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
+        stays = {key: {*one.times().tolist()} for key, one in numbers.items()}
+        known = self._reader.summarize(path).topics
+        before = [one.count for one in known if (one.topic, one.type) in stays]
         if sum(before) > sum(map(len, stays.values())):
             days = self._joined(path, ())
             self._replace(path, (one for one in days if _stays(one, stays)))
@@ -200,6 +219,8 @@ class MemoryDays:
             OSError: one cannot be deleted.
         """
         days = self._days()
+        for left in self._folder.glob(".*.thinned.mcap.tmp"):
+            left.unlink()
         if days:
             _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         for path in days:
@@ -224,15 +245,19 @@ class MemoryDays:
             topic, kind = table.channel.topic, table.channel.type
             if "" in table.left_out:
                 chosen.left_out[topic] = table.left_out[""]
+            elif is_sampled(table):
+                chosen.left_out[topic] = "it has long arrays of numbers"
+            elif _is_of_people(f"{topic}/{kind}") and not self._limits.labels:
+                chosen.left_out[topic] = "it is of people, and memory.labels names none"
             elif is_said(table) and not _is_named(topic, self._limits.texts):
                 chosen.left_out[topic] = "it has texts, and memory.texts does not name it"
             elif self._is_latched(snapshot, topic):
                 chosen.latched.add(topic)
-                chosen.times[topic].update(table.log_times.tolist())
+                chosen.times[topic, kind].update(table.log_times.tolist())
             elif len(table):
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
-        for (topic, _), one in thinned.items():
-            chosen.times[topic].update(one.times().tolist())
+        for key, one in thinned.items():
+            chosen.times[key].update(one.times().tolist())
         return chosen
 
     def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
@@ -245,11 +270,11 @@ class MemoryDays:
 
     def _records(self, bags: Sequence[BagFile], chosen: _Chosen) -> Iterator[Record]:
         """Yields the messages that stay, without people whose label may not."""
-        topics = [topic for topic, times in chosen.times.items() if times]
+        topics = [*{topic for (topic, _), times in chosen.times.items() if times}]
         for bag in bags:
             for record in _readable(self._reader, bag.path, topics):
                 channel = record.channel
-                if record.log_time not in chosen.times[channel.topic]:
+                if record.log_time not in chosen.times.get((channel.topic, channel.type), ()):
                     continue
                 if channel.latched and channel.topic not in chosen.latched:
                     # Thinned, it would look like one whose messages hold until the next.
@@ -257,7 +282,8 @@ class MemoryDays:
                     channel = replace(channel, latched=False, metadata=metadata)
                 stays = record._replace(channel=channel)
                 if channel.topic in chosen.latched:
-                    yield stays
+                    if not self._shows_people(stays):
+                        yield stays
                 elif (smaller := self._smaller(stays)) is not None:
                     yield smaller
 
@@ -268,19 +294,31 @@ class MemoryDays:
         """
         try:
             message = _without(self._reader.decode(record), self._is_hidden)
-            shown = self._extractor.exact(message, record.channel.type)
-            texts = [value for _, value in _fields(message) if isinstance(value, str)]
-            for value in (shown, *texts):
-                if any(self._is_hidden(seen.label) for seen in detections_of(value)):
-                    return None
+            if self._names_people(message, record.channel.type):
+                return None
             left = rounded(message, self._reader.definition(record.channel))
             return record._replace(payload=self._reader.encode(record.channel, left))
         except UndecodableError:
             return None
 
+    def _shows_people(self, record: Record) -> bool:
+        """Returns whether a message names people who may not stay, or cannot be decoded."""
+        try:
+            return self._names_people(self._reader.decode(record), record.channel.type)
+        except UndecodableError:
+            return True
+
+    def _names_people(self, message: object, type_name: str) -> bool:
+        shown = self._extractor.exact(message, type_name)
+        texts = [value for _, value in _fields(message) if isinstance(value, str)]
+        labels = [seen.label for value in (shown, *texts) for seen in detections_of(value)]
+        return any(map(self._is_hidden, [*labels, *_labels(message)]))
+
     def _is_hidden(self, label: str) -> bool:
-        words = label.replace("_", " ").replace("-", " ").casefold().split()
-        return not _PEOPLE.isdisjoint(words) and label not in self._limits.labels
+        """Returns whether a label is of people, or a number that may be: 0 is a person in COCO."""
+        if label in self._limits.labels:
+            return False
+        return _is_of_people(label) or label.strip().isdecimal()
 
     def _write(self, day: str, records: Sequence[Record]) -> None:
         """Writes a day anew, with more messages.
@@ -350,14 +388,19 @@ class _Chosen:
     """Which messages of some bags stay.
 
     Attributes:
-        times: their log times (ns), by topic.
+        times: their log times (ns), by topic and type.
         latched: the topics of which all do.
         left_out: of which topics none does, and why.
     """
 
-    times: dict[str, set[Ns]] = field(default_factory=lambda: defaultdict(set))
+    times: dict[tuple[str, str], set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
+
+
+def _is_of_people(name: str) -> bool:
+    """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
+    return not _PEOPLE.isdisjoint(_WORD.findall(name.casefold()))
 
 
 def _is_named(topic: str, globs: Sequence[str]) -> bool:
@@ -392,10 +435,10 @@ def _readable(reader: BagReader, path: Path, topics: Sequence[str]) -> Iterator[
             return
 
 
-def _stays(record: Record, stays: Mapping[str, Collection[Ns]]) -> bool:
+def _stays(record: Record, stays: Mapping[tuple[str, str], Collection[Ns]]) -> bool:
     """Returns whether a message is one of those, or of a topic that is not thinned."""
-    topic = record.channel.topic
-    return topic not in stays or record.log_time in stays[topic]
+    key = (record.channel.topic, record.channel.type)
+    return key not in stays or record.log_time in stays[key]
 
 
 def _by_topic(record: Record) -> tuple[str, Ns]:
@@ -408,7 +451,7 @@ def _labels(node: object) -> Iterator[str]:
         yield node
     for name, value in _fields(node):
         for one in value if isinstance(value, list) else [value]:
-            if name in LABELS or not isinstance(one, str):
+            if name in _NAMES or not isinstance(one, str):
                 yield from _labels(one)
 
 

@@ -46,8 +46,12 @@ EXTREMES_NS: Final[Ns] = 300 * NS_PER_S
 _MOVED: Final = 0.05
 """In metres; also of each component of a unit quaternion, which is then a turn by 6 degrees."""
 _FEW: Final = 8
-_OFTEN: Final = 4
-"""Integers of more values, or that repeat less often, are measurements, times or counters."""
+"""Integers of more values in a bag are measurements or counters."""
+_STATE_BYTES: Final = 4
+_LONG: Final = 64
+"""Messages with longer arrays are samples: scans, maps, sound, features of faces."""
+_DEGREE_M: Final = 111_320.0
+"""Metres of a degree of latitude."""
 _FRAME: Final = "child_frame_id"
 _POINTS: Final = ("position", "translation")
 _TURNS: Final = ("orientation", "rotation")
@@ -146,11 +150,12 @@ class TopicThinning:
                     self._add_changes(path, column.codes, column.values(), times)
             elif _is_discrete(column):
                 self._add_changes(path, column, column.tolist(), times)
-            elif _is_measured(column):
+            elif _is_measured(column) or column.dtype.itemsize <= _STATE_BYTES:
                 self._add_extremes(path, np.asarray(column, np.float64), times)
         self._add_moves("", times, _poses(table.columns))
-        for inner in table.elements.values():
+        for path, inner in table.elements.items():
             self._add_frames(inner, times, named)
+            self._add_states(path, inner, times)
         slot_ns = self.numbers_ns if has_numbers(table) else THINNED_NS
         if slot_ns == THINNED_NS:
             self._add_pauses(times)
@@ -225,6 +230,23 @@ class TopicThinning:
             mover = self._movers.setdefault((path, name), _Mover())
             self._stays.append(np.array([*mover.moved(times, rows)], np.int64))
 
+    def _add_states(self, path: str, inner: Elements, times: IntArray) -> None:
+        """Adds the messages in which the states of a list change, as those of goals."""
+        states = [
+            column
+            for column in inner.columns.values()
+            if not isinstance(column, Texts) and column.dtype.itemsize == 1 and _is_discrete(column)
+        ]
+        if not states:
+            return
+        rows: list[tuple[object, ...]] = [()] * times.size
+        for owner, *values in zip(
+            inner.owners.tolist(), *(c.tolist() for c in states), strict=True
+        ):
+            rows[owner] = (*rows[owner], *values)
+        codes = {value: nth for nth, value in enumerate(dict.fromkeys(rows))}
+        self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
+
     def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
         """Adds the moves of the frames of transforms, and to `named` the frames in each message."""
         column = inner.columns.get(_FRAME)
@@ -236,6 +258,19 @@ class TopicThinning:
             own = np.flatnonzero(column.codes == code)
             poses = {key: rows[own] for key, rows in _poses(inner.columns).items()}
             self._add_moves(frame, times[inner.owners[own]], poses)
+
+
+def is_sampled(table: Table) -> bool:
+    """Returns whether messages have a long array of numbers, other than a covariance."""
+    lengths = {
+        path: column
+        for path, column in table.columns.items()
+        if path.endswith(".length") and "covariance" not in path
+    }
+    return any(
+        not isinstance(column, Texts) and column.size and column.max() > _LONG
+        for column in lengths.values()
+    )
 
 
 def _pairs(found: Detections) -> Iterator[tuple[int, str]]:
@@ -258,10 +293,10 @@ def _is_discrete(column: Column) -> TypeGuard[Numbers]:
     """Returns whether a column of numbers has states: booleans, and integers of few values."""
     if isinstance(column, Texts):
         return False
-    if column.dtype.kind not in "biu" or column.dtype.itemsize == 1:
-        return column.dtype.kind in "biu"
-    distinct = np.unique(column).size
-    return distinct <= _FEW and distinct * _OFTEN <= column.size
+    # Those of 64 bits are times.
+    if column.dtype.kind not in "biu" or column.dtype.itemsize > _STATE_BYTES:
+        return False
+    return np.unique(column).size <= _FEW
 
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
@@ -274,14 +309,18 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
         turn = _TURNS[_POINTS.index(name)]
         names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
         names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
-        numbers = [columns[each] for each in names if each in columns]
-        found[path[:-2]] = np.stack(
-            [np.asarray(each, np.float64) for each in numbers if not isinstance(each, Texts)],
-            axis=1,
-        )
+        found |= _stacked(path[:-2], [columns[each] for each in names if each in columns])
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
-        planar = [columns[name] for name in ("x", "y", "theta")]
-        found[""] = np.stack(
-            [np.asarray(each, np.float64) for each in planar if not isinstance(each, Texts)], axis=1
-        )
+        found |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
+    if {"latitude", "longitude"} <= columns.keys():
+        degrees = _stacked("latitude", [columns["latitude"], columns["longitude"]])
+        found |= {path: points * _DEGREE_M for path, points in degrees.items()}
     return found
+
+
+def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
+    """Returns columns of numbers as rows, by a path; nothing where one is of texts."""
+    numbers = [one for one in columns if not isinstance(one, Texts)]
+    if len(numbers) < len(columns):
+        return {}
+    return {path: np.stack([np.asarray(one, np.float64) for one in numbers], axis=1)}

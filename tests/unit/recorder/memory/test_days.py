@@ -53,7 +53,7 @@ from tests.support.program import Program, exits
 S = NS_PER_S
 T0 = 1_790_000_400 * S  # 13:20 on 21 September 2026
 __all__ = ["exits"]
-DAY_FILE = "memory/20260921.mcap"
+DAY_FILE = "memory/20260921.thinned.mcap"
 
 
 def split(
@@ -224,7 +224,7 @@ def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
     own_all(bag_dir)
     keep_all(days_of(bag_dir), bag_dir)
     assert (bag_dir / DAY_FILE).read_bytes() == b"\x89MCAP0\r\nbroken"
-    assert messages_in(bag_dir / "memory/20260921_1.mcap")
+    assert messages_in(bag_dir / "memory/20260921-1.thinned.mcap")
 
 
 class Failing(McapWriter):
@@ -256,7 +256,7 @@ def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) 
     with pytest.raises(BagError):
         keep_all(days_of(bag_dir, writer=Failing(after)), bag_dir, "rec_B")
     assert (bag_dir / DAY_FILE).read_bytes() == before
-    assert [path.name for path in (bag_dir / "memory").iterdir()] == ["20260921.mcap"]
+    assert [path.name for path in (bag_dir / "memory").iterdir()] == ["20260921.thinned.mcap"]
 
 
 def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
@@ -268,7 +268,7 @@ def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
     days = days_of(bag_dir)
     for day in range(4):
         keep_all(days, bag_dir, f"rec_{day}")
-    names = [f"202609{number}.mcap" for number in (21, 22, 23, 24)]
+    names = [f"202609{number}.thinned.mcap" for number in (21, 22, 23, 24)]
     assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names
     size = (bag_dir / DAY_FILE).stat().st_size
     now = T0 + 4 * 86_400 * S
