@@ -17,6 +17,7 @@ from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -42,10 +43,20 @@ class Tested(NamedTuple):
     Attributes:
         times: log times (ns).
         met: `MET`, `NOT_MET` or `UNKNOWN` for each.
+        recordings: a number for the recording of each; by it those of one log time are ordered.
     """
 
     times: IntArray
     met: NDArray[np.uint8]
+    recordings: IntArray
+
+    def until(self, stop: int) -> Tested:
+        """Returns the first `stop` of them."""
+        return Tested(self.times[:stop], self.met[:stop], self.recordings[:stop])
+
+    def since(self, start: int) -> Tested:
+        """Returns the others."""
+        return Tested(self.times[start:], self.met[start:], self.recordings[start:])
 
 
 class Block(NamedTuple):
@@ -78,6 +89,7 @@ class Matching:
         self._view = view
         self._search = search
         self._test = ColumnCondition(search.condition, view.memory.extractor)
+        self._numbers: dict[str, dict[Path, int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
         """Yields the messages of a topic in blocks that do not overlap, the newest block first.
@@ -140,7 +152,8 @@ class Matching:
 
             def none_met() -> Tested:
                 times = _times(parts)
-                return Tested(times, np.zeros(times.size, np.uint8))
+                none = np.zeros(times.size, np.uint8)
+                return Tested(times, none, self._recordings(topic, parts))
 
             return Block(topic, first, last, has_match=False, tested=none_met)
         met, unsure = truth.met, truth.unsure
@@ -155,23 +168,39 @@ class Matching:
         self, topic: str, parts: Sequence[Rows], met: NDArray[np.bool_], unsure: NDArray[np.bool_]
     ) -> Tested:
         times, found = _times(parts), met.astype(np.uint8)
+        recordings = self._recordings(topic, parts)
         undecided = np.flatnonzero(unsure)
         if undecided.size:
             edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
             for some in np.split(undecided, edges):
-                found[some] = self._read(topic, times[some])
-        return Tested(times, found)
+                found[some] = self._read(topic, times[some], recordings[some])
+        return Tested(times, found, recordings)
 
-    def _read(self, topic: str, times: IntArray) -> list[int]:
+    def _read(self, topic: str, times: IntArray, recordings: IntArray) -> list[int]:
         """Returns what the messages at some log times, which ascend, are found to be."""
         window = TimeWindow(int(times[0]), int(times[-1]) + 1)
-        read: dict[Ns, list[int]] = defaultdict(list)
+        numbers = self._numbers_of(topic)
+        read: dict[tuple[Ns, int], list[int]] = defaultdict(list)
         # The newest first, as a search reports what it cannot decode.
         for each in self._view.stream.messages([topic], window, newest_first=True):
             met = self._search.matches(each)
-            read[each.time].append(UNKNOWN if met is None else int(met))
+            found = read[each.time, numbers[each.bag.recording]]
+            found.append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
-        return [read[time].pop() if read[time] else NOT_MET for time in times.tolist()]
+        wanted = zip(times.tolist(), recordings.tolist(), strict=True)
+        return [read[key].pop() if read[key] else NOT_MET for key in wanted]
+
+    def _recordings(self, topic: str, parts: Sequence[Rows]) -> IntArray:
+        """Returns for each of some rows the number of its recording."""
+        numbers = self._numbers_of(topic)
+        return np.repeat([numbers[rows.recording] for rows in parts], [*map(len, parts)])
+
+    def _numbers_of(self, topic: str) -> dict[Path, int]:
+        """Returns the recordings of a topic, numbered in the order of their names."""
+        if topic not in self._numbers:
+            recordings = sorted(self._view.snapshot.timeline.recordings(topic), key=str)
+            self._numbers[topic] = {recording: nth for nth, recording in enumerate(recordings)}
+        return self._numbers[topic]
 
 
 def _follows(older: Rows, newer: Rows) -> bool:
@@ -199,18 +228,19 @@ def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
     for empty, rest in ((one, other), (other, one)):
         if not empty.tested().times.size:
             return None, rest
-    joined = _joined([one.tested(), other.tested()])
+    in_order = sorted((one, other), key=lambda block: (block.first, block.last))
+    joined = _joined([block.tested() for block in in_order])
     cut = int(np.searchsorted(joined.times, other.last, side="right"))
-    older = _of(one.topic, Tested(joined.times[:cut], joined.met[:cut]))
-    if cut == joined.times.size:
-        return None, older
-    return _of(one.topic, Tested(joined.times[cut:], joined.met[cut:])), older
+    newer, older = joined.since(cut), joined.until(cut)
+    return _of(one.topic, newer) if newer.times.size else None, _of(one.topic, older)
 
 
 def _joined(parts: Sequence[Tested]) -> Tested:
     times = np.concatenate([part.times for part in parts])
-    order = np.argsort(times, kind="stable")
-    return Tested(times[order], np.concatenate([part.met for part in parts])[order])
+    met = np.concatenate([part.met for part in parts])
+    recordings = np.concatenate([part.recordings for part in parts])
+    order = np.lexsort((recordings, times))
+    return Tested(times[order], met[order], recordings[order])
 
 
 def _of(topic: str, tested: Tested) -> Block:
@@ -246,7 +276,7 @@ def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
     A run ends with a message that does not match, and where none comes for longer than
     `silence_ns`. With `apart` each match is a run of its own.
     """
-    times, met = tested
+    times, met, _ = tested
     begins = np.empty(times.size, np.bool_)
     begins[0], begins[1:] = False, np.diff(times) > silence_ns
     # Of two matches, this differs where a message that is none, or a silence, lies between them.

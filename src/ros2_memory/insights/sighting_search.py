@@ -178,13 +178,14 @@ def _counting(block: Block, scope: Scope) -> Block:
     """Returns a block in which only those are matches that count in a scope."""
 
     def tested() -> Tested:
-        times, met = block.tested()
-        matches = np.flatnonzero(met == MET)[::-1]
+        found = block.tested()
+        matches = np.flatnonzero(found.met == MET)[::-1]
         # The newest first, as a scope reads what the other topic said.
-        counts = np.array([scope.holds_at(time) for time in times[matches].tolist()], np.bool_)
-        met = met.copy()
+        times = found.times[matches].tolist()
+        counts = np.array([scope.holds_at(time) for time in times], np.bool_)
+        met = found.met.copy()
         met[matches[~counts]] = NOT_MET
-        return Tested(times, met)
+        return found._replace(met=met)
 
     return block._replace(tested=tested)
 
