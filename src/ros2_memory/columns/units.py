@@ -216,9 +216,9 @@ class Rows:
         return self._unit.recording
 
     @property
-    def order(self) -> tuple[str, Ns, Ns]:
-        """Sorts tables whose rows have one log time: by recording, as copies do, then by time."""
-        return str(self.recording), self.first, self.last
+    def order(self) -> tuple[str, str, Ns, Ns]:
+        """Sorts tables whose rows have one log time: by recording, as copies, and by type."""
+        return str(self.recording), self.table.channel.type, self.first, self.last
 
     @property
     def first(self) -> Ns:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -43,20 +44,20 @@ class Tested(NamedTuple):
     Attributes:
         times: log times (ns).
         met: `MET`, `NOT_MET` or `UNKNOWN` for each.
-        recordings: a number for the recording of each; by it those of one log time are ordered.
+        sources: a number for recording and type of each; by it those of one log time are ordered.
     """
 
     times: IntArray
     met: NDArray[np.uint8]
-    recordings: IntArray
+    sources: IntArray
 
     def until(self, stop: int) -> Tested:
         """Returns the first `stop` of them."""
-        return Tested(self.times[:stop], self.met[:stop], self.recordings[:stop])
+        return Tested(self.times[:stop], self.met[:stop], self.sources[:stop])
 
     def since(self, start: int) -> Tested:
         """Returns the others."""
-        return Tested(self.times[start:], self.met[start:], self.recordings[start:])
+        return Tested(self.times[start:], self.met[start:], self.sources[start:])
 
 
 class Block(NamedTuple):
@@ -89,7 +90,7 @@ class Matching:
         self._view = view
         self._search = search
         self._test = ColumnCondition(search.condition, view.memory.extractor)
-        self._numbers: dict[str, dict[Path, int]] = {}
+        self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
         """Yields the messages of a topic in blocks that do not overlap, the newest block first.
@@ -153,7 +154,7 @@ class Matching:
             def none_met() -> Tested:
                 times = _times(parts)
                 none = np.zeros(times.size, np.uint8)
-                return Tested(times, none, self._recordings(topic, parts))
+                return Tested(times, none, self._sources(topic, parts))
 
             return Block(topic, first, last, has_match=False, tested=none_met)
         met, unsure = truth.met, truth.unsure
@@ -168,15 +169,15 @@ class Matching:
         self, topic: str, parts: Sequence[Rows], met: NDArray[np.bool_], unsure: NDArray[np.bool_]
     ) -> Tested:
         times, found = _times(parts), met.astype(np.uint8)
-        recordings = self._recordings(topic, parts)
+        sources = self._sources(topic, parts)
         undecided = np.flatnonzero(unsure)
         if undecided.size:
             edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
             for some in np.split(undecided, edges):
-                found[some] = self._read(topic, times[some], recordings[some])
-        return Tested(times, found, recordings)
+                found[some] = self._read(topic, times[some], sources[some])
+        return Tested(times, found, sources)
 
-    def _read(self, topic: str, times: IntArray, recordings: IntArray) -> list[int]:
+    def _read(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
         """Returns what the messages at some log times, which ascend, are found to be."""
         window = TimeWindow(int(times[0]), int(times[-1]) + 1)
         numbers = self._numbers_of(topic)
@@ -184,22 +185,26 @@ class Matching:
         # The newest first, as a search reports what it cannot decode.
         for each in self._view.stream.messages([topic], window, newest_first=True):
             met = self._search.matches(each)
-            found = read[each.time, numbers[each.bag.recording]]
+            source = numbers[each.bag.recording, each.record.channel.type]
+            found = read[each.time, source]
             found.append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
-        wanted = zip(times.tolist(), recordings.tolist(), strict=True)
+        wanted = zip(times.tolist(), sources.tolist(), strict=True)
         return [read[key].pop() if read[key] else NOT_MET for key in wanted]
 
-    def _recordings(self, topic: str, parts: Sequence[Rows]) -> IntArray:
-        """Returns for each of some rows the number of its recording."""
+    def _sources(self, topic: str, parts: Sequence[Rows]) -> IntArray:
+        """Returns for each of some rows the number of its recording and type."""
         numbers = self._numbers_of(topic)
-        return np.repeat([numbers[rows.recording] for rows in parts], [*map(len, parts)])
+        of = [numbers[rows.recording, rows.table.channel.type] for rows in parts]
+        return np.repeat(of, [*map(len, parts)])
 
-    def _numbers_of(self, topic: str) -> dict[Path, int]:
-        """Returns the recordings of a topic, numbered in the order of their names."""
+    def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
+        """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
         if topic not in self._numbers:
-            recordings = sorted(self._view.snapshot.timeline.recordings(topic), key=str)
-            self._numbers[topic] = {recording: nth for nth, recording in enumerate(recordings)}
+            timeline = self._view.snapshot.timeline
+            recordings = sorted(timeline.recordings(topic), key=str)
+            sources = product(recordings, sorted(timeline.types_of(topic)))
+            self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}
         return self._numbers[topic]
 
 
@@ -238,9 +243,9 @@ def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
 def _joined(parts: Sequence[Tested]) -> Tested:
     times = np.concatenate([part.times for part in parts])
     met = np.concatenate([part.met for part in parts])
-    recordings = np.concatenate([part.recordings for part in parts])
-    order = np.lexsort((recordings, times))
-    return Tested(times[order], met[order], recordings[order])
+    sources = np.concatenate([part.sources for part in parts])
+    order = np.lexsort((sources, times))
+    return Tested(times[order], met[order], sources[order])
 
 
 def _of(topic: str, tested: Tested) -> Block:
