@@ -102,8 +102,11 @@ class _OfTopic:
         self._is_open = bool(runs.counts.size) and runs.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
-        """Ends the oldest run if the topic has a message in a time that was not searched."""
-        if self._is_open and _has_messages(view, self._topic, gap):
+        """Ends the oldest run if the topic has a message in a time that was not searched.
+
+        Then, and where no run goes on, what follows an older run is not known.
+        """
+        if not self._is_open or _has_messages(view, self._topic, gap):
             self._is_open, self._begins = False, MAX_NS
 
     def cut(self) -> list[Run]:

@@ -146,6 +146,7 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
 @example(seed=12, part=1.0, has_types=False)
 @example(seed=35, part=0.5, has_types=False)
 @example(seed=6, part=0.5, has_types=True)
+@example(seed=321, part=1.0, has_types=True)
 def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
     seed: int, part: float, has_types: bool
 ) -> None:
