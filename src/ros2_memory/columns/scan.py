@@ -196,6 +196,7 @@ class Scan:
         if (within := self._asked.within) is not None:
             sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
         ahead = together = 1
+        waiting: list[Rows] = []
         for nth, source in enumerate(sources):
             if nth == ahead:
                 # Who goes on reads many.
@@ -205,8 +206,22 @@ class Scan:
                 self._together = [each.part for each in parts if each.part is not None]
             self._asked.check(source.last if newest_first else source.first)
             may = source.part is None or source.part.number not in ruled_out
-            for unit in self._units(source):
-                rows = Rows(unit, partial(self._counting, unit), may_match=may)
+            waiting += [
+                Rows(unit, partial(self._counting, unit), may_match=may)
+                for unit in self._units(source)
+            ]
+            # A bag has a table for each type: one may be later than the next bag, the other not.
+            waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
+            after = sources[nth + 1] if nth + 1 < len(sources) else None
+            while waiting and (
+                after is None
+                or (
+                    waiting[0].last >= after.last
+                    if newest_first
+                    else waiting[0].first <= after.first
+                )
+            ):
+                rows = waiting.pop(0)
                 if self._asked.may_be_empty or len(rows):
                     yield rows
 

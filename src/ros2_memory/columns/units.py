@@ -216,6 +216,11 @@ class Rows:
         return self._unit.recording
 
     @property
+    def order(self) -> tuple[str, str, Ns, Ns]:
+        """Sorts tables whose rows have one log time: by recording, as copies, and by type."""
+        return str(self.recording), self.table.channel.type, self.first, self.last
+
+    @property
     def first(self) -> Ns:
         """A log time (ns) that none of the rows is earlier than."""
         return self._unit.first

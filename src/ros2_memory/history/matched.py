@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from functools import partial
+from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -17,6 +18,7 @@ from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -42,10 +44,20 @@ class Tested(NamedTuple):
     Attributes:
         times: log times (ns).
         met: `MET`, `NOT_MET` or `UNKNOWN` for each.
+        sources: a number for recording and type of each; by it those of one log time are ordered.
     """
 
     times: IntArray
     met: NDArray[np.uint8]
+    sources: IntArray
+
+    def until(self, stop: int) -> Tested:
+        """Returns the first `stop` of them."""
+        return Tested(self.times[:stop], self.met[:stop], self.sources[:stop])
+
+    def since(self, start: int) -> Tested:
+        """Returns the others."""
+        return Tested(self.times[start:], self.met[start:], self.sources[start:])
 
 
 class Block(NamedTuple):
@@ -78,6 +90,7 @@ class Matching:
         self._view = view
         self._search = search
         self._test = ColumnCondition(search.condition, view.memory.extractor)
+        self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
         """Yields the messages of a topic in blocks that do not overlap, the newest block first.
@@ -140,7 +153,8 @@ class Matching:
 
             def none_met() -> Tested:
                 times = _times(parts)
-                return Tested(times, np.zeros(times.size, np.uint8))
+                none = np.zeros(times.size, np.uint8)
+                return Tested(times, none, self._sources(topic, parts))
 
             return Block(topic, first, last, has_match=False, tested=none_met)
         met, unsure = truth.met, truth.unsure
@@ -155,23 +169,43 @@ class Matching:
         self, topic: str, parts: Sequence[Rows], met: NDArray[np.bool_], unsure: NDArray[np.bool_]
     ) -> Tested:
         times, found = _times(parts), met.astype(np.uint8)
+        sources = self._sources(topic, parts)
         undecided = np.flatnonzero(unsure)
         if undecided.size:
             edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
             for some in np.split(undecided, edges):
-                found[some] = self._read(topic, times[some])
-        return Tested(times, found)
+                found[some] = self._read(topic, times[some], sources[some])
+        return Tested(times, found, sources)
 
-    def _read(self, topic: str, times: IntArray) -> list[int]:
+    def _read(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
         """Returns what the messages at some log times, which ascend, are found to be."""
         window = TimeWindow(int(times[0]), int(times[-1]) + 1)
-        read: dict[Ns, list[int]] = defaultdict(list)
+        numbers = self._numbers_of(topic)
+        read: dict[tuple[Ns, int], list[int]] = defaultdict(list)
         # The newest first, as a search reports what it cannot decode.
         for each in self._view.stream.messages([topic], window, newest_first=True):
             met = self._search.matches(each)
-            read[each.time].append(UNKNOWN if met is None else int(met))
+            source = numbers[each.bag.recording, each.record.channel.type]
+            found = read[each.time, source]
+            found.append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
-        return [read[time].pop() if read[time] else NOT_MET for time in times.tolist()]
+        wanted = zip(times.tolist(), sources.tolist(), strict=True)
+        return [read[key].pop() if read[key] else NOT_MET for key in wanted]
+
+    def _sources(self, topic: str, parts: Sequence[Rows]) -> IntArray:
+        """Returns for each of some rows the number of its recording and type."""
+        numbers = self._numbers_of(topic)
+        of = [numbers[rows.recording, rows.table.channel.type] for rows in parts]
+        return np.repeat(of, [*map(len, parts)])
+
+    def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
+        """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
+        if topic not in self._numbers:
+            timeline = self._view.snapshot.timeline
+            recordings = sorted(timeline.recordings(topic), key=str)
+            sources = product(recordings, sorted(timeline.types_of(topic)))
+            self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}
+        return self._numbers[topic]
 
 
 def _follows(older: Rows, newer: Rows) -> bool:
@@ -199,18 +233,19 @@ def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
     for empty, rest in ((one, other), (other, one)):
         if not empty.tested().times.size:
             return None, rest
-    joined = _joined([one.tested(), other.tested()])
+    in_order = sorted((one, other), key=lambda block: (block.first, block.last))
+    joined = _joined([block.tested() for block in in_order])
     cut = int(np.searchsorted(joined.times, other.last, side="right"))
-    older = _of(one.topic, Tested(joined.times[:cut], joined.met[:cut]))
-    if cut == joined.times.size:
-        return None, older
-    return _of(one.topic, Tested(joined.times[cut:], joined.met[cut:])), older
+    newer, older = joined.since(cut), joined.until(cut)
+    return _of(one.topic, newer) if newer.times.size else None, _of(one.topic, older)
 
 
 def _joined(parts: Sequence[Tested]) -> Tested:
     times = np.concatenate([part.times for part in parts])
-    order = np.argsort(times, kind="stable")
-    return Tested(times[order], np.concatenate([part.met for part in parts])[order])
+    met = np.concatenate([part.met for part in parts])
+    sources = np.concatenate([part.sources for part in parts])
+    order = np.lexsort((sources, times))
+    return Tested(times[order], met[order], sources[order])
 
 
 def _of(topic: str, tested: Tested) -> Block:
@@ -246,7 +281,7 @@ def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
     A run ends with a message that does not match, and where none comes for longer than
     `silence_ns`. With `apart` each match is a run of its own.
     """
-    times, met = tested
+    times, met, _ = tested
     begins = np.empty(times.size, np.bool_)
     begins[0], begins[1:] = False, np.diff(times) > silence_ns
     # Of two matches, this differs where a message that is none, or a silence, lies between them.

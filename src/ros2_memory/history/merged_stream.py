@@ -1,5 +1,7 @@
 """Many bags as one stream: in log-time order, each message once.
 
+Messages of one log time are in the order of their recordings' names, then of their bags.
+
 Recordings overlap (see `duplicates`), and a new recording receives latched messages again: with a
 new log time and the original publish time. Such a relatched message counts once too, at its
 earliest log time, however long ago that is.
@@ -225,7 +227,7 @@ class MergedStream:
         waiting = deque(
             sorted(
                 (-span.last if newest_first else span.first, sign * rank, span.bag)
-                for rank, span in enumerate(bags)
+                for rank, span in enumerate(sorted(bags, key=_by_recording))
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -274,6 +276,10 @@ def _begins(segment: Segment) -> Ns:
 
 def _in_order(span: BagSpan) -> tuple[Ns, Ns, str]:
     return span.first, span.last, span.bag.file
+
+
+def _by_recording(span: BagSpan) -> tuple[str, Ns, Ns, str]:
+    return str(span.bag.recording), *_in_order(span)
 
 
 def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:

@@ -297,14 +297,13 @@ class PoseReader:
         self._columns = PoseColumns(view.memory.extractor)
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
-        """Returns the poses of rows that overlap in time."""
+        """Returns the poses of rows that overlap in time, in the order of `blocks`."""
         span = min(each.first for each in rows), max(each.last for each in rows)
         known = [each.part for each in rows]
         numbers = tuple(part for part in known if part is not None)
         is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
         parts = numbers if is_whole else None
-        ordered = sorted(rows, key=lambda each: (each.first, each.last, str(each.recording)))
-        return PoseRows(span, partial(self._joined, ordered), parts, self.trouble)
+        return PoseRows(span, partial(self._joined, rows), parts, self.trouble)
 
     def trouble(self) -> Hashable:
         """Returns what differs from before where something could not be read since."""

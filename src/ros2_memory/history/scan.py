@@ -166,7 +166,10 @@ def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
-    """Yields the rows of a scan, those together that overlap in time: no other lies between."""
+    """Yields the rows of a scan, those together that overlap in time: no other lies between.
+
+    Those together are in the order that their messages of one log time have; see `Rows.order`.
+    """
     together: list[Rows] = []
     for rows in scanned:
         is_apart = together and (
@@ -175,11 +178,15 @@ def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows
             else rows.first > max(each.last for each in together)
         )
         if is_apart:
-            yield together
+            yield _in_order(together)
             together = []
         together.append(rows)
     if together:
-        yield together
+        yield _in_order(together)
+
+
+def _in_order(together: list[Rows]) -> list[Rows]:
+    return sorted(together, key=lambda rows: rows.order) if len(together) > 1 else together
 
 
 def copies(view: View, topic: str) -> Iterator[Rows]:

@@ -102,8 +102,11 @@ class _OfTopic:
         self._is_open = bool(runs.counts.size) and runs.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
-        """Ends the oldest run if the topic has a message in a time that was not searched."""
-        if self._is_open and _has_messages(view, self._topic, gap):
+        """Ends the oldest run if the topic has a message in a time that was not searched.
+
+        Then, and where no run goes on, what follows an older run is not known.
+        """
+        if not self._is_open or _has_messages(view, self._topic, gap):
             self._is_open, self._begins = False, MAX_NS
 
     def cut(self) -> list[Run]:
@@ -178,13 +181,14 @@ def _counting(block: Block, scope: Scope) -> Block:
     """Returns a block in which only those are matches that count in a scope."""
 
     def tested() -> Tested:
-        times, met = block.tested()
-        matches = np.flatnonzero(met == MET)[::-1]
+        found = block.tested()
+        matches = np.flatnonzero(found.met == MET)[::-1]
         # The newest first, as a scope reads what the other topic said.
-        counts = np.array([scope.holds_at(time) for time in times[matches].tolist()], np.bool_)
-        met = met.copy()
+        times = found.times[matches].tolist()
+        counts = np.array([scope.holds_at(time) for time in times], np.bool_)
+        met = found.met.copy()
         met[matches[~counts]] = NOT_MET
-        return Tested(times, met)
+        return found._replace(met=met)
 
     return block._replace(tested=tested)
 

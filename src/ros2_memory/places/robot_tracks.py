@@ -42,7 +42,7 @@ from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows
 from ros2_memory.history.poses import PoseReader
-from ros2_memory.history.scan import joined_back, open_scan, scan
+from ros2_memory.history.scan import blocks, joined_back, open_scan, scan
 from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -344,8 +344,12 @@ class RobotTracks:
         for topic in self._topics:
             scans = self._moving_scans(window)
             moving = None if self._is_own else _Moving(scans, window, window)
-            every = scan(self._view, topic, window, newest_first=True)
-            found += [self._placed(rows, self._groups(rows, moving), thins=False) for rows in every]
+            scanned = scan(self._view, topic, window, newest_first=True)
+            found += [
+                self._placed(rows, self._groups(rows, moving), thins=False)
+                for together in blocks(scanned, newest_first=True)
+                for rows in together
+            ]
         return _joined(found)
 
     def _lending(self, recording: Path, at: Ns) -> Session:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.columns.detections import DetectionColumns, detections_by
+from ros2_memory.columns.pack import pack, unpack
+from ros2_memory.columns.steps import MOST_RELATIVE, step_of
+from ros2_memory.columns.table import Texts
 from ros2_memory.messages.detections import detections_of
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
-from tests.unit.columns.drawn_tables import drawn_tables, stored
+from tests.unit.columns.drawn_tables import drawn_of, drawn_tables, rounded, store, stored
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,19 +44,22 @@ def detections_in(message: object, type_name: str) -> list[Detection]:
     return [one if one.frame_id else one._replace(frame_id=frame) for one in found]
 
 
-def listed(found: Detections, digits: int) -> list[tuple[int | str, ...]]:
-    """Detections in an order that does not depend on where in a message they are."""
+def listed(found: Detections, step: float) -> list[tuple[int | str, ...]]:
+    """Detections in an order that does not depend on where in a message they are.
+
+    Their numbers are rounded to a multiple of `step`, if it is not 0.
+    """
     columns = (
         found.rows.tolist(),
         found.labels.values(),
         found.frames.values(),
-        found.scores.tolist(),
-        found.places.tolist(),
+        (rounded(found.scores, step)[0] if step else found.scores).tolist(),
+        (rounded(found.places, step)[0] if step else found.places).tolist(),
     )
 
     def said(number: float) -> str:
-        """A number as a text, so that NaN is NaN; of what is rounded to zero nothing is left."""
-        return "0" if abs(number) < 10.0**-digits else f"{number:.{digits}g}"
+        """A number as a text, so that NaN is NaN; next to zero is zero."""
+        return "0" if abs(number) < 1e-12 else f"{number:.12g}"
 
     rows: list[tuple[int | str, ...]] = []
     for row, label, frame, score, place in zip(*columns, strict=True):
@@ -63,8 +70,8 @@ def listed(found: Detections, digits: int) -> list[tuple[int | str, ...]]:
     return sorted(rows)
 
 
-def compared(table: Table, messages: Sequence[object], digits: int = 12) -> bool:
-    """Checks what the columns settle; returns whether they do."""
+def compared(table: Table, messages: Sequence[object], step: float = 0.0) -> bool:
+    """Checks what the columns settle, rounded to `step`; returns whether they do."""
     type_name = table.channel.type
     expected = detections_by([detections_in(each, type_name) for each in messages])
     columns = DetectionColumns(EXTRACTOR)
@@ -72,7 +79,7 @@ def compared(table: Table, messages: Sequence[object], digits: int = 12) -> bool
     assert columns.may_match(table) or not expected.rows.size
     if found is None:
         return False
-    assert listed(found.detections, digits) == listed(expected, digits)
+    assert listed(found.detections, step) == listed(expected, step)
     stamps = [getattr(getattr(each, "header", None), "stamp", None) for each in messages]
     if found.stamps is not None:
         read = [each.sec * 10**9 + each.nanosec for each in stamps if each is not None]
@@ -98,7 +105,20 @@ def test_detections_of_common_types_need_no_reading(drawn: Drawn) -> None:
 @settings(max_examples=examples(60), deadline=None)
 @given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
 def test_stored_columns_detect_the_same_but_for_rounding(drawn: Drawn, step: float) -> None:
-    compared(stored(drawn.table, step), drawn.messages, digits=4)
+    compared(stored(drawn.table, step), drawn.messages, step)
+
+
+def test_a_small_score_is_compared_as_its_column_was_rounded() -> None:
+    """A step of a millionth leaves three digits of it; a store rounds scores to more of them."""
+    build = store().types["own_msgs/msg/Label"]
+    drawn = drawn_of("own_msgs/msg/Label", [build("cup", 0.00013342, 0.5, -0.00013342)])
+    for step in (0.0, 1e-6):
+        assert compared(stored(drawn.table, step), drawn.messages, step)
+    scores = np.array([0.00013342, 0.7], np.float32)
+    packed = pack(scores, step_of("score", drawn.table.definition))
+    kept = unpack(packed.codec, packed.count, packed.zone.least, packed.data)
+    assert not isinstance(kept, Texts)
+    assert kept.tolist() == pytest.approx(scores.tolist(), rel=MOST_RELATIVE)
 
 
 @pytest.mark.parametrize(

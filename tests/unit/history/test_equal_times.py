@@ -1,0 +1,186 @@
+"""Messages of one log time in recordings that overlap: one order, however they are stored."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter, defaultdict
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Final
+
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.core.timebase import MAX_NS
+from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
+from tests.support.examples import examples
+from tests.support.memories import asked, assert_same_counts, memory_of, with_store
+from tests.support.random_histories import MS, S
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+    from random import Random
+
+    from ros2_memory.history.context import Memory
+
+T0: Final = 1_700_006_400 * S
+SPAN: Final = {"start": T0 / S - 5, "end": T0 / S + 200}
+CUP: Final = {"topic": "/chatter", "condition_type": "contains", "value": "cup"}
+TRUE: Final = {"topic": "/bumper", "condition_type": "equals", "value": True}
+QUESTIONS: Final[Sequence[tuple[str, dict[str, Any]]]] = [
+    ("find_matches", {**CUP, "by": "day"}),
+    ("find_matches", {**CUP, "by": "hour"}),
+    ("find_matches", CUP),
+    ("find_matches", {**CUP, "where": {"x": 1, "y": 0, "radius_m": 0.5}, "by": "day"}),
+    ("find_matches", {**CUP, "while": TRUE}),
+    ("find_matches", {**CUP, "value": "c", "by": "value"}),
+    ("find_matches", {**TRUE, "by": "day"}),
+    ("find_matches", {**CUP, "topic": "/vision", "by": "hour"}),
+    ("find_matches", {**CUP, "topic": "/vision", "min_score": 0.3, "by": "day"}),
+    ("find_matches", {**CUP, "topic": "/vision", "by": "label"}),
+    ("find_matches", {**CUP, "topic": "/json", "min_score": 0.3, "by": "day"}),
+    ("get_topic_in_range", {"topic": "/chatter", "changes": True}),
+    ("get_topic_in_range", {"topic": "/chatter", "max_samples": 9}),
+    ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "by": "hour"}),
+    ("trajectory_summary", {}),
+    ("recap", {}),
+]
+
+
+def draw_recordings(draw: Random) -> dict[str, list[Msg]]:
+    """Two or three recordings that overlap, of which messages often have one log time."""
+    seconds = draw.choice([5, 20, 40])
+    begin = draw.randrange(seconds)
+    names = draw.sample(["a", "ab", "b", "c"], draw.randint(2, 3))
+    first, second, *others = names
+    found = {first: _published(draw, 0, seconds)}
+    found[second] = _published(draw, begin, begin + draw.choice([3, 20, 40]))
+    if draw.random() < 0.5:
+        late = [each for each in found[first] if each.log_time >= T0 + begin * S]
+        found[second] += [
+            replace(each, log_time=each.log_time + draw.choice([0, 1, 500]) * MS) for each in late
+        ]
+    for name in others:
+        found[name] = _published(draw, 2, 12)
+    return {name: sorted(some, key=lambda each: each.log_time) for name, some in found.items()}
+
+
+def _published(draw: Random, start: int, stop: int) -> list[Msg]:
+    """Text, booleans, detections and poses at whole tenths of seconds, now and then none."""
+    found: list[Msg] = []
+    for kind in range(5):
+        at = T0 + start * S
+        while (at := at + draw.choice([1, 2, 5, 5, 10, 30, 110]) * 100 * MS) < T0 + stop * S:
+            found.append(replace(_message(draw, kind, at), publish_time=at))
+    return found or [odom(T0 + start * S, 0, 0)]
+
+
+def _message(draw: Random, kind: int, at: int) -> Msg:
+    if kind == 0:
+        return text(at, draw.choice(["cup", "cup", "cat", "dog"]), "/chatter")
+    if kind == 1:
+        return boolean(at, draw.random() < 0.6)
+    if kind == 2:
+        labels = draw.choice([["cup"], ["cup", "dog"], [], ["dog"]])
+        return detections(at, labels, topic="/vision", score=draw.choice([0.1, 0.5]))
+    if kind == 3:
+        label, score = draw.choice(["cup", "dog"]), draw.choice([0.1, 0.5])
+        return text(at, f'[{{"label": "{label}", "score": {score}}}]', "/json")
+    return odom(at, draw.choice([-1.0, 1.0, 1.0]), 0.0)
+
+
+def _on_chatter(message: Msg) -> Msg:
+    return replace(message, topic="/chatter") if message.topic == "/bumper" else message
+
+
+def write(bag_dir: Path, recordings: Mapping[str, list[Msg]], draw: Random) -> None:
+    """Writes recordings, each cut into splits anywhere."""
+    for name, messages in recordings.items():
+        inside = {draw.randrange(len(messages)) for _ in range(draw.choice([0, 1, 3, 6]))} - {0}
+        for nth, (begin, end) in enumerate(pairwise([0, *sorted(inside), len(messages)])):
+            write_mcap(bag_dir / name / f"{name}_{nth}.mcap", messages[begin:end])
+
+
+def said_in(recordings: Mapping[str, list[Msg]], topic: str) -> Iterator[tuple[int, str]]:
+    """Log time (ns) and text of each message: by log time, then by recording; copies count once."""
+    every = [
+        (each.log_time, name, nth, each)
+        for name, messages in recordings.items()
+        for nth, each in enumerate(messages)
+        if each.topic == topic
+    ]
+    known: defaultdict[tuple[int, str], Counter[str]] = defaultdict(Counter)
+    for at, name, _, message in sorted(every, key=lambda row: row[:3]):
+        body: Any = message.body
+        copies = known[message.published, body.data]
+        most = max(copies.values(), default=0)
+        copies[name] += 1
+        if copies[name] > most:
+            yield at, body.data
+
+
+def sightings(recordings: Mapping[str, list[Msg]]) -> tuple[int, float]:
+    """How many runs of cups there are, and how long they last until another text, in seconds."""
+    found = [*said_in(recordings, "/chatter")]
+    count, total, goes_on = 0, 0, False
+    for (at, word), (following, _) in pairwise([*found, (MAX_NS, "")]):
+        count += word == "cup" and not goes_on
+        goes_on = word == "cup" and following - at <= SILENCE_NS
+        total += (following - at) * goes_on
+    return count, total / S
+
+
+def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
+    """The same as `find_matches` counts it; both are 0 where there is no such topic."""
+    reply = asked(memory, bag_dir, "find_matches", **CUP, by="day", **SPAN)
+    values = dict(zip(reply.get("columns", ())[1:], reply.get("all", ()), strict=True))
+    return values.get("count", 0), values.get("seconds", 0.0)
+
+
+@settings(max_examples=examples(10), deadline=None)
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 0.5]), has_types=st.booleans())
+@example(seed=12, part=1.0, has_types=False)
+@example(seed=35, part=0.5, has_types=False)
+@example(seed=6, part=0.5, has_types=True)
+@example(seed=321, part=1.0, has_types=True)
+def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
+    seed: int, part: float, has_types: bool
+) -> None:
+    """Also of a topic of two types."""
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        recordings = draw_recordings(draw)
+        if has_types:
+            recordings = {name: [*map(_on_chatter, some)] for name, some in recordings.items()}
+        write(bag_dir, recordings, draw)
+        plain = memory_of(bag_dir)
+        stored = with_store(plain, bag_dir, part=part)
+        if not has_types:
+            assert counted(plain, bag_dir) == pytest.approx(sightings(recordings), abs=0.051)
+        for name, given_ in QUESTIONS:
+            reply = asked(stored, bag_dir, name, **given_, **SPAN)
+            assert_same_counts(reply, asked(plain, bag_dir, name, **given_, **SPAN))
+
+
+@pytest.mark.parametrize("last", [3, 6])
+def test_of_one_log_time_the_first_recording_by_name_speaks_first(
+    tmp_path: Path, last: int
+) -> None:
+    """Not that of which the bag, or the part that has several of its bags, ends first."""
+    said = {"a": [(0, "cup"), (1, "dog"), (last, "dog")], "b": [(1, "cup"), (2, "dog"), (4, "cat")]}
+    recordings = {
+        name: [text(T0 + at * S, word, "/chatter") for at, word in words]
+        for name, words in said.items()
+    }
+    assert sightings(recordings) == (2, 2.0)
+    for name, messages in recordings.items():
+        for nth, message in enumerate(messages):
+            write_mcap(tmp_path / name / f"{name}_{nth}.mcap", [message])
+    plain = memory_of(tmp_path)
+    for memory in (plain, with_store(plain, tmp_path), with_store(plain, tmp_path, part=0.5)):
+        assert counted(memory, tmp_path) == (2, 2.0)
