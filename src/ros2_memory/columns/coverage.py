@@ -88,7 +88,8 @@ class Coverage:
 
     def among(self, numbers: IntArray) -> IntArray:
         """Returns those of some numbers whose bags are bags of the timeline."""
-        return numbers[self.positions(numbers) >= 0]
+        are_there = self.positions(numbers) >= 0
+        return numbers if are_there.all() else numbers[are_there]
 
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
         """Returns the same of the numbers of a part, which are looked up once."""

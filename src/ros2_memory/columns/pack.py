@@ -65,7 +65,7 @@ if TYPE_CHECKING:
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Values = TypeVar("Values", "IntArray", "Floats")
 
-FORMAT: Final = 15
+FORMAT: Final = 16
 """Version of the file. Raise it with every change of its tables and of their bytes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4

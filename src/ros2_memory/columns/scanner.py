@@ -141,7 +141,8 @@ class Scanner:
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
         self._settings = settings
         self._fragments: dict[str, object] = {}
-        self._outlines = self.fragments(OUTLINE)
+        # They follow from columns alone, and are of use where these were dropped.
+        self._outlines = Fragments(store, OUTLINE, "", self._read)
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""

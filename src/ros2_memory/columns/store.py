@@ -454,12 +454,14 @@ class ColumnStore(Database):
     def fragments_of_others(self, reading: str) -> list[Ns]:
         """Returns where slices begin whose fragments all depend on other settings, newest first.
 
-        `reading` ends the name of a kind that depends on these.
+        `reading` ends the name of a kind that depends on these; nothing does of one that depends
+        on none.
         """
 
         def ask(connection: sqlite3.Connection) -> list[Ns]:
             rows = connection.execute(
                 "SELECT DISTINCT start_ns FROM (SELECT start_ns FROM fragment"
+                " WHERE kind NOT LIKE '% '"
                 " GROUP BY substr(kind, 1, instr(kind, ' ')), start_ns"
                 " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
                 " ORDER BY start_ns DESC",

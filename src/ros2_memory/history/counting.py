@@ -60,7 +60,8 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
             counted.add(*_one_by_one(rows.times, edges))
         return counted
     shared = holding_copies(view, topic, window)
-    to_read: dict[str, tuple[Ns, Ns]] = {}
+    to_read: set[str] = set()
+    spans: list[tuple[Ns, Ns]] = []
     for segment in view.snapshot.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:
@@ -69,8 +70,10 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
         pieces, is_in, is_cut = _told_apart(column, window, edges, shared)
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_cut).tolist():
-            to_read[segment.bags[of[row]].file] = int(firsts[row]), int(lasts[row]) + 1
-    near_those = united(sorted(to_read.values()))
+            # A bag has a row for each type of the topic.
+            to_read.add(segment.bags[of[row]].file)
+            spans.append((int(firsts[row]), int(lasts[row]) + 1))
+    near_those = united(sorted(spans))
     for rows in scan(view, topic, window, columns=False, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
             counted.add(*_one_by_one(rows.times[positions], edges))

@@ -170,7 +170,10 @@ def slices_of_poses(
         near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
         if not near:
             return stretch.key(settings)
-        left_out = repr([(str(one.other), one.span, sorted(one.bags)) for one in near])
+        # Not the whole span: it grows with each bag, and what is beyond bears on nothing here.
+        left_out = repr(
+            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
+        )
         return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
 
     yield from joined_back(

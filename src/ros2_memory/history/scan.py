@@ -10,6 +10,7 @@ import numpy as np
 from ros2_memory.columns.fragments import Joined, joining
 from ros2_memory.columns.scan import Asked, Scan, Stretch
 from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 
 if TYPE_CHECKING:
@@ -147,8 +148,14 @@ def joined_back(
         joined = known.get(key)
         if joined is None:
             before = trouble(), view.notes.added
-            made = [one for _, one in make(stretch)]
-            joined = Joined(kind.join(made[::-1]) if made else [])
+            made: list[tuple[Ns, T]] = []
+            try:
+                made.extend(make(stretch))
+            except QueryTimeoutError:
+                # What there was time for is an answer, too, with a note.
+                yield from made
+                raise
+            joined = Joined(kind.join([one for _, one in made[::-1]]) if made else [])
             if before == (trouble(), view.notes.added):
                 known.put(key, joined)
         for one in reversed(joined.found):

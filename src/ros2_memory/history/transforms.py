@@ -88,6 +88,7 @@ _BORROWED: Final = Reason(
     many="are placed by transforms of others of the same time; no handovers prove that they are of "
     "one robot",
 )
+_UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
 
 _OF_ALL_TIMES: Final = frozenset({NoDataReason.FRAME_UNKNOWN, NoDataReason.FRAMES_NOT_CONNECTED})
 
@@ -642,5 +643,5 @@ def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransfo
             return view.memory.extractor.transforms(message, found.time, static=is_static)
         except UndecodableError as error:
             view.notes.complete = False
-            view.notes.add(f"messages of {error.topic} could not be decoded: {error.reason}")
+            view.notes.add(Note(_UNDECODED, error.topic, error.reason))
             return ()

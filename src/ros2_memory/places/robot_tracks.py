@@ -257,7 +257,7 @@ class RobotTracks:
                 if sessions.holds_carried(recording):
                     return None
                 placed_by.append(numbers.get(sessions.of(recording)))
-            parts += found
+            parts += [part for part in found if part not in parts]
         return FragmentKey(start, self._settings(placed_by), tuple(parts))
 
     def _settings(self, placed_by: Sequence[object]) -> str:

@@ -124,6 +124,8 @@ def _binned(parts: Sequence[_Part], width: Ns) -> list[tuple[float | None, ...]]
     totals = np.array([each.total for each in parts])
     lows = np.minimum.reduceat(np.array([each.low for each in parts]), starts)
     highs = np.maximum.reduceat(np.array([each.high for each in parts]), starts)
+    # One of them may be exact, and the other rounded to beyond it.
+    lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
     means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
     # Of a whole part the least and the greatest number are exact, and the sum is of rounded ones.
     means = np.clip(means, lows, highs)
