@@ -143,6 +143,7 @@ class Scanner:
         self._fragments: dict[str, object] = {}
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self._read)
+        self._fragments[OUTLINE.name] = self._outlines
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""

@@ -12,18 +12,20 @@ import pytest
 
 from ros2_memory.columns import scan
 from ros2_memory.columns.fragments import Fragment, Joined, Kind, joining
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
-from ros2_memory.history.scan import open_scan
+from ros2_memory.history.scan import joined_back, open_scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
-from tests.support.bags import boolean, odom, write_mcap
+from tests.support.bags import boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import World, store_file
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from ros2_memory.columns.scan import Stretch
@@ -126,6 +128,42 @@ def test_what_is_joined_is_made_while_filling_and_goes_with_any_part(
     world.memory.index.refresh()
     world.prune()
     assert 0 < joined_fragments(store_file(tmp_path)) < before
+
+
+def test_what_was_made_in_time_is_told_before_the_time_is_over(world: World) -> None:
+    view = View(world.memory, Call())
+    opened = open_scan(view, "/odom", WINDOW)
+
+    def made(stretch: Stretch) -> Iterator[tuple[int, Numbers]]:
+        yield stretch.window.start, Numbers(Fragment("one", {}))
+        if stretch.parts is not None:
+            raise QueryTimeoutError("no time")
+
+    found: list[int] = []
+    with pytest.raises(QueryTimeoutError):
+        found += (start for start, _ in joined_back(view, opened, NUMBERS, made))
+    newest = next(one for one in opened.stretches() if one.parts is not None)
+    assert found[-1] == newest.window.start
+
+
+def test_tracks_by_transforms_alone_are_joined_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (scan, backfill):
+        monkeypatch.setattr(module, "STRETCH_NS", LENGTH)
+    for number in range(30):
+        start = T0 + number * 100 * S
+        messages = [
+            tf(start + n * S, transform(start + n * S, "map", "base_link", (n / 10, 0, 0)))
+            for n in range(100)
+        ]
+        fixed = transform(start, "base_link", "camera", (0.1, 0, 0.3))
+        messages.insert(0, tf(start, fixed, topic="/tf_static"))
+        write_mcap(tmp_path / "rec" / f"{number}.mcap", messages)
+    World.of(tmp_path).fill()
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        query = "SELECT count(*) FROM fragment WHERE kind LIKE 'track-joined %'"
+        assert base.execute(query).fetchone()[0] == 2
 
 
 def test_joined_fragments_are_stored_as_one() -> None:

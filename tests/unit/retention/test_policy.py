@@ -13,6 +13,7 @@ from ros2_memory.retention.policy import (
     RetentionStock,
     StoredBag,
     StoredFile,
+    by_hours,
     plan_deletions,
 )
 
@@ -92,6 +93,29 @@ class TestAge:
         assert names(expired(held, LIMITS)) == ["h171", "h169"]
         small = replace(LIMITS, max_total_bytes=1690)
         assert names(expired(held, small)) == ["h171", "h170", "h169"]
+
+    def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
+        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
+        held = replace(stock(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
+        plan = plan_deletions(held, budget(1900))
+        going = set(names(by_hours(plan, held)))
+        assert set(names(plan.to_delete)) <= going
+        assert "m170" not in going
+        first = min(int(name[1:]) for name in going)
+        left = {each.path for each in minutes} - {f"rec/{name}" for name in going}
+        assert left >= {f"rec/m{ago}" for ago in range(first)}
+        # Of the hour that the plan ends in all go that may.
+        hours = {each.end // HOUR for each in minutes if each.path.rpartition("/")[2] in going}
+        rest = [each for each in minutes if each.end // HOUR in hours and each.path in left]
+        assert {each.path for each in rest} <= held.needed
+
+    def test_a_future_date_has_no_newest_hour(self) -> None:
+        ahead = bag("ahead", NOW + 900 * DAY)
+        minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
+        held = stock(*minutes, ahead)
+        plan = plan_deletions(held, budget(200))
+        going = by_hours(plan, held)
+        assert plan.newest not in {each.path for each in going}
 
     def test_age_counts_from_the_newest_data_and_not_from_the_clock(self) -> None:
         assert expired(stock(*hourly(100), now=NOW + 365 * DAY), LIMITS) == ()

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
+import sqlite3
 import sys
 import time
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -61,6 +63,12 @@ def storing(
     filling = Filling(scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
     memory = replace(memory, columns=scanner)
     return memory, Backfill(memory, filling)
+
+
+def outlines_in(bag_dir: Path) -> list[tuple[int, str]]:
+    with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as base:
+        query = "SELECT id, settings FROM fragment WHERE kind LIKE 'outline %' ORDER BY id"
+        return base.execute(query).fetchall()
 
 
 def stored(memory: Memory) -> list[str]:
@@ -141,7 +149,11 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
 ) -> None:
     for number in range(6):
         bag(tmp_path, 60 * number)  # each in ten minutes of its own
-    fill_store(storing(tmp_path, reading="before")[1])
+    earlier = storing(tmp_path, reading="before")[1]
+    fill_store(earlier)
+    while earlier.follow():
+        pass
+    outlines = outlines_in(tmp_path)
     memory, backfill = storing(tmp_path, reading="after")
     assert memory.columns is not None
     before = len(memory.columns.fragments_of_others())
@@ -150,6 +162,8 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     while backfill.follow():
         pass
     assert memory.columns.fragments_of_others() == []
+    # They depend on no settings.
+    assert outlines_in(tmp_path) == outlines != []
     known = storing(tmp_path, reading="before")[0].columns
     assert known is not None
     assert known.fragments_of_others() == []

@@ -10,12 +10,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 from starlette.datastructures import QueryParams
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher, build_memory
 from ros2_memory.config import load_settings
@@ -39,6 +41,8 @@ from tests.support.bags import (
     battery,
     boolean,
     detections,
+    goals,
+    make,
     odom,
     text,
     tf,
@@ -76,7 +80,11 @@ def split(
 
 
 def days_of(
-    bag_dir: Path, *, writer: BagWriter | None = None, limits: MemoryLimits | None = None
+    bag_dir: Path,
+    *,
+    writer: BagWriter | None = None,
+    limits: MemoryLimits | None = None,
+    keeps: bool = True,
 ) -> MemoryDays:
     return MemoryDays(
         bag_dir,
@@ -84,7 +92,7 @@ def days_of(
         writer or McapWriter(),
         OwnRecordings(bag_dir),
         shipped_extractor(),
-        limits=limits or MemoryLimits(),
+        limits=(limits or MemoryLimits()) if keeps else None,
         static_topics=("/tf_static",),
     )
 
@@ -197,6 +205,96 @@ def test_people_are_taken_out_unless_their_label_is_named(bag_dir: Path) -> None
         for one in reader.decode(record).detections  # type: ignore[attr-defined]
     )
     assert seen.keys() == {"mug", "Person"}
+
+
+def camera(at: int, *frames: str) -> Msg:
+    return tf(at, *(transform(at, "map", frame, (0.1, 0, 0.3)) for frame in frames))
+
+
+def test_people_are_looked_for_in_frames_topics_and_numbers(bag_dir: Path) -> None:
+    """Of models that say numbers 0 is mostly a person."""
+    at = [T0 + n * S for n in range(60)]
+    messages = [
+        *(detections(each, ("0", "mug")) for each in at),
+        *(camera(each, "base_link", "person_1") for each in at[::2]),
+        *(camera(each, "base_link") for each in at[1::2]),
+        tf(T0, transform(T0, "map", "child", (0.1, 0, 0.3)), topic="/tf_static"),
+        *(boolean(each, each % 2 == 0, topic="/face/is_seen") for each in at),
+    ]
+    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", sorted(messages, key=lambda one: one.log_time))
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    reader = McapReader()
+    stays = [(one.channel.topic, reader.decode(one)) for one in messages_in(bag_dir / DAY_FILE)]
+    assert {topic for topic, _ in stays} == {"/vision/scene/scene_objects", "/tf"}
+    assert "person" not in repr(stays)
+    assert "label='0'" not in repr(stays)
+    assert "base_link" in repr([one for topic, one in stays if topic == "/tf"])
+
+
+def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> None:
+    begin = T0
+    spectrum = [
+        Msg(
+            "/spectrum",
+            "std_msgs/msg/Float32MultiArray",
+            begin + n * S,
+            make(
+                "std_msgs/msg/Float32MultiArray",
+                layout=make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0),
+                data=np.ones(65, np.float32),
+            ),
+        )
+        for n in range(30)
+    ]
+    states = [goals(begin + n * S // 2, {1: 2 if n < 21 else 4}) for n in range(60)]
+    both = sorted([*spectrum, *states], key=lambda one: one.log_time)
+    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", both)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    found = {
+        (one.log_time - begin) / S
+        for one in messages_in(bag_dir / DAY_FILE)
+        if one.channel.topic == "/drive/_action/status"
+    }
+    assert found >= {10.0, 10.5}
+    assert len(found) < 20
+    assert {one.channel.topic for one in messages_in(bag_dir / DAY_FILE)} == {
+        "/drive/_action/status"
+    }
+
+
+def test_days_go_when_nothing_is_to_stay_but_not_before_the_recorder_begins(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    keeper = house(bag_dir, T0 + 100 * S, memory=days_of(bag_dir, keeps=False))
+    assert (bag_dir / DAY_FILE).exists()
+    keeper.repair()
+    assert not (bag_dir / DAY_FILE).exists()
+
+
+def test_nothing_is_written_while_messages_are_forgotten(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
+    (bag_dir / ERASING_FILE).write_text("{}")
+    with pytest.raises(BagError, match="being forgotten"):
+        keep_all(days_of(bag_dir), bag_dir)
+    assert not (bag_dir / DAY_FILE).exists()
+
+
+def test_days_of_a_wrong_date_do_not_age_nor_any_by_an_unsure_clock(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    write_mcap(bag_dir / "rec_A" / "old.mcap", [odom(n * S, n, 0.0) for n in range(1, 9)])
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    both = ["19700101.thinned.mcap", "20260921.thinned.mcap"]
+    days = days_of(bag_dir, limits=MemoryLimits(max_age_ns=30 * 86_400 * S))
+    days.limit(None)
+    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == both
+    days.limit(T0 + 60 * 86_400 * S)
+    assert [path.name for path in (bag_dir / "memory").iterdir()] == both[:1]
 
 
 def test_what_stays_already_is_not_written_twice_and_hours_are_added(bag_dir: Path) -> None:
