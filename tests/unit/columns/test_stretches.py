@@ -18,10 +18,11 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
+from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
-from tests.support.bags import boolean, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import World, store_file
 
 if TYPE_CHECKING:
@@ -164,6 +165,27 @@ def test_tracks_by_transforms_alone_are_joined_too(
     with closing(sqlite3.connect(store_file(tmp_path))) as base:
         query = "SELECT count(*) FROM fragment WHERE kind LIKE 'track-joined %'"
         assert base.execute(query).fetchone()[0] == 2
+
+
+def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (scan, backfill):
+        monkeypatch.setattr(module, "STRETCH_NS", LENGTH)
+    for number in range(40):
+        start = T0 + number * 100 * S
+        fixed = tf(start, transform(start, "map", "odom", (1, 0, 0)), topic="/tf_static")
+        torn = Msg("/tf_static", "tf2_msgs/msg/TFMessage", start + S, b"\0\1\0\0\xff\xff\xff\x7f")
+        poses = [odom(start + n * 5 * S, number, 0.1) for n in range(1, 20)]
+        write_mcap(tmp_path / "rec" / f"{number}.mcap", [fixed, *[torn] * (number == 7), *poses])
+    world = World.of(tmp_path)
+    world.fill()
+    for memory in (world.unstored().memory, world.memory, World.of(tmp_path).memory):
+        view = View(memory, Call())
+        assert static_transforms(view, sessions_of(view).of(tmp_path / "rec"))
+        assert not view.notes.complete
+        [said] = [one for one in view.notes.sentences() if "could not be decoded" in one]
+        assert said.startswith("messages of /tf_static could not be decoded: ")
 
 
 def test_joined_fragments_are_stored_as_one() -> None:
