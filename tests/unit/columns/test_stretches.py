@@ -188,6 +188,32 @@ def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(
         assert said.startswith("messages of /tf_static could not be decoded: ")
 
 
+def test_two_robots_side_by_side_have_no_stretch_made_anew_with_each_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (scan, backfill):
+        monkeypatch.setattr(module, "STRETCH_NS", LENGTH)
+
+    def record(number: int) -> None:
+        start = T0 + number * 100 * S
+        for robot, name in enumerate(["rec_a", "rec_b"]):
+            times = range(start + robot * S, start + 100 * S, 5 * S)
+            poses = [odom(at, number + 10 * robot, 0.1) for at in times]
+            write_mcap(tmp_path / name / f"{number}.mcap", poses)
+
+    for number in range(40):
+        record(number)
+    found: list[int] = []
+    for number in range(40, 43):
+        record(number)
+        world = World.of(tmp_path)
+        world.fill()
+        assert [*slices_of_path(View(world.memory, Call()), "/odom", WINDOW, [])]
+        world.memory.columns.write_fragments()
+        found.append(joined_fragments(store_file(tmp_path)))
+    assert found == found[:1] * 3 != [0] * 3
+
+
 def test_joined_fragments_are_stored_as_one() -> None:
     kind = joining(NUMBERS)
     every = [
