@@ -33,7 +33,7 @@ from tests.integration.test_server_process import serving
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.examples import LONG
 from tests.support.housekeepers import keeper_of, own_all, size_of
-from tests.support.live_recorder import answer
+from tests.support.live_recorder import answer, answering
 from tests.support.memories import memory_of
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import ask_everything, write_run
@@ -365,3 +365,26 @@ async def test_bags_on_a_read_only_mount_are_served(old_bags: Path, tmp_path: Pa
             async with Client(served.url("/mcp")) as client:
                 await ask_everything(client)
     assert state(old_bags) == before
+
+
+def test_days_are_kept_by_the_recorder_and_go_with_the_setting(tmp_path: Path) -> None:
+    two_days_ago = WallClock().now() - 48 * 3600 * NS_PER_S
+    with sited(tmp_path) as site:
+        for number in range(3):
+            start = two_days_ago + number * 10 * NS_PER_S
+            poses = [odom(start + n * NS_PER_S // 100, n / 400, 0.0) for n in range(1000)]
+            write_mcap(site.bag_dir / "rec_old" / f"rec_old_{number}.mcap", poses)
+        own_all(site.bag_dir)
+        keeping = site.run("memory.keep=true", "retention.max_total_gb=0.0005")
+        keeping.wait_for("memory_kept")
+        until(lambda: not [*site.bag_dir.glob("rec_old/*.mcap")])
+        keeping.stop()
+        days = [*site.bag_dir.glob("memory/*.thinned.mcap")]
+        assert days
+        with answering(site.bag_dir, tmp_path / "served") as served:
+            reply = answer(served, "get_position_at", timestamp=two_days_ago / NS_PER_S + 5)
+        assert (reply["from"], round(reply["x"], 1)) == ("memory", 1.2)
+        again = site.run()
+        [deleted] = again.wait_for("memory_deleted")
+        assert deleted["days"] == len(days)
+        assert not [*site.bag_dir.glob("memory/*")]
