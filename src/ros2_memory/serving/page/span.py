@@ -164,7 +164,7 @@ def span_shown(
         shown["range"] = {
             **render(ranged, memory.index.bag_dir),
             "gaps": _gaps(ranged),
-            "thinned": [[_s(day.start), _s(day.end)] for day in snapshot.timeline.thinned],
+            **_thinned_days(snapshot),
         }
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
@@ -265,6 +265,12 @@ def _start_s(window: TimeWindow) -> float:
 
 def _end_s(window: TimeWindow) -> float:
     return -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
+
+
+def _thinned_days(snapshot: Snapshot) -> JsonObject:
+    """Returns the spans of thinned days, where there are some."""
+    days = snapshot.timeline.thinned
+    return {"thinned": [[_s(day.start), _s(day.end)] for day in days]} if days else {}
 
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
