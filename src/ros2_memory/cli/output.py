@@ -153,7 +153,7 @@ def with_commands(sentence: str) -> str:
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
     """Returns a reply with an object for each row of its table, if it has one.
 
-    Of a time that stands in a row twice the exact one is shown, once.
+    Where a row has a time in two columns, only the exact one is shown.
     """
     names = "columns" if "columns" in value else "fields"
     fields, rows, every = value.get(names), value.get("rows"), value.get(_ALL)

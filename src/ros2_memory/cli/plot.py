@@ -1,4 +1,4 @@
-"""`ros2-memory plot`: pictures of what is recorded, which is asked as the tools ask it.
+"""`ros2-memory plot`: pictures of what is recorded, by the same queries as the tools.
 
 Times are Unix seconds.
 """

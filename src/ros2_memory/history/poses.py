@@ -138,7 +138,7 @@ def slices_of_poses(
         view: of the call.
         topic: of the poses.
         window: of log time.
-        kind: of what is made; it is remembered, and joined by stretches of the clock.
+        kind: what is made; it is stored, and joined by stretches of the clock.
         make: makes it.
         failures: as for `pose_rows`.
         length: of a slice (ns); they are counted from the epoch.
@@ -170,7 +170,7 @@ def slices_of_poses(
         near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
         if not near:
             return stretch.key(settings)
-        # Not the whole span: it grows with each bag, and what is beyond bears on nothing here.
+        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
         left_out = repr(
             [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
         )

@@ -262,14 +262,13 @@ class TopicThinning:
 
 def is_sampled(table: Table) -> bool:
     """Returns whether messages have a long array of numbers, other than a covariance."""
-    lengths = {
-        path: column
+    lengths = (
+        column
         for path, column in table.columns.items()
         if path.endswith(".length") and "covariance" not in path
-    }
+    )
     return any(
-        not isinstance(column, Texts) and column.size and column.max() > _LONG
-        for column in lengths.values()
+        not isinstance(column, Texts) and column.size and column.max() > _LONG for column in lengths
     )
 
 
