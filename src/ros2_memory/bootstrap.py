@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.memory.days import MemoryDays
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
+    from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
@@ -180,6 +181,29 @@ def build_housekeeper(
         static_topics=settings.data.tf_static_topics,
         grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
         memory=_memory_days_of(settings, bag_dir, bags, own),
+        cutter=_topic_cutter_of(settings, bag_dir, reader),
+    )
+
+
+def _topic_cutter_of(settings: Settings, bag_dir: Path, reader: BagReader) -> TopicCutter | None:
+    """Returns what cuts topics with a shorter life out of bags; None where none has one."""
+    from ros2_memory.retention.topic_ages import TopicAge, TopicCutter, is_quiet
+    from ros2_memory.storage.mcap.writer import McapWriter
+
+    topic_ages = [
+        TopicAge(topics, ns_from_unix(life.max_age_h * 3600))
+        for topics, life in settings.retention.topics.items()
+    ]
+    if not topic_ages:
+        return None
+    writer = McapWriter(settings.reader.max_chunk_mb)
+    return TopicCutter(
+        bag_dir,
+        topic_ages,
+        reader,
+        writer,
+        static_topics=settings.data.tf_static_topics,
+        is_quiet=is_quiet,
     )
 
 

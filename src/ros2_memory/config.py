@@ -309,12 +309,21 @@ class StoreSettings:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+class TopicLife:
+    """How old the messages of some topics may become."""
+
+    max_age_h: Positive
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
 class RetentionSettings:
     """How much history is kept.
 
     `max_moments_gb` is the part of the total that saved moments may take, at most half of it.
     `foreign`: whether bags of other programs are left alone, or counted and deleted as its own.
     `require_shipped`: whether age deletes no bag before `ros2-memory ship` has confirmed it.
+    `topics` has, by a name or glob of topics, how old their messages may become; then they are cut
+    out of bags that stay.
     """
 
     max_total_gb: Positive
@@ -323,6 +332,7 @@ class RetentionSettings:
     max_moments_gb: Tolerance
     foreign: Literal["keep", "delete"]
     require_shipped: Flag
+    topics: dict[Text, TopicLife]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)

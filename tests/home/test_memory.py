@@ -11,6 +11,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_memory, build_reader
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.home import asking
@@ -28,8 +29,9 @@ OF_BAGS = {"crash"}
 """Asks how many recordings a crash left open: that is of the bags, which are gone."""
 
 
+@pytest.mark.parametrize("age_d", [1, 40])
 def test_questions_are_answered_alike_when_the_first_day_is_thinned(
-    home: Path, tmp_path: Path
+    home: Path, tmp_path: Path, age_d: int
 ) -> None:
     world = tmp_path / "world"
     shutil.copytree(home, world)
@@ -53,6 +55,8 @@ def test_questions_are_answered_alike_when_the_first_day_is_thinned(
     for path in going.values():
         path.unlink()
     assert (bag_dir / "memory" / f"{first}.thinned.mcap").stat().st_size < size / 20
+    # After a month numbers stay once a minute; then nothing changes for a year.
+    days.limit(snapshot.bags[0].start + age_d * 86_400 * NS_PER_S)
     outcomes = asking.ask_all(asking.server_over(settings), questions(SCALE))
     missed = {each.question.id: each.why for each in outcomes if each.result != asking.RIGHT}
     assert missed.keys() <= OF_BAGS, missed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
 from dataclasses import replace
@@ -13,9 +14,11 @@ import pytest
 import yaml
 
 from ros2_memory.bag_dir.layout import OWN_FOLDER
+from ros2_memory.bootstrap import build_dispatcher, build_memory
 from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
@@ -167,3 +170,12 @@ def replied(
     except EpisodicError as error:
         return replies.error(error)
     return replies.answer(answer, from_active=call.used_active)
+
+
+def reply_over(bag_dir: Path, tool: str, **arguments: Any) -> Any:
+    """What a server over the shipped configuration replies."""
+    settings = load_settings(
+        [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"], env={}
+    )
+    dispatcher = build_dispatcher(settings, build_memory(settings))
+    return json.loads(asyncio.run(dispatcher.answer(tool, arguments)).text)

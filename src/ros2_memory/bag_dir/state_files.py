@@ -2,7 +2,9 @@
 
     recorded.jsonl     the recorder: how long it has recorded (see `retention.recorded_time`)
     lost.jsonl         the recorder, `forget`: messages that are in no bag, for the notes of answers
+    expired.json       the recorder: messages that `retention.topics` takes out of bags, likewise
     deleted.jsonl      the recorder: what retention deletes, so that nobody calls it lost
+    kept.json          the recorder: bags of which thinned days have what stays, for the index
     shipped.jsonl      `ship`: which bags are in a lake, for retention
     forgotten.jsonl    `forget`: what is deleted here, for the lake that may have it
     erasing.json       `forget`: messages that are being taken out of bags
@@ -16,8 +18,10 @@ What is about to be deleted is written before it is, so a kill hides nothing. El
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from itertools import chain
+from operator import attrgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
 
@@ -27,7 +31,9 @@ from ros2_memory.bag_dir.json_files import Count, Int64, JsonDocument, JsonLog, 
 from ros2_memory.bag_dir.layout import (
     DELETED_FILE,
     ERASING_FILE,
+    EXPIRED_FILE,
     FORGOTTEN_FILE,
+    KEPT_FILE,
     LOST_FILE,
     RECORDED_FILE,
     SCREENED_FILE,
@@ -86,7 +92,8 @@ class Loss:
     """Messages of a topic that are missing between two log times.
 
     `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
-    may never have been published either), or rosbag2's own count; or they were deleted by request.
+    may never have been published either), or rosbag2's own count; or they were deleted by request,
+    or since they had `expired` (`retention.topics`).
     The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
     noticed, with a key of `INTERRUPTIONS`. How many messages it cost is not known, and `lost` 0.
     """
@@ -95,7 +102,7 @@ class Loss:
     start: Int64
     stop: Int64
     lost: Count
-    by: Literal["counter", "stamps", "rosbag2", "forgotten", "died", "hung", "unclean"]
+    by: Literal["counter", "stamps", "rosbag2", "forgotten", "expired", "died", "hung", "unclean"]
 
     @property
     def interrupts(self) -> bool:
@@ -123,9 +130,55 @@ def _losses(bag_dir: Path) -> Sequence[Loss]:
 
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
-    """Returns the losses that fall between two log times; none where the file cannot be read."""
-    losses = _losses(bag_dir) or ()
+    """Returns the losses that fall between two log times; none where a file cannot be read."""
+    losses = (*(_losses(bag_dir) or ()), *(_expired(bag_dir) or ()))
     return [loss for loss in losses if loss.start < stop and start < loss.stop]
+
+
+# expired.json
+
+_MOST_EXPIRED: Final = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class Expired:
+    """The messages that `retention.topics` took out of bags.
+
+    `gone` in order of time; stretches of a topic that lie close together are one. `going` are those
+    of the bag at the path `bag` below the bag directory, which was being rewritten; a kill may have
+    left them there.
+    """
+
+    gone: tuple[Loss, ...] = ()
+    bag: str = ""
+    going: tuple[Loss, ...] = ()
+
+    def then(self, bag: str, going: Iterable[Loss]) -> Expired:
+        """Returns it with the messages of a bag that go next."""
+        going = tuple(going)
+        # What a kill left in the bag goes again.
+        again = {loss.topic for loss in going} if bag == self.bag else set()
+        before = [loss for loss in self.going if loss.topic not in again]
+        topics: dict[str, list[Loss]] = {}
+        for loss in sorted([*self.gone, *before], key=attrgetter("start")):
+            known = topics.setdefault(loss.topic, [])
+            if known and loss.start - known[-1].stop <= _APART_NS:
+                last = known.pop()
+                stop, lost = max(last.stop, loss.stop), last.lost + loss.lost
+                known.append(replace(last, stop=stop, lost=lost))
+            else:
+                known.append(loss)
+        gone = sorted(chain.from_iterable(topics.values()), key=attrgetter("start", "topic"))
+        return Expired((*gone[-_MOST_EXPIRED:],), bag, going)
+
+
+EXPIRED: Final = JsonDocument(EXPIRED_FILE, Expired)
+
+
+@until_changed(EXPIRED_FILE)
+def _expired(bag_dir: Path) -> Sequence[Loss]:
+    found = EXPIRED.read(bag_dir) or Expired()
+    return (*found.gone, *found.going)
 
 
 # deleted.jsonl
@@ -209,6 +262,38 @@ def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
     every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
     return tuple(united(every, _TOUCHING_NS))
+
+
+# kept.json
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Bags that no longer count, since thinned days have what stays of them.
+
+    A kill may leave them there. One does count until its day is as it is listed.
+
+    Attributes:
+        days: size (bytes) and mtime (ns) of the file of each day, by its path below the bag
+            directory.
+        bags: the day that each is in, by its path below the bag directory.
+    """
+
+    days: dict[str, tuple[Count, Int64]] = field(default_factory=dict)
+    bags: dict[str, str] = field(default_factory=dict)
+
+
+KEPT: Final = JsonDocument(KEPT_FILE, Kept)
+
+
+@until_changed(KEPT_FILE)
+def _kept(bag_dir: Path) -> Kept | None:
+    return KEPT.read(bag_dir)
+
+
+def read_kept(bag_dir: Path) -> Kept:
+    """Returns the bags that no longer count; none where the file cannot be read."""
+    return _kept(bag_dir) or Kept()
 
 
 # shipped.jsonl

@@ -31,7 +31,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.coverage import was_forgotten
+from ros2_memory.history.coverage import was_cut
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import Status
@@ -191,7 +191,7 @@ def _rates(memory: Memory, snapshot: Snapshot, latest: Ns) -> Iterator[TopicRate
         last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)
-        if timeline.is_log(topic) or was_forgotten(memory.index.bag_dir, topic, since):
+        if timeline.is_log(topic) or was_cut(memory.index.bag_dir, topic, since):
             usual = None
         age_s = max(unix_from_ns(latest - last), 0.0)
         yield TopicRate(topic, count / unix_from_ns(WINDOW_NS), usual, age_s)

@@ -134,6 +134,7 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             "missing by the cadence of header stamps (never published, or lost)",
         ),
         (("forgotten",), "deleted by request"),
+        (("expired",), "deleted by retention (retention.topics)"),
     ):
         topics: dict[str, int] = {}
         for loss in losses:
@@ -231,18 +232,19 @@ def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> I
         yield f"recorded, and deleted by retention since: {named}"
 
 
-def was_forgotten(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
-    """Whether messages of a topic in a window were deleted by request."""
-    return bool(forgotten_spans(bag_dir, topic, window))
+def was_cut(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
+    """Whether messages of a topic in a window were deleted, and others of their bags were not."""
+    return bool(cut_spans(bag_dir, topic, window))
 
 
-def forgotten_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
-    """Returns when (log time, half-open) messages of a topic were deleted by request, in order.
+def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
+    """Returns when (log time, half-open) such messages were, in order: see `was_cut`.
 
-    Those intervals that overlap the window, joined where they overlap.
+    They were deleted by request, or by `retention.topics`. Those intervals that overlap the window,
+    joined where they overlap.
     """
     losses = read_losses(bag_dir, window.start, window.stop)
-    gone = (each for each in losses if each.topic == topic and each.by == "forgotten")
+    gone = (each for each in losses if each.topic == topic and each.by in {"forgotten", "expired"})
     return united((each.start, each.stop) for each in gone)
 
 
@@ -288,16 +290,16 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     """Returns why a search of topics in a window was not complete; empty where it was.
 
     It was where all that closed files hold of the window was read, and nothing of the topics was
-    deleted by request, nor by retention between two bags. A file that is being written
+    deleted out of bags, nor by retention between two bags. A file that is being written
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(is_whole, view.snapshot.timeline.faulty(window)))
     excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
-    forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
-    forgotten |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
-    forgotten |= any(describe_thinned(view.snapshot, window))
-    if view.notes.complete and whole and not lost and not excluded and not forgotten:
+    deleted = any(was_cut(view.memory.index.bag_dir, each, window) for each in topics)
+    deleted |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
+    deleted |= any(describe_thinned(view.snapshot, window))
+    if view.notes.complete and whole and not lost and not excluded and not deleted:
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()

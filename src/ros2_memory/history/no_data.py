@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_carried, is_thinned
+from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
@@ -34,6 +35,8 @@ from ros2_memory.history.coverage import (
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -330,6 +333,8 @@ def no_data_at(
     if older and newer and around is None and reason is NoDataReason.GAP:
         reason, why = _within_recording(view, older, newer)
         detail += why
+    if _have_expired(view, topics, window):
+        reason = NoDataReason.DELETED
     detail += _advice(view, reason)
     if _is_to_come(view, at):
         detail.append(_to_come(view, at))
@@ -337,6 +342,12 @@ def no_data_at(
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:
+    """Whether messages of each of these topics in a window were cut by `retention.topics`."""
+    losses = read_losses(view.memory.index.bag_dir, window.start, window.stop)
+    return {loss.topic for loss in losses if loss.by == "expired"}.issuperset(topics)
 
 
 def _within_recording(
@@ -375,6 +386,8 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
     reason = between(view, window) if is_between else beyond(view, newest)
+    if _have_expired(view, topics, window):
+        reason = NoDataReason.DELETED
     detail += _advice(view, reason)
     if _is_to_come(view, start):
         detail.append(_to_come(view, start))

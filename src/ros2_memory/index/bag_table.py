@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
+from ros2_memory.bag_dir.state_files import read_kept
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
@@ -102,6 +103,7 @@ class BagTable:
         self._packs = packs
         self._reader = reader
         self._known = known
+        self._bag_dir = bag_dir
         self._tree = Tree(bag_dir, only, setting=setting)
         self._unchanged: Unchanged = {}
         self._files: dict[str, FileNotes] = {}
@@ -144,7 +146,7 @@ class BagTable:
 
     def snapshot(self, now: Ns) -> Snapshot:
         """Returns what is known since the last scan."""
-        timeline, scanned = self._timeline, self._scanned or ScanResult()
+        timeline, scanned = self._counting(), self._scanned or ScanResult()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty: list[Path] = []
@@ -167,6 +169,26 @@ class BagTable:
             problem=scanned.problem,
             metadata_folders=tuple(sorted(scanned.metadata_folders)),
         )
+
+    def _counting(self) -> Timeline:
+        """Returns the bags without those of which thinned days have what stays, if there are."""
+        kept = read_kept(self._bag_dir)
+        days = {name: self._bag(name) for name in kept.days}
+        whole = {
+            name
+            for name, day in days.items()
+            if day is not None and (day.size, day.mtime_ns) == kept.days[name]
+        }
+        bags = [*filter(None, (self._bag(name) for name, day in kept.bags.items() if day in whole))]
+        return self._timeline.changed(bags, ()) if bags else self._timeline
+
+    def _bag(self, name: str) -> BagFile | None:
+        """Returns the bag at a path below the bag directory, if that answers."""
+        path = str(self._bag_dir / name)
+        if path in self._unchanged:
+            return self._unchanged[path][0]
+        found = self._counted.get(path)
+        return None if found is None else found.bag
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
         """Returns what retention considers; `named` are recordings that are being written."""

@@ -11,7 +11,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
-from ros2_memory.history.coverage import forgotten_spans, recording_gaps, unix_text
+from ros2_memory.history.coverage import cut_spans, recording_gaps, unix_text
 from ros2_memory.index.holes import SHORTEST_GAP_NS
 
 if TYPE_CHECKING:
@@ -32,8 +32,7 @@ _ALIKE_NS: Final[Ns] = 30 * NS_PER_S
 def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
     """Yields all silences in order of time.
 
-    A latched topic holds, and is never silent. Nor was one silent where its messages were deleted
-    by request.
+    A latched topic holds, and is never silent. Nor was one silent where its messages were deleted.
     """
     latching, bag_dir = memory.limits.latching, memory.index.bag_dir
     latched: dict[str, bool] = {}
@@ -41,12 +40,12 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
         if each.topic not in latched:
             latched[each.topic] = latching.is_latched(snapshot, each.topic)
         if not latched[each.topic]:
-            yield from _around_forgotten(bag_dir, snapshot, each)
+            yield from _around_cut(bag_dir, snapshot, each)
 
 
-def _around_forgotten(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
-    """Yields a silence, or the parts of it before and after messages were deleted by request."""
-    gone = forgotten_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
+def _around_cut(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
+    """Yields a silence, or the parts of it before and after messages that were deleted."""
+    gone = cut_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
     if not gone:
         yield silence
         return

@@ -15,7 +15,7 @@ from ros2_memory.history.coverage import (
     describe_gaps,
     describe_lost,
     unix_text,
-    was_forgotten,
+    was_cut,
 )
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
@@ -250,7 +250,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         usual = (last - first) // (messages - 1)
         is_long = latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual)
         since = TimeWindow(last + 1, latest + 1)
-        if is_long and not was_forgotten(memory.index.bag_dir, topic, since):
+        if is_long and not was_cut(memory.index.bag_dir, topic, since):
             yield SilentTopic(topic, last, usual)
 
 

@@ -276,6 +276,8 @@ class Shipper:
                     known[shipped.bag_id] = shipped
                     confirmed.append(shipped)
                     continue
+                if _is_cut(robot, bag, by_file.get(shipped.file)):
+                    continue
                 rows = rows_of(robot.memory, bag, shipped, self._messages)
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{robot.name}: {error}")
@@ -423,6 +425,17 @@ class Shipper:
                 log.warning("receipts_not_written", robot=robot.name, reason=str(error))
                 self._refused.add(robot.name)
             done.problems.append(problem)
+
+
+def _is_cut(robot: RobotBags, bag: BagFile, before: ShippedBag | None) -> bool:
+    """Returns whether only retention took messages out of a bag after it was shipped.
+
+    The lake keeps those, as it keeps the bags that retention deletes.
+    """
+    if before is None:
+        return False
+    receipt = read_receipts(robot.bag_dir).get(before.file)
+    return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

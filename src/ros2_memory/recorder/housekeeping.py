@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from ros2_memory.retention.collect import Outliving
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.repair import Repaired
+    from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
@@ -86,6 +87,7 @@ class Housekeeping(Housekeeper):
         measure_free: measures what the disk has left, in bytes.
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
+        cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
     """
 
     def __init__(
@@ -108,6 +110,7 @@ class Housekeeping(Housekeeper):
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
+        cutter: TopicCutter | None = None,
     ) -> None:
         self._bag_dir = bag_dir
         self._recorded = RecordedTime(bag_dir)
@@ -126,6 +129,7 @@ class Housekeeping(Housekeeper):
             measure_free=measure_free,
             monotonic=monotonic,
             memory=memory if memory is not None and memory.keeps else None,
+            cutter=cutter,
         )
         self._memory = memory
         self._index = IndexManager(

@@ -149,7 +149,7 @@ class IndexManager:
             collected = self._collector.apply(
                 self._table.known(named, snapshot.scanned_at), snapshot, free_bytes_wanted
             )
-            if collected.bags:
+            if collected.bags or collected.cut:
                 self._scan()
             return collected
 

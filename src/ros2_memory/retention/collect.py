@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
+    from ros2_memory.retention.topic_ages import TopicCutter
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
@@ -68,6 +69,7 @@ class Collected:
         fits: whether the limits are kept.
         held: how many bags are too old by their dates and stay, since the clock is not known to be
             right.
+        cut: out of how many bags topics were cut.
         needed: how many of the deleted bags rules may still have needed.
         unshipped: those of the deleted bags that had to be shipped and were in no lake, relative to
             the bag directory; without those that are saved in moments.
@@ -86,6 +88,7 @@ class Collected:
     saved_bytes: int = 0
     fits: bool = True
     held: int = 0
+    cut: int = 0
     needed: int = 0
     unshipped: tuple[str, ...] = ()
     most_free: int | None = None
@@ -161,6 +164,7 @@ class GarbageCollector:
         measure_free: measures what the disk of a directory has left, in bytes.
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags; None where nothing does.
+        cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
     """
 
     def __init__(
@@ -178,8 +182,10 @@ class GarbageCollector:
         measure_free: Callable[[Path], int] = free_bytes,
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
+        cutter: TopicCutter | None = None,
     ) -> None:
         self._bag_dir = bag_dir
+        self._cutter = cutter
         self._limits = limits
         self._memory = memory
         self._memory_fails_since: float | None = None
@@ -249,6 +255,8 @@ class GarbageCollector:
             # As bags do, days age by the newest that is recorded, and by a clock that is right.
             newest = snapshot.latest if stock.synchronised else None
             self._limit_memory(None if newest is None else min(newest, snapshot.scanned_at))
+        if free_bytes_wanted is None and result.fits:
+            self._cut_topics(stock, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
             relative_recording(path, self._bag_dir)
@@ -280,14 +288,34 @@ class GarbageCollector:
         )
         old = ages(stock, limits)
         # Asking starts a program, so only where it matters.
-        matters = old.by_dates != old.by_recording or self._recorded.asks_for_clock()
-        if matters and run.synchronised is None:
-            run.synchronised = self._is_synchronised()
-            if run.synchronised:
-                self._recorded.confirm_clock()
+        if old.by_dates != old.by_recording or self._recorded.asks_for_clock():
+            self._ask_clock(run)
         synchronised = bool(run.synchronised)
         run.result.held = len(old.held(synchronised=synchronised) - missing)
         return replace(stock, synchronised=synchronised)
+
+    def _ask_clock(self, run: _Pass) -> None:
+        if run.synchronised is None:
+            run.synchronised = self._is_synchronised()
+            if run.synchronised:
+                self._recorded.confirm_clock()
+
+    def _cut_topics(
+        self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot, run: _Pass
+    ) -> None:
+        """Cuts topics with a shorter life out of bags that stay."""
+        if self._cutter is None:
+            return
+        self._ask_clock(run)
+        stock = replace(
+            stock,
+            synchronised=bool(run.synchronised),
+            bags=[bag for bag in stock.bags if bag.path not in run.deleted],
+        )
+        try:
+            run.result.cut = self._cutter.cut(stock, limits, snapshot)
+        except OSError as error:
+            _log.error("topics_not_cut", reason=error.strerror or str(error))
 
     def _delete_all(
         self,

@@ -205,6 +205,12 @@ def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
     return _ages(stock, _eras(stock, limits), limits.max_age_ns)
 
 
+def older_than(max_age_ns: Ns, stock: RetentionStock, limits: RetentionLimits) -> frozenset[str]:
+    """Returns the bags that age could delete if it were so much, by the clock that is right."""
+    stock = _in_order(stock, limits)
+    return _going(stock, _eras(stock, limits), max_age_ns)
+
+
 def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
     """Plans which bags to delete: all that are too old, then no more than the limits need.
 
@@ -227,9 +233,7 @@ def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPl
     left = _Left(stock)
     total = left.total
     eras = _eras(stock, limits)
-    old = _ages(stock, eras, limits.max_age_ns)
-    aged = old.by_dates if stock.synchronised else old.by_recording
-    aged -= stock.needed | stock.unshipped
+    aged = _going(stock, eras, limits.max_age_ns)
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True), left.free
     order = _oldest_first(stock, limits, eras[-1] if eras else [])
@@ -378,6 +382,12 @@ def _dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
         for bag in stock.bags
         if FIRST_BAGS_NS <= bag.start <= bag.end <= latest and bag.end - bag.start <= longest
     ]
+
+
+def _going(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> frozenset[str]:
+    old = _ages(stock, eras, max_age_ns)
+    aged = old.by_dates if stock.synchronised else old.by_recording
+    return aged - stock.needed - stock.unshipped
 
 
 def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:

@@ -7,6 +7,7 @@ name of the original, which is left as it is in every other case.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import stat
 from collections import Counter
@@ -175,10 +176,10 @@ def rewritten(
         left_of: what every file of the recording holds afterwards, see `recounted`.
 
     Raises:
-        EpisodicError: it cannot be rewritten; nothing is changed.
+        EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
         OSError: likewise, or it is another file now.
     """
-    with opened_folder(bag_dir, path) as here, beside(here) as new:
+    with opened_folder(bag_dir, path) as here, _alone(here), beside(here) as new:
         taken = writer.cut(here, new, takes, lambda text: recounted(text, left_of))
         if taken != expected:
             raise BagError(str(path), "its contents changed meanwhile")
@@ -186,6 +187,22 @@ def rewritten(
         give_attributes(new, before, before.st_mtime_ns + 1)
         yield new
         replace_file(new, here, (before.st_dev, before.st_ino))
+
+
+@contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Holds the lock under which a bag is rewritten: `forget` runs beside the recorder.
+
+    Raises:
+        BagError: another program holds it.
+        OSError: the file cannot be opened.
+    """
+    with path.open("rb") as old:
+        try:
+            fcntl.flock(old, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BagError(str(path), "another program rewrites it; try again") from error
+        yield
 
 
 def replace_file(new: Path, path: Path, inode: Identity) -> None:

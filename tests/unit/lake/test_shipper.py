@@ -4,12 +4,13 @@ import os
 import random
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
-from ros2_memory.bag_dir.state_files import read_receipts
+from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
 from ros2_memory.lake.tables import TABLES
@@ -102,6 +103,19 @@ def test_a_bag_of_which_messages_were_deleted_replaces_its_rows(tmp_path: Path) 
     assert ship_from(tmp_path).bags == 2
     assert values(tmp_path / "lake") == ["n0", "n100", "n101"]
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == 2
+
+
+@pytest.mark.parametrize("most", [1, 2])
+def test_a_bag_that_retention_cut_keeps_its_rows(tmp_path: Path, most: int) -> None:
+    write_bag(tmp_path / "hall", 0)
+    ship_from(tmp_path)
+    before = values(tmp_path / "lake")
+    (receipt,) = read_receipts(tmp_path / "hall").values()
+    # With its first message gone it has another id.
+    bag = write_bag(tmp_path / "hall", 0, at_s=START_S + (most == 2), most=most)
+    append_receipts(tmp_path / "hall", [replace(receipt, size=bag.stat().st_size)])
+    assert ship_from(tmp_path).bags == 0
+    assert values(tmp_path / "lake") == before
 
 
 def test_another_bag_under_the_name_of_a_deleted_one_leaves_its_rows(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import ERASING_FILE, MEMORY_FOLDER, memory_file, utc_day
+from ros2_memory.bag_dir.state_files import KEPT, Kept, read_kept
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
@@ -151,16 +152,21 @@ class MemoryDays:
         begun = time.perf_counter_ns()
         bags = [bag for bag in snapshot.bags if bag.file in paths]
         chosen = self._chosen(snapshot, bags)
-        days: dict[str, list[Record]] = defaultdict(list)
-        for record in sorted(self._records(bags, chosen), key=attrgetter("log_time")):
-            days[utc_day(record.log_time)].append(record)
-        for day, records in days.items():
-            self._write(day, records)
+        # Whole bags, also across midnight: a bag is in one day, or in none.
+        days: dict[str, list[BagFile]] = defaultdict(list)
+        for bag in bags:
+            days[utc_day(bag.start)].append(bag)
+        messages = 0
+        for day, of_day in days.items():
+            records = sorted(self._records(of_day, chosen), key=attrgetter("log_time"))
+            messages += len(records)
+            if records:
+                self._write(day, records, of_day)
         _log.info(
             "memory_kept",
             days=[*days],
             bags=len(bags),
-            messages=sum(map(len, days.values())),
+            messages=messages,
             left_out=chosen.left_out,
             duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
         )
@@ -209,8 +215,9 @@ class MemoryDays:
         known = self._reader.summarize(path).topics
         before = [one.count for one in known if (one.topic, one.type) in stays]
         if sum(before) > sum(map(len, stays.values())):
-            days = self._joined(path, ())
-            self._replace(path, (one for one in days if _stays(one, stays)))
+            left = (one for one in self._joined(path, ()) if _stays(one, stays))
+            self._write_beside(path, left).replace(path)
+            flush(self._folder)
 
     def clear(self) -> None:
         """Deletes all days, since nothing is to stay (`memory.keep`).
@@ -320,31 +327,43 @@ class MemoryDays:
             return False
         return _is_of_people(label) or label.strip().isdecimal()
 
-    def _write(self, day: str, records: Sequence[Record]) -> None:
-        """Writes a day anew, with more messages.
+    def _write(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
+        """Writes a day anew, with more messages, and lists the bags that these are of.
+
+        From the moment on in which the new file takes its name, those bags count no longer.
 
         Raises:
             BagError: it cannot be written.
             OSError: likewise.
         """
+        bag_dir = self._folder.parent
         if self._folder.is_symlink():
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
         self._folder.mkdir(exist_ok=True)
         path = self._free(day)
         self._own.hold(self._folder, [path.name])
-        self._replace(path, self._joined(path, records))
-        flush(self._folder.parent)
+        name = str(path.relative_to(bag_dir))
+        beside = self._write_beside(path, self._joined(path, records))
+        status, before = beside.stat(), read_kept(bag_dir)
+        # Those that could not be deleted yet.
+        left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
+        listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
+        days = {known: before.days[known] for known in {*left.values()} - {name}}
+        KEPT.write(bag_dir, Kept({**days, name: (status.st_size, status.st_mtime_ns)}, listed))
+        beside.replace(path)
+        flush(self._folder)
+        flush(bag_dir)
 
-    def _replace(self, path: Path, records: Iterator[Record]) -> None:
-        """Has a new file take the name of a day, once it is on the disk."""
+    def _write_beside(self, path: Path, records: Iterator[Record]) -> Path:
+        """Writes a new file for a day, to the disk, which is to take its name."""
         beside = path.with_name(f".{path.name}.tmp")
         beside.unlink(missing_ok=True)
         try:
             self._writer.write(beside, records, dense=True)
-            beside.replace(path)
-        finally:
+        except BaseException:
             beside.unlink(missing_ok=True)
-        flush(self._folder)
+            raise
+        return beside
 
     def _free(self, day: str) -> Path:
         """Returns the file of a day that can be written anew: no damaged one, nor one of others."""

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
+import operator
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from starlette.datastructures import QueryParams
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import build_dispatcher, build_memory
+from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
@@ -28,7 +29,9 @@ from ros2_memory.history.context import Call
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import MONTH_NS, MemoryDays, MemoryLimits
+from ros2_memory.retention import collect
 from ros2_memory.retention.clear import clear_bags
+from ros2_memory.retention.delete import remove_bag
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
 from ros2_memory.serving.page.span import span_shown
@@ -51,7 +54,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, files_in, own_all
-from tests.support.memories import shipped_extractor
+from tests.support.memories import reply_over, shipped_extractor
 from tests.support.program import Program, exits
 
 S = NS_PER_S
@@ -116,15 +119,6 @@ def house(
         static_topics=("/tf_static",),
         memory=memory,
     )
-
-
-def reply_of(bag_dir: Path, tool: str, **arguments: Any) -> Any:
-    """What a server over the shipped configuration replies."""
-    settings = load_settings(
-        [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"], env={}
-    )
-    dispatcher = build_dispatcher(settings, build_memory(settings))
-    return json.loads(asyncio.run(dispatcher.answer(tool, arguments)).text)
 
 
 def content_of(path: Path) -> bytes:
@@ -343,6 +337,70 @@ class Failing(McapWriter):
         super().write(path, some(), **how)
 
 
+class KilledError(BaseException):
+    """Ends the program."""
+
+
+class Steps:
+    """Lets so many changes of files happen, and ends the program at the next."""
+
+    def __init__(self, left: int) -> None:
+        self.left = left
+
+    def counting(self, change: Callable[..., Any]) -> Callable[..., Any]:
+        def counted(*args: Any, **how: Any) -> Any:
+            if any(".thinned.mcap" in str(arg) or "rec_A" in str(arg) for arg in args):
+                self.left -= 1
+                if self.left < 0:
+                    raise KilledError
+            return change(*args, **how)
+
+        return counted
+
+
+STARTS = (0, 60, 10 * 3600 + 2370, 12 * 3600)
+"""Of the splits that go (s after `T0`): one is across midnight, and one on the next day."""
+
+
+def poses_in(folder: Path) -> list[int]:
+    """How many poses there are of each of these splits."""
+    windows = ({"start": T0 / S + at, "end": T0 / S + at + 59.9} for at in STARTS)
+    replies = (reply_over(folder, "get_topic_in_range", topic="/odom", **each) for each in windows)
+    return [reply["total"] for reply in replies]
+
+
+@pytest.mark.parametrize("steps", range(7))
+def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
+    bag_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, steps: int
+) -> None:
+    def apply(folder: Path) -> None:
+        house(folder, T0 + (53 * 3600 + 60) * S, max_age_h=24, memory=days_of(folder)).apply()
+
+    for start in STARTS:
+        split(bag_dir, start)
+    for hour in (30, 53):
+        split(bag_dir, hour * 3600, name="rec_B")
+    undisturbed = tmp_path / "undisturbed"
+    shutil.copytree(bag_dir, undisturbed)
+    own_all(bag_dir)
+    own_all(undisturbed)
+    whole = poses_in(undisturbed)
+    apply(undisturbed)
+    thinned = poses_in(undisturbed)
+    counter = Steps(steps)
+    with monkeypatch.context() as patched, suppress(KilledError):
+        patched.setattr(Path, "replace", counter.counting(Path.replace))
+        patched.setattr(collect, "remove_bag", counter.counting(remove_bag))
+        apply(bag_dir)
+    assert (counter.left < 0) == (steps < 6)
+    assert all(map(operator.contains, zip(whole, thinned, strict=True), poses_in(bag_dir)))
+    apply(bag_dir)
+    assert poses_in(bag_dir) == thinned
+    for name in ("memory/20260921.thinned.mcap", "memory/20260922.thinned.mcap"):
+        assert messages_in(bag_dir / name) == messages_in(undisturbed / name)
+    assert not [*bag_dir.glob("rec_A/*.mcap")]
+
+
 @pytest.mark.parametrize("after", [0, 1, 50, 150])
 def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
     split(bag_dir, 0)
@@ -403,7 +461,7 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
         split(bag_dir, 60 * nth)
     own_all(bag_dir)
     asked = {"timestamp": (T0 + 600 * S) / S}
-    exact = reply_of(bag_dir, "get_position_at", **asked)
+    exact = reply_over(bag_dir, "get_position_at", **asked)
     newest = split(bag_dir, 86_400 + 3000, name="rec_B")
     own_all(bag_dir)
     days = days_of(bag_dir)
@@ -411,15 +469,15 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     left = sorted(path.name for path in (bag_dir / "rec_A").glob("*.mcap"))
     assert len(left) == 40
     assert newest.exists()
-    reply = reply_of(bag_dir, "get_position_at", **asked)
+    reply = reply_over(bag_dir, "get_position_at", **asked)
     assert reply["from"] == "memory"
     assert reply["resolution_s"] == 1
     assert reply["x"] == pytest.approx(exact["x"], abs=0.3)
     assert [
         note for note in reply["notes"] if "it was within x 150.00 to 150.25 and y 1.00" in note
     ]
-    assert "from" not in reply_of(bag_dir, "get_position_at", timestamp=(T0 + 3000 * S) / S)
-    whole = reply_of(
+    assert "from" not in reply_over(bag_dir, "get_position_at", timestamp=(T0 + 3000 * S) / S)
+    whole = reply_over(
         bag_dir, "get_topic_at_time", topic="/battery_state", timestamp=(T0 + 604.5 * S) / S
     )
     assert (whole["error"], whole["reason"]) == ("no_data", "deleted")
@@ -433,9 +491,9 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     for path in (bag_dir / "rec_A").iterdir():
         path.unlink()
     wanted = {"topic": "/chatter", "condition_type": "contains"}
-    found = reply_of(bag_dir, "find_last_match", **wanted, value="4711")
+    found = reply_over(bag_dir, "find_last_match", **wanted, value="4711")
     assert (found["value"], found["from"]) == ({"value": "the code is 4711"}, "memory")
-    never = reply_of(bag_dir, "find_last_match", **wanted, value="scissors")
+    never = reply_over(bag_dir, "find_last_match", **wanted, value="scissors")
     assert never["timestamp"] is None
     assert any("only some messages stayed" in note for note in never["notes"])
 
@@ -527,10 +585,10 @@ GOLDEN = Path(__file__).resolve().parents[3] / "data" / "memory_day_1.mcap"
 def test_days_of_earlier_versions_are_read(bag_dir: Path) -> None:
     (bag_dir / "memory").mkdir()
     shutil.copy(GOLDEN, bag_dir / DAY_FILE)
-    reply = reply_of(bag_dir, "get_position_at", timestamp=(T0 + 30 * S) / S)
+    reply = reply_over(bag_dir, "get_position_at", timestamp=(T0 + 30 * S) / S)
     assert (round(reply["x"], 1), reply["from"]) == (7.5, "memory")
     seen = {"topic": "/vision/scene/scene_objects", "condition_type": "contains"}
-    found = reply_of(bag_dir, "find_last_match", **seen, value="mug")
+    found = reply_over(bag_dir, "find_last_match", **seen, value="mug")
     assert found["value"]["detections"][0]["label"] == "mug"
 
 

@@ -1,0 +1,265 @@
+"""Cuts topics with a shorter life (`retention.topics`) out of bags that stay.
+
+A bag is old enough for it by the same clocks as for `retention.max_age_h` (see `policy`). It is
+rewritten beside itself, read back and compared, as `forget` does it; the new file takes its name.
+What goes is written down before it does (`expired.json`), so that answers say why it is not there.
+
+Nothing goes of latched topics, which hold until the next message, nor of bags that moments have.
+Nor is a bag touched that a rule may need, or that must be shipped first. A bag that is in a lake
+stays shipped: its receipt is written again with the new size.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import Counter, defaultdict
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import structlog
+
+from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
+from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, METADATA_FILE, SHIPPED_FILE
+from ros2_memory.bag_dir.metadata_yaml import bare_name, recounted
+from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, read_receipts
+from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import match_topics
+from ros2_memory.core.timebase import ms_from_ns
+from ros2_memory.retention.disk import free_bytes
+from ros2_memory.retention.policy import older_than
+from ros2_memory.retention.repair import left_in, rewritten
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Collection, Mapping, Sequence
+    from pathlib import Path
+
+    from ros2_memory.bag_dir.state_files import Receipt
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
+    from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.retention.policy import RetentionLimits, RetentionStock
+    from ros2_memory.storage.base import BagReader, BagWriter
+
+SLICE_S: Final = 1.0
+"""How long one pass cuts, but for the bag that it has begun: meanwhile nothing is deleted."""
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class TopicAge:
+    """How old messages may become of the topics that a name or glob matches."""
+
+    topics: str
+    max_age_ns: Ns
+
+
+class TopicCut(NamedTuple):
+    """The topics that go from one bag."""
+
+    bag: BagFile
+    topics: frozenset[str]
+
+
+def plan_cuts(
+    topic_ages: Sequence[TopicAge],
+    stock: RetentionStock,
+    limits: RetentionLimits,
+    snapshot: Snapshot,
+    static_topics: Collection[str],
+) -> list[TopicCut]:
+    """Returns which topics are too old in which bags, the oldest bag first."""
+    timeline = snapshot.timeline
+    saved = {file.inode for file in stock.saved}
+    alone = {bag.path for bag in stock.bags if saved.isdisjoint(file.inode for file in bag.files)}
+    bags: dict[str, BagFile] = {}
+    going: defaultdict[str, set[str]] = defaultdict(set)
+    for topic_age in topic_ages:
+        topics = [
+            topic
+            for topic in match_topics(timeline.topics(), topic_age.topics)
+            if topic not in static_topics and not timeline.is_transient_state(topic)
+        ]
+        if not topics:
+            continue
+        old = alone & older_than(topic_age.max_age_ns, stock, limits)
+        for topic in topics:
+            for extent in timeline.extents(topic, TimeWindow.everything()):
+                if extent.bag.file in old and extent.bag.path.suffix == ".mcap":
+                    bags[extent.bag.file] = extent.bag
+                    going[extent.bag.file].add(topic)
+    cuts = [TopicCut(bag, frozenset(going[path])) for path, bag in bags.items()]
+    return sorted(cuts, key=lambda cut: (cut.bag.start, cut.bag.file))
+
+
+class TopicCutter:
+    """Cuts topics out of the bags of one bag directory, some in each pass. Not thread-safe.
+
+    Args:
+        bag_dir: the bag directory, whose lock the caller holds.
+        topic_ages: the topics with a shorter life.
+        static_topics: topics that are latched whatever their publishers declare.
+        reader: reads files as they are, also what does not count in answers.
+        writer: rewrites bags.
+        is_quiet: whether the machine has time for it.
+        measure_free: measures what the disk has left, in bytes.
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(
+        self,
+        bag_dir: Path,
+        topic_ages: Sequence[TopicAge],
+        reader: BagReader,
+        writer: BagWriter,
+        *,
+        static_topics: Collection[str] = (),
+        is_quiet: Callable[[], bool],
+        measure_free: Callable[[Path], int] = free_bytes,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._topic_ages = tuple(topic_ages)
+        self._static_topics = static_topics
+        self._bag_dir = bag_dir
+        self._reader = reader
+        self._writer = writer
+        self._is_quiet = is_quiet
+        self._measure_free = measure_free
+        self._monotonic = monotonic
+        self._failed: set[tuple[str, Ns]] = set()
+        self._known: _Counts | None = None
+
+    def cut(self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot) -> int:
+        """Cuts what is too old until `SLICE_S` is over; returns how many bags were cut.
+
+        None while the machine is busy or messages are being forgotten, nor where the new file
+        beside the old one would leave less than `limits.min_free_bytes` of the disk free. A bag
+        that cannot be cut is reported once, and stays as it is until it changes.
+
+        Raises:
+            OSError: the free space cannot be measured, or the receipts of `ship` not be read.
+        """
+        cuts = plan_cuts(self._topic_ages, stock, limits, snapshot, self._static_topics)
+        waiting = [cut for cut in cuts if (cut.bag.file, cut.bag.mtime_ns) not in self._failed]
+        if not waiting or (self._bag_dir / ERASING_FILE).exists() or not self._is_quiet():
+            return 0
+        begun = time.perf_counter_ns()
+        until_s = self._monotonic() + SLICE_S
+        receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
+        gone, bags = Counter[str](), 0
+        for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
+            counts: _Counts | None = None
+            for cut in of_recording:
+                free = self._measure_free(self._bag_dir)
+                if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
+                    break
+                try:
+                    counts = counts or self._counts_of(recording)
+                    gone += self._cut(cut, counts, receipts)
+                    bags += 1
+                except (EpisodicError, OSError) as error:
+                    self._failed.add((cut.bag.file, cut.bag.mtime_ns))
+                    _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
+            if counts is not None:
+                _correct_metadata(counts)
+                self._known = replace(counts, changed=recording.stat().st_mtime_ns)
+        if bags:
+            ms = round(ms_from_ns(time.perf_counter_ns() - begun), 3)
+            _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
+        return bags
+
+    def _counts_of(self, recording: Path) -> _Counts:
+        """Returns what the bags of a recording hold; they are read where they have changed.
+
+        Raises:
+            OSError: its folder cannot be read.
+        """
+        changed = recording.stat().st_mtime_ns
+        if (known := self._known) and (known.recording, known.changed) == (recording, changed):
+            return known
+        return _Counts(recording, changed, left_in(recording, self._reader, {}))
+
+    def _cut(self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]) -> Counter[str]:
+        """Cuts one bag; returns the messages that went, by topic, and takes them from `counts`.
+
+        Raises:
+            EpisodicError: it cannot be rewritten; nothing is changed.
+            OSError: likewise.
+        """
+        path, name = cut.bag.path, bare_name(cut.bag.path.name)
+        before = path.lstat()
+        going = [one for one in self._reader.summarize(path).topics if one.topic in cut.topics]
+        gone = Counter[str]()
+        for one in going:
+            gone[one.topic] += one.count
+        left = {**counts.left, name: counts.left[name] - gone}
+        bag = os.path.relpath(path, self._bag_dir)
+        expired = self._expired()
+        losses = [Loss(one.topic, one.first, one.last + 1, one.count, "expired") for one in going]
+        EXPIRED.write(self._bag_dir, expired.then(bag, losses))
+        try:
+            with rewritten(
+                self._bag_dir,
+                path,
+                before,
+                self._writer,
+                takes=lambda topic, _logged, _published: topic in cut.topics,
+                expected=gone,
+                left_of=left,
+            ):
+                pass
+        except (EpisodicError, OSError):
+            EXPIRED.write(self._bag_dir, expired)
+            raise
+        counts.left.update(left)
+        receipt = receipts.get(bag)
+        if receipt is not None and receipt.size == before.st_size:
+            SHIPPED.append(self._bag_dir, [replace(receipt, size=path.stat().st_size)])
+        return gone
+
+    def _expired(self) -> Expired:
+        """Returns what went before; nothing where its file is damaged, which is then replaced.
+
+        Raises:
+            OSError: it cannot be read.
+        """
+        try:
+            return EXPIRED.read(self._bag_dir) or Expired()
+        except ValueError as error:
+            path = str(self._bag_dir / EXPIRED_FILE)
+            _log.warning("expired_list_damaged", path=path, reason=str(error))
+            return Expired()
+
+
+@dataclass(frozen=True, slots=True)
+class _Counts:
+    """How many messages of each topic each bag of a recording has, by its bare name.
+
+    `changed` is the mtime (ns) of its folder then.
+    """
+
+    recording: Path
+    changed: Ns
+    left: dict[str, Counter[str]]
+
+
+def is_quiet() -> bool:
+    """Returns whether fewer programs ran in the last minute than there are processors."""
+    return os.getloadavg()[0] < (os.cpu_count() or 1)
+
+
+def _correct_metadata(counts: _Counts) -> None:
+    """Has metadata.yaml count what is left, where there is one."""
+    path = counts.recording / METADATA_FILE
+    try:
+        text = read_small_file(path)
+        written = recounted(text, counts.left)
+        if written != text:
+            write_durably(path, written)
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        _log.warning("metadata_not_corrected", recording=path.parent.name, reason=str(error))

@@ -1,0 +1,277 @@
+"""`retention.topics`: topics with a shorter life leave bags that stay."""
+
+from __future__ import annotations
+
+import fcntl
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from structlog.testing import capture_logs
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
+from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses, unshipped
+from ros2_memory.core.errors import BagError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.retention.topic_ages import TopicAge, TopicCutter
+from ros2_memory.storage.base import BagWriter
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import HOUR, own_all
+from tests.support.memories import reply_over
+
+S = NS_PER_S
+T0 = 1_790_000_400 * S
+NOW = T0 + 30 * HOUR
+PLENTY = 10**15
+SPEECH = (TopicAge("/spee*", 24 * HOUR),)
+
+
+def split(bag_dir: Path, hour: int, *, name: str = "rec_A", first: int = 0) -> Path:
+    """Ten seconds of a robot that drives and speaks, so many hours after `T0`."""
+    begin = T0 + hour * HOUR
+    messages: list[Msg] = [
+        tf(begin, transform(begin, "base_link", "camera", (0.1, 0, 0.3)), topic="/tf_static"),
+        *(odom(begin + n * S // 10, n / 10, 1.0) for n in range(100)),
+        *(text(begin + first + n * S, f"word {n}", topic="/speech") for n in range(10)),
+        *(boolean(begin + n * S, n % 2 == 0) for n in range(10)),
+    ]
+    messages.sort(key=lambda message: message.log_time)
+    return write_mcap(bag_dir / name / f"{name}_{hour}.mcap", messages)
+
+
+def cutter_of(
+    bag_dir: Path,
+    *,
+    topic_ages: tuple[TopicAge, ...] = SPEECH,
+    writer: BagWriter | None = None,
+    is_quiet: bool = True,
+    free: int = PLENTY,
+    monotonic: Callable[[], float] = lambda: 0.0,
+) -> TopicCutter:
+    return TopicCutter(
+        bag_dir,
+        topic_ages,
+        McapReader(),
+        writer or McapWriter(),
+        static_topics=("/tf_static",),
+        is_quiet=lambda: is_quiet,
+        measure_free=lambda _: free,
+        monotonic=monotonic,
+    )
+
+
+def house(
+    bag_dir: Path, cutter: TopicCutter, *, require_shipped: bool = False, synchronised: bool = True
+) -> Housekeeping:
+    limits = RetentionLimits(
+        PLENTY, 168 * HOUR, min_free_bytes=1000, require_shipped=require_shipped
+    )
+    return Housekeeping(
+        bag_dir,
+        BagDirReader(McapReader()),
+        McapWriter(),
+        SettableClock(NOW),
+        limits,
+        is_synchronised=lambda: synchronised,
+        split_duration_s=10.0,
+        static_topics=("/tf_static",),
+        cutter=cutter,
+    )
+
+
+def counts_of(path: Path) -> dict[str, int]:
+    return {one.topic: one.count for one in McapReader().summarize(path).topics}
+
+
+def contents_of(path: Path, *topics: str) -> list[tuple[str, int, bytes]]:
+    records = McapReader().records(path, topics, TimeWindow.everything())
+    return [(one.channel.topic, one.log_time, one.payload) for one in records]
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    """Two bags that are older than a day, and one that is not."""
+    folder = tmp_path / "bags"
+    for hour in (0, 1, 29):
+        split(folder, hour)
+    own_all(folder)
+    return folder
+
+
+def test_only_what_is_too_old_goes_and_all_else_stays(bag_dir: Path) -> None:
+    old, young = bag_dir / "rec_A" / "rec_A_0.mcap", bag_dir / "rec_A" / "rec_A_29.mcap"
+    others = ("/odom", "/tf_static", "/bumper")
+    before, untouched = contents_of(old, *others), young.read_bytes()
+    with capture_logs() as logs:
+        house(bag_dir, cutter_of(bag_dir)).apply()
+    assert contents_of(old, "/speech") == []
+    assert contents_of(old, *others) == before
+    assert before
+    assert young.read_bytes() == untouched
+    [told] = [log for log in logs if log["event"] == "topics_cut"]
+    assert (told["bags"], told["messages"]) == (2, {"/speech": 20})
+
+
+def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    start = T0 / S
+    reply = reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=start, end=start + 9)
+    assert (reply["error"], reply["reason"]) == ("no_data", "deleted")
+    assert "10 messages deleted by retention (retention.topics): /speech (10)" in reply["notes"]
+    odometry = reply_over(bag_dir, "get_position_at", timestamp=start + 5)
+    assert odometry["x"] == 5.0
+    young = start + 29 * 3600
+    found = reply_over(bag_dir, "get_topic_in_range", topic="/speech", start=young, end=young + 9)
+    assert len(found["samples"]) == 10
+
+
+def test_a_moment_of_a_topic_that_was_cut_is_told_as_deleted(bag_dir: Path) -> None:
+    odometry = (TopicAge("/odom", 24 * HOUR),)
+    house(bag_dir, cutter_of(bag_dir, topic_ages=odometry)).apply()
+    at = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 5)
+    assert (at["error"], at["reason"]) == ("no_data", "deleted")
+
+
+def test_losses_of_one_stretch_are_one(bag_dir: Path) -> None:
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    split(bag_dir, 2)
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    found = [(loss.start, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
+    assert found == [(T0 + hour * HOUR, 10, "expired") for hour in range(3)]
+
+
+def test_a_bag_may_lose_one_topic_after_another(bag_dir: Path) -> None:
+    (bag_dir / "rec_A" / "rec_A_1.mcap").unlink()
+    for topic_ages in (SPEECH, (*SPEECH, TopicAge("/bumper", 25 * HOUR))):
+        house(bag_dir, cutter_of(bag_dir, topic_ages=topic_ages)).apply()
+    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap") == {"/odom": 100, "/tf_static": 1}
+    found = {loss.topic: loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)}
+    assert found == {"/speech": 10, "/bumper": 10}
+
+
+def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: Path) -> None:
+    saved = bag_dir / "rec_A" / "rec_A_0.mcap"
+    moment = bag_dir / "moments" / "kept"
+    moment.mkdir(parents=True)
+    (moment / saved.name).hardlink_to(saved)
+    foreign = split(bag_dir, 2, name="theirs")
+    before = {path: path.read_bytes() for path in (saved, foreign)}
+    everything = (TopicAge("*", 24 * HOUR),)
+    house(bag_dir, cutter_of(bag_dir, topic_ages=everything)).apply()
+    assert {path: path.read_bytes() for path in before} == before
+    assert counts_of(bag_dir / "rec_A" / "rec_A_1.mcap") == {"/tf_static": 1}
+
+
+@pytest.mark.parametrize(
+    "why",
+    [{"is_quiet": False}, {"free": 1100}],
+    ids=["the machine is busy", "the disk is short"],
+)
+def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
+    house(bag_dir, cutter_of(bag_dir, **why)).apply()
+    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
+    assert not (bag_dir / EXPIRED_FILE).exists()
+
+
+def test_nothing_is_cut_while_messages_are_forgotten(bag_dir: Path) -> None:
+    (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
+    (bag_dir / ERASING_FILE).write_text("{}")
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
+
+
+def test_nothing_is_cut_by_a_clock_that_may_be_wrong(bag_dir: Path) -> None:
+    house(bag_dir, cutter_of(bag_dir), synchronised=False).apply()
+    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
+
+
+def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
+    ticks = iter([0.0, 0.5, 1.5])
+    house(bag_dir, cutter_of(bag_dir, monotonic=lambda: next(ticks))).apply()
+    left = [counts_of(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
+    assert ["/speech" in counts for counts in left] == [False, True]
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    assert "/speech" not in counts_of(bag_dir / "rec_A" / "rec_A_1.mcap")
+
+
+def test_metadata_counts_what_is_left(bag_dir: Path) -> None:
+    recording = bag_dir / "rec_A"
+    assert correct(recording, McapReader())
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    assert not correct(recording, McapReader()), (recording / "metadata.yaml").read_text()
+
+
+class FailingWriter(McapWriter):
+    """Cannot cut."""
+
+    def cut(self, source: Path, *_: Any) -> Counter[str]:
+        raise BagError(str(source), "no space left on device")
+
+
+class KilledError(BaseException):
+    """Ends the program."""
+
+
+class KilledWriter(McapWriter):
+    """Is killed while it cuts."""
+
+    def cut(self, *_: Any) -> Counter[str]:
+        raise KilledError
+
+
+def test_a_bag_that_cannot_be_cut_is_told_once_and_claims_nothing(bag_dir: Path) -> None:
+    keeper = house(bag_dir, cutter_of(bag_dir, writer=FailingWriter()))
+    with capture_logs() as logs:
+        keeper.apply()
+        keeper.apply()
+    failed = [log["path"] for log in logs if log["event"] == "topics_not_cut"]
+    assert failed == [str(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
+    assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
+
+
+def test_what_a_kill_interrupted_is_counted_once(bag_dir: Path) -> None:
+    with pytest.raises(KilledError):
+        house(bag_dir, cutter_of(bag_dir, writer=KilledWriter())).apply()
+    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10]
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
+    assert not [*bag_dir.glob("rec_A/.*")]
+
+
+def test_a_bag_that_another_program_rewrites_is_left_to_it(bag_dir: Path) -> None:
+    bag = bag_dir / "rec_A" / "rec_A_0.mcap"
+    with bag.open("rb") as held, capture_logs() as logs:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        house(bag_dir, cutter_of(bag_dir)).apply()
+    [told] = [log for log in logs if log["event"] == "topics_not_cut"]
+    assert "another program rewrites it" in told["reason"]
+    assert counts_of(bag)["/speech"] == 10
+
+
+def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(bag_dir: Path) -> None:
+    old = [bag_dir / "rec_A" / f"rec_A_{hour}.mcap" for hour in (0, 1)]
+    receipt = Receipt("rec_A/rec_A_0.mcap", "id", old[0].stat().st_size, "00", "lake", 1)
+    append_receipts(bag_dir, [receipt])
+    house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    assert ["/speech" in counts_of(path) for path in old] == [False, True]
+    assert unshipped(bag_dir, [(receipt.bag, old[0].stat().st_size)]) == frozenset()
+
+
+def test_a_damaged_list_of_what_went_is_named_and_replaced(bag_dir: Path) -> None:
+    (bag_dir / EXPIRED_FILE).parent.mkdir(exist_ok=True)
+    (bag_dir / EXPIRED_FILE).write_text("{")
+    with capture_logs() as logs:
+        house(bag_dir, cutter_of(bag_dir)).apply()
+    damaged = [log["path"] for log in logs if log["event"] == "expired_list_damaged"]
+    assert damaged == [str(bag_dir / EXPIRED_FILE)]
+    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
