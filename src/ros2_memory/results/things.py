@@ -205,14 +205,31 @@ class Thing:
         return len(self.moved) - 1 if self.moved else None
 
     @property
+    def since(self) -> Ns | None:
+        """When it was first seen at its last place, where it has several."""
+        return self.moved[-1].start if self.moved else None
+
+    @property
+    def before(self) -> str:
+        """The named place where it was before; empty where it was in none, or did not move."""
+        return next(iter(self.moved[-2].inside), "") if len(self.moved) > 1 else ""
+
+    @property
     def missed_there(self) -> StillThere | None:
         """What is known since it was last seen, if it was missed."""
         known = self.still_there
         return known if known is not None and known.state == _MISSED else None
 
 
-SHORT_THING: Final = Keys((*thing(1).short.keys, OBJECT("still_there", "missed_there").if_known))
-"""What a thing is, where it was last, and whether it was missed there."""
+SHORT_THING: Final = Keys(
+    (
+        *thing(1).short.keys,
+        TIME("since").if_known,
+        NAME("before").if_any,
+        OBJECT("still_there", "missed_there").if_known,
+    )
+)
+"""What a thing is, where it was last, since when, where before, and whether it was missed."""
 
 
 def listed_things(form: Keys) -> Keys:

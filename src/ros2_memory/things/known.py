@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
     from ros2_memory.things.seen import Stretch
 
-_MOST_SPOTS: Final = 300_000
+_MOST_SPOTS: Final = 150_000
 """Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""
 _ESTIMATING_S: Final = 6.0
 _FEWER: Final = 4
@@ -174,6 +174,7 @@ class _Loader:
             if len(parts) > 1 and until.expired():
                 raise _TakesTooLongError
 
+        self._view.memory.large.acquire()
         sights, of_slice = joined(
             [one for stretch in stretches for one in stretch.sights],
             [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],

@@ -47,6 +47,7 @@ MOST_TIMES: Final = 20
 """Moments that one call asks about."""
 MOST_WAYPOINTS: Final = 200
 _INCLUSIVE: Final = "Inclusive."
+_MINUTE_S: Final = 60.0
 _OF_THE_OTHER: Final = "Of the other."
 FORMS_OF_TIME: Final = "Unix s or 2026-11-20T14:05."
 TIME_KINDS: Final = ("number", "string")
@@ -104,13 +105,15 @@ def _read_time(value: object) -> object:
 def _read_until(value: object, info: ValidationInfo[object]) -> object:
     """Returns the end of a window: a time as `_read_time` does, but see `rest_of_end_s`.
 
-    Of a window whose start is the same the end of the minute or the day that the text names.
+    A date alone is the end of its day, and a minute its own end where the window starts with it.
     """
     seconds = _read_time(value)
     if not isinstance(value, str) or not isinstance(seconds, float):
         return seconds
-    start = info.data.get((info.field_name or "").replace("end", "start"))
-    return seconds + (named_span_s(value) if start == seconds else 0.0) + rest_of_end_s(value)
+    name, named = info.field_name or "", named_span_s(value)
+    start = info.data.get(name.replace("end", "start"))
+    ends_it = "end" in name and (start == seconds or named > _MINUTE_S)
+    return seconds + (named if ends_it else 0.0) + rest_of_end_s(value)
 
 
 def _read_moment(value: object) -> tuple[object, float]:

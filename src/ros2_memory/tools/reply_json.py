@@ -51,7 +51,7 @@ _SUMMED: Final = (
 _COMPARISONS: Final = tuple(compared(most) for most in range(5, 0, -1))
 _THINGS: Final = tuple(listed_things(thing(most_stays)) for most_stays in (8, 5, 3, 2))
 _SHORT_THINGS: Final = listed_things(SHORT_THING)
-_HOW: Final = "in short form; ask with label or where for their scores, states and moves"
+_HOW: Final = "in short form; ask with one to four labels for their scores, states and moves"
 _LONGEST: Final = 6_000
 """Characters of a reply about things; its lists are cut until it is no longer."""
 
@@ -184,8 +184,12 @@ def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
         return reply
 
     def first(count: int) -> JsonObject:
-        note = f"{count} of {answer.total} things are listed, {_HOW}"
-        few = replace(answer, things=answer.things[:count], notes=(note, *answer.notes))
+        things = answer.things[:count]
+        # A row of several at once is so many things.
+        listed = sum(one.at_once or 1 for one in things)
+        how_many = "all" if listed == answer.total else f"{listed} of {answer.total}"
+        note = f"{how_many} things are listed, {_HOW}"
+        few = replace(answer, things=things, notes=(note, *answer.notes))
         return render(few, bag_dir, _SHORT_THINGS)
 
     return first(largest(1, len(answer.things), lambda count: _is_short(first(count))) or 1)

@@ -169,7 +169,7 @@ _DECLARATIONS = (
             ToolName("get_topic_in_last", "Topic over the last seconds", Last),
         ),
         "A topic's messages {when}: all up to max_samples, else so many, evenly spaced, "
-        "ends included. start and end alike: that minute or day. changes: what "
+        "ends included. start and end alike: that minute. changes: what "
         "held, [{{start, seconds, value}}]. Reply: {{topic, type, total, samples: [{{timestamp, "
         "value}}]}}; "
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "
@@ -181,8 +181,8 @@ _DECLARATIONS = (
     ToolDeclaration(
         _at_and_ago("position", "Position"),
         "Where the robot was {when}, from {pose_topic}. Reply: {{x, y, z (m), yaw_deg "
-        "(counter-clockwise from x), timestamp, topic, frame_id}}; of NavSatFix latitude, "
-        "longitude, altitude; x, y, z null.",
+        "(counter-clockwise from x), timestamp, topic, frame_id, in, also_in (room)}}; "
+        "NavSatFix: latitude, longitude, altitude; x, y, z null.",
         PositionArguments,
         at_each(queries.position),
     ),

@@ -426,6 +426,22 @@ def test_a_long_list_has_each_thing_shortly_and_says_how_to_ask_for_more(tmp_pat
     assert answer["notes"][0].startswith(f"{len(rows)} of 70 things are listed")
 
 
+def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
+    tmp_path: Path,
+) -> None:
+    many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
+    elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
+    write(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
+    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
+    answer = json.loads(reply.text)
+    [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
+    assert (moved["moved_times"], moved["since"]) == (1, moved["last_seen"] - 7.0)
+    assert all("since" not in row for row in answer["things"] if row is not moved)
+    listed = len(answer["things"])
+    how_many = "all" if listed == 36 else f"{listed} of 36"
+    assert answer["notes"][0].startswith(f"{how_many} things are listed, in short form")
+
+
 def random_messages(draw: Random) -> list[Msg]:
     """A robot that looks around while a few things are moved, now and then without a map."""
     places = [(3.0, 0.5), (3.5, -1.0), (-1.5, 1.0), (-2.0, -1.0), (2.5, 2.0)]

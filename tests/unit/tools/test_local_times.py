@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.support.memories import asked
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import text, write_mcap
+from tests.support.memories import asked, memory_of
 from tests.support.rooms import BEGIN, SEEN, asked_of, draw, write
 
 if TYPE_CHECKING:
@@ -146,3 +148,19 @@ def test_a_reply_about_minutes_has_none(memory: Memory, folder: Path) -> None:
     short = {"start": BEGIN + DAY_S, "end": BEGIN + DAY_S + 3600}
     earlier = {"with_start": BEGIN + DAY_S - 7200, "with_end": BEGIN + DAY_S - 3600}
     assert days_said(asked(memory, folder, "compare", **short, **earlier)) == []
+
+
+def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does_not(
+    tmp_path: Path,
+) -> None:
+    day = round(datetime.fromisoformat("2026-11-18").timestamp()) * NS_PER_S
+    hours = [day + hour * 3600 * NS_PER_S for hour in (-30, -1, 1, 23)]
+    write_mcap(tmp_path / "bag.mcap", [text(at, "here") for at in hours])
+    memory = memory_of(tmp_path)
+    window = {"topic": "/chatter", "start": "2026-11-16", "end": "2026-11-18"}
+    assert asked(memory, tmp_path, "get_topic_in_range", **window)["total"] == 4
+    window["end"] = "2026-11-18T00:00"
+    assert asked(memory, tmp_path, "get_topic_in_range", **window)["total"] == 2
+    wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
+    found = asked(memory, tmp_path, "find_last_match", before="2026-11-18", **wanted)
+    assert found["timestamp"] == hours[1] / NS_PER_S
