@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 SLICE_S: Final = 1.0
 """How long one pass cuts, but for the bag that it has begun: meanwhile nothing is deleted."""
+PATIENCE_S: Final = 3600.0
+"""How long cutting waits for a quiet minute: a robot may be busy all day."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -131,20 +133,22 @@ class TopicCutter:
         self._monotonic = monotonic
         self._failed: set[tuple[str, Ns]] = set()
         self._known: _Counts | None = None
+        self._waits_since_s: float | None = None
 
     def cut(self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot) -> int:
         """Cuts what is too old until `SLICE_S` is over; returns how many bags were cut.
 
-        None while the machine is busy or messages are being forgotten, nor where the new file
-        beside the old one would leave less than `limits.min_free_bytes` of the disk free. A bag
-        that cannot be cut is reported once, and stays as it is until it changes.
+        None while messages are being forgotten, nor while the machine is busy (for `PATIENCE_S`
+        at most), nor where the new file beside the old one would leave less than
+        `limits.min_free_bytes` of the disk free. A bag that cannot be cut is reported once, and
+        stays as it is until it changes.
 
         Raises:
             OSError: the free space cannot be measured, or the receipts of `ship` not be read.
         """
         cuts = plan_cuts(self._topic_ages, stock, limits, snapshot, self._static_topics)
         waiting = [cut for cut in cuts if (cut.bag.file, cut.bag.mtime_ns) not in self._failed]
-        if not waiting or (self._bag_dir / ERASING_FILE).exists() or not self._is_quiet():
+        if not waiting or (self._bag_dir / ERASING_FILE).exists() or not self._may_begin():
             return 0
         begun = time.perf_counter_ns()
         until_s = self._monotonic() + SLICE_S
@@ -170,6 +174,16 @@ class TopicCutter:
             ms = round(ms_from_ns(time.perf_counter_ns() - begun), 3)
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
         return bags
+
+    def _may_begin(self) -> bool:
+        """Whether the machine is quiet, or has not been for too long."""
+        now_s = self._monotonic()
+        if self._is_quiet():
+            self._waits_since_s = None
+            return True
+        if self._waits_since_s is None:
+            self._waits_since_s = now_s
+        return now_s - self._waits_since_s >= PATIENCE_S
 
     def _counts_of(self, recording: Path) -> _Counts:
         """Returns what the bags of a recording hold; they are read where they have changed.

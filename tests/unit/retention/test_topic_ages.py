@@ -20,7 +20,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.retention.topic_ages import TopicAge, TopicCutter
+from ros2_memory.retention.topic_ages import PATIENCE_S, TopicAge, TopicCutter
 from ros2_memory.storage.base import BagWriter
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -183,6 +183,18 @@ def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
     assert not (bag_dir / EXPIRED_FILE).exists()
 
 
+def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> None:
+    now_s = [0.0]
+    cutter = cutter_of(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
+    bag, keeper = bag_dir / "rec_A" / "rec_A_0.mcap", house(bag_dir, cutter)
+    for now_s[0] in (0.0, PATIENCE_S - 1):
+        keeper.apply()
+        assert counts_of(bag)["/speech"] == 10
+    now_s[0] = PATIENCE_S
+    keeper.apply()
+    assert "/speech" not in counts_of(bag)
+
+
 def test_nothing_is_cut_while_messages_are_forgotten(bag_dir: Path) -> None:
     (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
     (bag_dir / ERASING_FILE).write_text("{}")
@@ -196,7 +208,7 @@ def test_nothing_is_cut_by_a_clock_that_may_be_wrong(bag_dir: Path) -> None:
 
 
 def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
-    ticks = iter([0.0, 0.5, 1.5])
+    ticks = iter([0.0, 0.0, 0.5, 1.5])
     house(bag_dir, cutter_of(bag_dir, monotonic=lambda: next(ticks))).apply()
     left = [counts_of(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
     assert ["/speech" in counts for counts in left] == [False, True]
