@@ -191,9 +191,10 @@ class View:
         if topic in counted:
             return counted[topic]
         before = self.notes.added
-        found = self._census(topic)
-        if self.notes.complete and self.notes.added == before and not self.call.used_active:
-            counted[topic] = found
+        with self.notes.isolated():
+            found = self._census(topic)
+            if self.notes.complete and self.notes.added == before and not self.call.used_active:
+                counted[topic] = found
         return found
 
     def _census(self, topic: str) -> dict[str, Census]:
