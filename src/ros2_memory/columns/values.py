@@ -8,7 +8,7 @@ for each message. What the table does not hold is None: then the bag has to be r
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
@@ -296,9 +296,21 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
     if len(leaf.sources) > 1 or leaf.made is Made.CHANNELS:
         return None
     found = zone(leaf.level.full(leaf.sources[0]))
+    if found is not None and leaf.is_of_array and leaf.level.parent is not None:
+        lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
+        return None if lengths is None else _with_long_arrays(found, lengths)
     if found is None or leaf.made is not Made.SECONDS:
         return found
     return found.divided(NS_PER_S)
+
+
+def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:
+    """Returns what is known of the numbers of all arrays, by that of those which are held."""
+    are_long = lengths.reaches(MAX_NUMBERS, above=True)
+    if isinstance(numbers, Zones):
+        low = np.where(are_long, -math.inf, numbers.low)
+        return replace(numbers, low=low, high=np.where(are_long, math.inf, numbers.high))
+    return None if are_long else numbers
 
 
 def seconds(times: Numeric) -> Floats:

@@ -247,8 +247,7 @@ def stored(table: Table, step: float, *, zones: bool = True) -> StoredTable:
         found: dict[str, Column] = {}
         for path, column in columns.items():
             full = f"{prefix}.{path}".strip(".")
-            # A list of numbers is not always held whole.
-            if zones and path:
+            if zones:
                 known[full] = zone_of(column)
             found[path] = column
             if step and not isinstance(column, Texts) and column.dtype.kind == "f":

@@ -1,0 +1,74 @@
+"""Arrays that are too long to be held: whether a condition holds is answered as from the bags."""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import pytest
+
+from ros2_memory.columns.table import MAX_NUMBERS
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import Msg, header, make, write_mcap
+from tests.support.memories import asked, memory_of, with_store
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+T0: Final = 1_790_000_000 * NS_PER_S
+LENGTHS: Final = {
+    "short": [5] * 20,
+    "the longest that are held": [MAX_NUMBERS] * 20,
+    "one more": [MAX_NUMBERS + 1] * 20,
+    "long": [360] * 20,
+    "some short, some long": [5, 40] * 10,
+    "few are short": [3, *[40] * 19],
+    "empty ones among them": [0, 40] * 10,
+}
+
+
+def joints(lengths: Sequence[int]) -> list[Msg]:
+    """States of joints whose positions rise by 1 from message to message."""
+    return [
+        Msg(
+            "/joints",
+            "sensor_msgs/msg/JointState",
+            T0 + nth * NS_PER_S,
+            make(
+                "sensor_msgs/msg/JointState",
+                header=header(T0 + nth * NS_PER_S, ""),
+                name=[],
+                position=np.linspace(nth, nth + 0.75, length),
+                velocity=np.zeros(0),
+                effort=np.zeros(0),
+            ),
+        )
+        for nth, length in enumerate(lengths)
+    ]
+
+
+@pytest.mark.parametrize("lengths", LENGTHS.values(), ids=LENGTHS)
+def test_conditions_on_arrays_are_answered_alike_stored_or_not(
+    tmp_path: Path, lengths: Sequence[int]
+) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", joints(lengths))
+    bags = memory_of(tmp_path)
+    stored = with_store(memory_of(tmp_path), tmp_path)
+    conditions: list[dict[str, Any]] = [
+        {"condition_type": kind, "value": value, **({"field": field} if field else {})}
+        for kind, value, field in product(
+            ("above", "below", "equals"), (3.5, 7.0, 100.0, -1.0), ("positions", "positions.0", "")
+        )
+        if field or kind == "equals"
+    ]
+    some = 0
+    for condition in conditions:
+        for tool in ("find_matches", "find_last_match"):
+            given = {"topic": "/joints", **condition}
+            expected = asked(bags, tmp_path, tool, **given)
+            assert asked(stored, tmp_path, tool, **given) == expected, (tool, condition)
+            found = expected or {}
+            some += bool(found.get("total") or found.get("timestamp"))
+    assert some > 8
