@@ -28,7 +28,7 @@ from ros2_memory.places.two_paths import farthest_apart, placed_standstills, sto
 from ros2_memory.places.where import parse_where, places_asked, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
-from ros2_memory.things.known import known_things
+from ros2_memory.things.known import known_things, note_other_frames
 from ros2_memory.things.unseen import vague_notes
 
 if TYPE_CHECKING:
@@ -123,6 +123,7 @@ def _things(
     """Returns the frame of things, and what became of them from the earlier window to the later."""
     limits = view.memory.limits
     known = known_things(view, limits.min_score, limits.labels)
+    note_other_frames(view, known, where)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
     frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
     if any(gap_around(view, each) is not None for each in windows):

@@ -53,8 +53,8 @@ def map_placement(
     if frame_id not in (None, placement.frame_id):
         known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
         raise InvalidArgumentsError(
-            f"frame_id was {abbreviate(frame_id)}; places are in {known}; "
-            "get_transform_at converts from other frames"
+            f"frame_id was {abbreviate(frame_id)} (as asked, or of a place), and where the robot "
+            f"was is known in {known} only: ask for that, or give the place this frame"
         )
     return placement
 

@@ -22,7 +22,7 @@ from ros2_memory.history.view import TimeRange, clamped, open_view, search_windo
 from ros2_memory.places.where import parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, ThingStay, UsualPlace
 from ros2_memory.things.instances import most_at_once
-from ros2_memory.things.known import KnownThings, known_things
+from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, notes_on
@@ -88,6 +88,7 @@ def find_things(
         )
     note_robots(view, view.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
+    note_other_frames(view, known, region)
     asked = {known.labels.key(each): each for each in labels}
     places = places_asked(limits, region, known.frames)
     finder = _Finder(known, window, region, places, now)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
+    from ros2_memory.places.where import Where
     from ros2_memory.things.seen import Stretch
 
 _MOST_SPOTS: Final = 150_000
@@ -84,6 +85,17 @@ def known_things(
             "to compare older ones, which find_matches finds"
         )
     return known
+
+
+def note_other_frames(view: View, known: KnownThings, region: Where | None) -> None:
+    """Notes the places that are asked for in frames in which no thing is known."""
+    frames = known.frames if known.has_map else known.frames[1:]
+    for place in () if region is None or not frames else region.each:
+        if place.frame_id not in {None, *frames}:
+            view.notes.add(
+                f"{place.title} is in {place.frame_id}, and things are known in "
+                f"{' and '.join(dict.fromkeys(frames))}: nothing is found there"
+            )
 
 
 class _TakesTooLongError(Exception):

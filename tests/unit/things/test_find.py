@@ -442,6 +442,21 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     assert answer["notes"][0].startswith(f"{how_many} things are listed, in short form")
 
 
+def test_a_place_in_a_frame_in_which_nothing_is_known_is_named(tmp_path: Path) -> None:
+    scenes = (scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False) for at in range(10))
+    write(tmp_path, [message for one in scenes for message in one])
+    reply = ask(tmp_path, where="kitchen")
+    assert reply["things"] == []
+    assert (
+        "kitchen is in map, and things are known in odom: nothing is found there" in reply["notes"]
+    )
+    windows = {"start": BEGIN, "end": BEGIN + 5, "with_start": BEGIN + 5, "with_end": BEGIN + 10}
+    memory = memory_of(tmp_path, limits=NAMED)
+    compared = asked(memory, tmp_path, "compare", where="kitchen", **windows)
+    assert any("kitchen is in map" in note for note in compared["notes"])
+    assert "notes" not in ask(tmp_path)
+
+
 def random_messages(draw: Random) -> list[Msg]:
     """A robot that looks around while a few things are moved, now and then without a map."""
     places = [(3.0, 0.5), (3.5, -1.0), (-1.5, 1.0), (-2.0, -1.0), (2.5, 2.0)]
