@@ -3,6 +3,7 @@
 const NEAR_PX = 14;
 const BESIDE = 0.25;  // of the canvas, to each side, for which the exact path is asked, too
 const LARGER = 1.5;  // so much larger than asked for it is drawn until it is asked for anew
+const SAME_S = 0.001;  // times of a path are rounded
 const NEWER_S = 4;  // what is newer is drawn as the look has it, until it is asked for
 const UNSEEN_S = 10;  // the robot may have moved since an older pose
 
@@ -424,14 +425,19 @@ class RobotMap {
       if (exact) this.trace(c, exact, 0);
       else this.drawCells(c, path.cells, colour(ofPath(index)));
       const until = exact ? exact.until : path.cells ? path.cells.until : null;
-      this.trace(c, path, until === null ? 0 : Math.max(lastBefore(path.t, until), 0));
+      const newer = until === null ? 0 : lastBefore(path.t, until + SAME_S) + 1;
+      // It goes on from where the exact one ends: a line from a pose before that would cut corners.
+      const [end, last] = exact && exact.t.length ? [exact, exact.t.length - 1] : [path, newer - 1];
+      this.trace(c, path, newer, last < 0 ? null : [end.x[last], end.y[last]]);
       c.stroke();
     });
   }
-  trace(c, path, first) {
+  /* A path from a pose on; the line to that comes from `before`, if it is not where a part begins. */
+  trace(c, path, first, before = null) {
+    if (before && first < path.t.length) c.moveTo(this.px(before[0]), this.py(before[1]));
     for (let n = first; n < path.t.length; n++) {
       const [x, y] = [this.px(path.x[n]), this.py(path.y[n])];
-      if (path.starts.has(n) || n === first) c.moveTo(x, y);
+      if (path.starts.has(n) || (n === first && !before)) c.moveTo(x, y);
       else c.lineTo(x, y);
     }
   }

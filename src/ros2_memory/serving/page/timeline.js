@@ -11,6 +11,8 @@ const SHORTEST_S = 1;
 const SPANS = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200,
   86400, 172800, 604800, 1209600, 2592000, 7776000, 15552000, 31536000, 63072000, 157680000, 315360000];
 const MONTH_S = 2592000;
+/* What is drawn over what: a fault is seen among many that are none. */
+const WORST_LAST = ["accent", "good", "warn", "gap"];
 const COLOURS = { error: "gap", "failed goal": "gap", gap: "gap", "clock step": "warn",
   silence: "warn", drop: "warn", flip: "accent", goal: "good" };
 
@@ -314,11 +316,13 @@ class Timeline {
     const middle = top + high / 2;
     c.fillStyle = colour("grid");
     c.fillRect(GUTTER, middle - 0.5, this.wide, 1);
-    for (const each of bars) {
+    const isMark = kind === "events";
+    const drawn = (each) => isMark ? COLOURS[each.kind] || "accent" : kind;
+    const rank = (each) => WORST_LAST.indexOf(drawn(each));
+    for (const each of isMark ? [...bars].sort((one, other) => rank(one) - rank(other)) : bars) {
       const left = this.x(each.t);
       const wide = Math.max(this.x(each.end === undefined ? each.t : each.end) - left, 0);
-      const isMark = kind === "events";
-      c.fillStyle = colour(isMark ? COLOURS[each.kind] || "accent" : kind);
+      c.fillStyle = colour(drawn(each));
       if (isMark && wide > 2 && each.kind !== "flip") {
         c.globalAlpha = 0.5;
         c.fillRect(left, middle - 1, wide, 2);
