@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.errors import (
@@ -119,6 +118,8 @@ A = TypeVar("A", results.Match, results.ValueWhen)
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
 _REACH_M: Final = 0.05
+_THINNED_POSES_NS: Final = 3 * NS_PER_S
+"""No farther apart are the poses of a thinned day, where they were recorded."""
 """How far a robot may have got before the next pose without a note."""
 
 
@@ -667,10 +668,9 @@ def _found_at(
     window, tolerance = _within(view, at, tolerance_s, rest_s)
     found = view.stream.newest(topic, window)
     if found is None and tolerance_s is None and is_pose:
-        # In a thinned day the pose of some seconds before holds, unless there is a later one.
-        before = TimeWindow(max(window.start - 2 * THINNED_NS, MIN_NS), window.stop)
+        before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
         found = view.stream.newest(topic, before)
-        if found is not None and not is_thinned(found.bag.file):
+        if found is not None and not (is_thinned(found.bag.file) and _holds(view, found)):
             found = None
     if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
         found = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
@@ -683,6 +683,12 @@ def _found_at(
     note_robots_near(view, found)
     note_unread(view, TimeWindow(found.time, window.stop))
     return found
+
+
+def _holds(view: View, found: StoredMessage) -> bool:
+    """Whether a pose of a thinned day holds until the next: farther apart none was recorded."""
+    window = TimeWindow(found.time + 1, found.time + _THINNED_POSES_NS)
+    return view.stream.first([found.record.channel.topic], window) is not None
 
 
 def _within(

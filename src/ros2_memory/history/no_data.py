@@ -333,7 +333,7 @@ def no_data_at(
     if older and newer and around is None and reason is NoDataReason.GAP:
         reason, why = _within_recording(view, older, newer)
         detail += why
-    if _have_expired(view, topics, window):
+    if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason)
     if _is_to_come(view, at):
@@ -350,11 +350,17 @@ def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bo
     return {loss.topic for loss in losses if loss.by == "expired"}.issuperset(topics)
 
 
+def _is_thinned(view: View, window: TimeWindow) -> bool:
+    """Whether of some time of a window only some messages stayed, and something was recorded."""
+    days = view.snapshot.timeline.thinned
+    return any(window.overlaps(day.start, day.end) for day in days) and not view.gaps(window)
+
+
 def _within_recording(
     view: View, older: StoredMessage, newer: StoredMessage
 ) -> tuple[NoDataReason, list[str]]:
     """Returns why there is no message between two that follow each other, and a sentence on it."""
-    if is_thinned(older.bag.file):
+    if is_thinned(older.bag.file) and not view.gaps(TimeWindow(older.time + 1, newer.time)):
         why = "of that time only some messages stayed: retention deleted the others"
         return NoDataReason.DELETED, [why]
     period = _usual_period(view, older)
@@ -386,7 +392,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
     reason = between(view, window) if is_between else beyond(view, newest)
-    if _have_expired(view, topics, window):
+    if _have_expired(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
     detail += _advice(view, reason)
     if _is_to_come(view, start):
@@ -460,7 +466,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     names: dict[str, None] = {}
     held: set[str] = set()
     for bag in timeline.overlapping(window):
-        if is_carried(bag.file):
+        if is_carried(bag.file) or is_thinned(bag.file):
             continue
         held.update(bag.summary.schema.positions)
         if is_named_after_folder(bag.file) or str(bag.recording) in whole:

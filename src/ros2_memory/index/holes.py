@@ -108,12 +108,14 @@ class Rhythm:
         return max(SHORTEST_GAP_NS, _GAP_PERIODS * min(self._periods.values(), default=0))
 
     def _is_gap(self, pause: Pause) -> bool:
+        if any(is_thinned(bag.file) for bag in pause.bags):
+            # There each topic has a message in every slot of 7 s, or as often as it had.
+            return pause.length > _LONGEST_LEAST_NS
         several = all(len(self._periods_of(bag)) > 1 for bag in pause.bags)
         if several and pause.length > _GAP_PERIODS * self._slower(pause):
             return True
         if len(pause.bags) == 1:
-            # In a thinned day each topic has a message in every slot of 7 s, or as often as it had.
-            return not pause.ran_on and pause.length > _LONGEST_LEAST_NS
+            return False
         longer = max(bag.end - bag.start for bag in pause.bags)
         least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0
         return pause.length > max(least, self.shortest_gap)

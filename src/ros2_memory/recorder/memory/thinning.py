@@ -2,7 +2,8 @@
 
 A message that stays is as it was recorded. Those go that say again what others say:
 
-- What moves has a pose a second (`STEP_NS`), and while it stands one in each slot (`THINNED_NS`).
+- What moves has a pose a second (`STEP_NS`), and one in two while it stands: standstills are found,
+  and where poses are farther apart none was recorded.
 - Of a boolean, a status or a name every message stays that changes it, and the last one before.
 - Of detections and transforms as few messages of each slot stay as show all labels and frames,
   and the most of a label at once.
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     Points = NDArray[np.float64]
 
 STEP_NS: Final[Ns] = NS_PER_S
+STANDING_NS: Final[Ns] = 2 * NS_PER_S
 PAUSE_NS: Final[Ns] = 3 * NS_PER_S
 """With a slot of 7 s no more than the 10 s of a silence lie between two messages that stay."""
 MINUTE_NS: Final[Ns] = 60 * NS_PER_S
@@ -97,11 +99,15 @@ class _Extremes(NamedTuple):
 
 @dataclass(slots=True)
 class _Mover:
-    """A frame or a robot, by the last pose of it that stays, and the last that was looked at."""
+    """A frame or a robot, by the last pose of it that stays, and the last that was looked at.
+
+    `kept` is the log time of the newest message that stays for it.
+    """
 
     slot: int = -1
     stays: Points = field(default_factory=lambda: np.full(0, np.nan))
     before: Ns = 0
+    kept: Ns = 0
 
     def moved(self, times: IntArray, poses: Points) -> Iterator[Ns]:
         """Yields the log times of the poses that stay, since it moved; also of those before it did.
@@ -117,7 +123,10 @@ class _Mover:
                 if self.before:
                     yield self.before
                 yield time
-                self.stays = pose
+                self.stays, self.kept = pose, time
+            elif time - self.kept >= STANDING_NS:
+                yield time
+                self.kept = time
             self.before = time
         self.slot = int(steps[-1])
 

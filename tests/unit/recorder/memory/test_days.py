@@ -337,6 +337,56 @@ class Failing(McapWriter):
         super().write(path, some(), **how)
 
 
+def drive_and_stand(bag_dir: Path, name: str, start: int) -> Path:
+    """Half a minute of driving, a minute of standing, and half a minute of driving on."""
+    begin = T0 + start * S
+    messages: list[Msg] = []
+    for at in range(begin, begin + 120 * S, S // 20):
+        seconds = (at - begin) / S
+        driven = min(seconds, 30.0) + max(seconds - 90.0, 0.0)
+        messages.append(odom(at, start + driven / 4, 1.0))
+        messages.append(boolean(at, 30 <= seconds < 90))
+    messages.sort(key=lambda each: each.log_time)
+    return write_mcap(bag_dir / name / f"{name}_{start}.mcap", messages)
+
+
+@pytest.mark.parametrize("pause", [12, 60])
+def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause: int) -> None:
+    drive_and_stand(bag_dir, "rec_A", 0)
+    drive_and_stand(bag_dir, "rec_B", 120 + pause)
+    # Bags that are not thinned show how often the topics have a message.
+    drive_and_stand(bag_dir, "rec_C", 4000)
+    own_all(bag_dir)
+    whole = {
+        "recap": {"start": T0 / S, "end": T0 / S + 119.9},
+        "get_topic_in_range": {
+            "topic": "/bumper",
+            "by": "value",
+            "start": T0 / S,
+            "end": T0 / S + 119.9,
+        },
+    }
+    recap, values = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
+    for name in ("rec_A", "rec_B"):
+        keep_all(days_of(bag_dir), bag_dir, name)
+        shutil.rmtree(bag_dir / name)
+    middle = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 120 + pause / 2)
+    assert middle["error"] == "no_data", middle
+    assert middle["reason"] == ("gap" if pause > 20 else "deleted")
+    standing = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 60)
+    assert standing["x"] == 7.5
+    thinned, states = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
+    assert thinned["stood_s"] == pytest.approx(recap["stood_s"], abs=3.0)
+    assert not [event for event in thinned["events"] if "nothing" in str(event)]
+    times = [[row[2] for row in reply["rows"]] for reply in (values, states)]
+    # The last message of a state may be up to 7 s before the end.
+    assert times[1] == pytest.approx(times[0], abs=7.5), (values, states)
+    text_then = reply_over(
+        bag_dir, "get_topic_in_range", topic="/chatter", start=T0 / S, end=T0 / S + 10
+    )
+    assert text_then["error"] == "no_data"
+
+
 class KilledError(BaseException):
     """Ends the program."""
 
