@@ -225,11 +225,11 @@ def deleted_length(view: View, window: TimeWindow) -> Ns:
 
 
 def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
-    """Yields a sentence on what retention deleted of a window, if it did, and around that."""
+    """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
     spans = [_span_text(*each) for each in _deleted_near(snapshot, bag_dir, window)]
     if spans:
         named = listed(spans[-MAX_NAMED:], len(spans))
-        yield f"recorded, and deleted by retention since: {named}"
+        yield f"recorded, and deleted since: {named}"
 
 
 def was_cut(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
@@ -508,7 +508,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
 def why_nothing(when: str, *, deleted: bool) -> str:
     """Returns that a time has no messages: none were recorded, or retention deleted them."""
     if deleted:
-        return f"what was recorded {when} was deleted by retention"
+        return f"what was recorded {when} was deleted"
     return f"nothing was recorded {when}"
 
 

@@ -387,7 +387,7 @@ def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     if not deleted:
         return "nothing was recorded"
     whole = unix_from_ns(until - begin)
-    return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted by retention"
+    return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
 def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None) -> Iterator[Event]:

@@ -78,24 +78,24 @@ def test_a_gap_that_retention_made_is_named_so_by_every_tool(bag_dir: Path) -> N
     window = {"start": T0_S + 32, "end": T0_S + 57}
     told = ask(bag_dir, "get_topic_in_range", topic="/odom", **window)
     assert told["reason"] == "deleted"
-    assert "deleted by retention" in str(told)
+    assert "recorded, and deleted since" in str(told)
     path = ask(bag_dir, "trajectory_summary", start=T0_S + 15, end=T0_S + 120)
-    assert any("deleted by retention" in note for note in path["notes"])
+    assert any("recorded, and deleted since" in note for note in path["notes"])
     events = ask(bag_dir, "recap", start=T0_S + 15, end=T0_S + 120)["events"]
-    told = "nothing is here: 30.0 of 71.0 s were deleted by retention"
+    told = "nothing is here: 30.0 of 71.0 s were deleted"
     assert any(told in str(each) for each in events)
 
 
 def test_a_search_across_what_was_deleted_says_so(bag_dir: Path) -> None:
     told = ask(bag_dir, "find_last_match", **TRUE)
     assert told["timestamp"] is None
-    assert any("deleted by retention" in note for note in told["notes"])
+    assert any("recorded, and deleted since" in note for note in told["notes"])
     # The memory begins later than what was deleted before, which a search of all leaves out.
     (bag_dir / "moments").rename(bag_dir / ".moments")
     shutil.rmtree(bag_dir / A)
     assert ask(bag_dir, "find_last_match", **TRUE) is None
     early = ask(bag_dir, "get_topic_in_range", topic="/odom", start=T0_S + 31, end=T0_S + 40)
-    assert (early["reason"], "deleted by retention" in str(early)) == ("outside_range", True)
+    assert (early["reason"], "deleted since" in str(early)) == ("outside_range", True)
 
 
 def test_what_was_recorded_and_deleted_did_not_end_with_the_recorder(bag_dir: Path) -> None:

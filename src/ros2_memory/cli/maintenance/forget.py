@@ -28,9 +28,17 @@ from ros2_memory.bag_dir.layout import (
     other_form,
 )
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.metadata_yaml import take_out
+from ros2_memory.bag_dir.metadata_yaml import bare_name, take_out
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state_files import ERASING, FORGOTTEN, Erasure, Forgetting, ForgottenBag
+from ros2_memory.bag_dir.state_files import (
+    ERASING,
+    FORGOTTEN,
+    Erasure,
+    Forgetting,
+    ForgottenBag,
+    append_deleted,
+    deleted_of,
+)
 from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
 from ros2_memory.cli.options import (
     MB,
@@ -410,6 +418,7 @@ class _Forget:
                 start = min(min(bag.summary.start, bag.start) for bag in known)
                 stop = max(bag.end for bag in known) + 1
                 kept += self._request_of_lake([Forgetting(start, stop, bags=tuple(forgotten))])
+            self._note_deletions(bags, kept)
             deleted, freed = self._delete_files(bags, kept)
             open_recordings = {
                 self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings
@@ -428,6 +437,19 @@ class _Forget:
         self._stays(kept)
         for note in notes:
             print_line(note)
+
+    def _note_deletions(self, bags: Sequence[BagFile], kept: list[str]) -> None:
+        """Writes down what is about to be deleted, so that answers do not call it unrecorded."""
+        splits: dict[Path, list[tuple[str, Ns, Ns]]] = {}
+        for bag in bags:
+            named = bare_name(bag.path.name), bag.start, bag.end
+            splits.setdefault(bag.recording, []).append(named)
+        try:
+            append_deleted(
+                self._bag_dir, [deleted_of(self._name(path), of) for path, of in splits.items()]
+            )
+        except OSError as error:
+            kept.append(f"a note of what was deleted: {error.strerror or error}")
 
     def _delete_files(self, bags: Sequence[BagFile], kept: list[str]) -> tuple[list[BagFile], int]:
         """Deletes bags in every form; returns which, and their bytes; adds faults to `kept`."""
