@@ -10,9 +10,11 @@ import os
 import shutil
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
 from importlib.util import find_spec
 from itertools import filterfalse
+from pathlib import Path
 from typing import Final, TypeVar
 
 from rich.text import Text
@@ -26,7 +28,13 @@ from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warnin
 from ros2_memory.cli.listing.info import assumed_active
 from ros2_memory.cli.options import AsJson, Bags, open_memory
 from ros2_memory.cli.output import escape, print_line, spinner, stdout_console
-from ros2_memory.config import NullRecorderNode, Settings, files_in_use, unused_config
+from ros2_memory.config import (
+    NullRecorderNode,
+    Settings,
+    config_dir,
+    files_in_use,
+    unused_config,
+)
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
@@ -464,7 +472,7 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
 
 def check_topics(robot: Examined) -> Iterator[Finding]:
     """Checks that the topics of `topics.yaml` have been recorded lately."""
-    file, live = robot.settings.recording.topics_file, robot.live
+    file, live = _list_file(robot.settings), robot.live
     try:
         selection = load_topics(file)
     except EpisodicError as problem:
@@ -501,9 +509,19 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
             yield warning(f"{entry} is in {file}; {unseen}", do)
 
 
+def _list_file(settings: Settings) -> Path:
+    """Returns the list of topics that the recorder has: what `up` wrote, where none was chosen."""
+    listed = settings.recording.topics_file
+    written, shipped = settings.recording.bag_dir / listed.name, config_dir({}) / listed.name
+    with suppress(OSError):
+        if written.is_file() and listed.read_bytes() == shipped.read_bytes():
+            return written
+    return listed
+
+
 def _other_list(robot: Examined, selection: TopicSelection, live: Heartbeat) -> Finding | None:
     """Returns the finding on a running recorder whose list is not this one; else None."""
-    file = robot.settings.recording.topics_file
+    file = _list_file(robot.settings)
     added = sorted({*selection.listed} - {*live.listed})
     dropped = sorted({*live.listed} - {*selection.listed})
     if live.listed and (added or dropped):

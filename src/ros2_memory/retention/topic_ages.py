@@ -183,6 +183,8 @@ class TopicCutter:
             return True
         if self._waits_since_s is None:
             self._waits_since_s = now_s
+            reason = f"the machine is busy: waiting for a quiet minute, {PATIENCE_S:.0f} s at most"
+            _log.info("topics_wait", reason=reason)
         return now_s - self._waits_since_s >= PATIENCE_S
 
     def _counts_of(self, recording: Path) -> _Counts:

@@ -187,9 +187,11 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
     now_s = [0.0]
     cutter = cutter_of(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
     bag, keeper = bag_dir / "rec_A" / "rec_A_0.mcap", house(bag_dir, cutter)
-    for now_s[0] in (0.0, PATIENCE_S - 1):
-        keeper.apply()
-        assert counts_of(bag)["/speech"] == 10
+    with capture_logs() as logs:
+        for now_s[0] in (0.0, PATIENCE_S - 1):
+            keeper.apply()
+            assert counts_of(bag)["/speech"] == 10
+    assert [log["event"] for log in logs].count("topics_wait") == 1
     now_s[0] = PATIENCE_S
     keeper.apply()
     assert "/speech" not in counts_of(bag)
