@@ -462,6 +462,8 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     It names topics there that carry what these do (poses, velocities). In a folder with the bags of
     several robots, the nearest message of a topic may be another robot's.
     """
+    if _have_expired(view, topics, window):
+        return []
     timeline, whole = view.snapshot.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}
     held: set[str] = set()

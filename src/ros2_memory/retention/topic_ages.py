@@ -25,7 +25,6 @@ from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, METADATA_FILE
 from ros2_memory.bag_dir.metadata_yaml import bare_name, recounted
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, read_receipts
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import ms_from_ns
 from ros2_memory.retention.disk import free_bytes
@@ -73,11 +72,14 @@ def plan_cuts(
     snapshot: Snapshot,
     static_topics: Collection[str],
 ) -> list[TopicCut]:
-    """Returns which topics are too old in which bags, the oldest bag first."""
+    """Returns which topics are too old in which bags, the oldest bag first.
+
+    Whether a bag holds them is not looked at: what counts in another recording goes, too, and no
+    index shows it.
+    """
     timeline = snapshot.timeline
     saved = {file.inode for file in stock.saved}
     alone = {bag.path for bag in stock.bags if saved.isdisjoint(file.inode for file in bag.files)}
-    bags: dict[str, BagFile] = {}
     going: defaultdict[str, set[str]] = defaultdict(set)
     for topic_age in topic_ages:
         topics = [
@@ -85,16 +87,14 @@ def plan_cuts(
             for topic in match_topics(timeline.topics(), topic_age.topics)
             if topic not in static_topics and not timeline.is_transient_state(topic)
         ]
-        if not topics:
-            continue
-        old = alone & older_than(topic_age.max_age_ns, stock, limits)
-        for topic in topics:
-            for extent in timeline.extents(topic, TimeWindow.everything()):
-                if extent.bag.file in old and extent.bag.path.suffix == ".mcap":
-                    bags[extent.bag.file] = extent.bag
-                    going[extent.bag.file].add(topic)
-    cuts = [TopicCut(bag, frozenset(going[path])) for path, bag in bags.items()]
-    return sorted(cuts, key=lambda cut: (cut.bag.start, cut.bag.file))
+        old = older_than(topic_age.max_age_ns, stock, limits) if topics else ()
+        for path in alone.intersection(old):
+            going[path].update(topics)
+    return [
+        TopicCut(bag, frozenset(going[bag.file]))
+        for bag in snapshot.bags
+        if bag.file in going and bag.path.suffix == ".mcap"
+    ]
 
 
 class TopicCutter:
@@ -131,7 +131,7 @@ class TopicCutter:
         self._is_quiet = is_quiet
         self._measure_free = measure_free
         self._monotonic = monotonic
-        self._failed: set[tuple[str, Ns]] = set()
+        self._done: dict[str, tuple[Ns, frozenset[str]]] = {}
         self._known: _Counts | None = None
         self._waits_since_s: float | None = None
 
@@ -144,10 +144,13 @@ class TopicCutter:
         stays as it is until it changes.
 
         Raises:
-            OSError: the free space cannot be measured, or the receipts of `ship` not be read.
+            OSError: the free space cannot be measured, or a folder or the receipts of `ship` not be
+                read.
         """
         cuts = plan_cuts(self._topic_ages, stock, limits, snapshot, self._static_topics)
-        waiting = [cut for cut in cuts if (cut.bag.file, cut.bag.mtime_ns) not in self._failed]
+        done = self._done
+        waiting = [cut for cut in cuts if done.get(cut.bag.file) != (cut.bag.mtime_ns, cut.topics)]
+        self._done = {cut.bag.file: done[cut.bag.file] for cut in cuts if cut.bag.file in done}
         if not waiting or (self._bag_dir / ERASING_FILE).exists() or not self._may_begin():
             return 0
         begun = time.perf_counter_ns()
@@ -155,21 +158,26 @@ class TopicCutter:
         receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            counts: _Counts | None = None
+            before, counts = bags, self._counts_of(recording)
             for cut in of_recording:
                 free = self._measure_free(self._bag_dir)
                 if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
                     break
+                if cut.topics.isdisjoint(counts.left.get(bare_name(cut.bag.path.name), ())):
+                    self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
+                    continue
                 try:
-                    counts = counts or self._counts_of(recording)
                     gone += self._cut(cut, counts, receipts)
                     bags += 1
                 except (EpisodicError, OSError) as error:
-                    self._failed.add((cut.bag.file, cut.bag.mtime_ns))
+                    self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
                     _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
-            if counts is not None:
+            if bags > before:
                 _correct_metadata(counts)
-                self._known = replace(counts, changed=recording.stat().st_mtime_ns)
+                counts = replace(counts, changed=recording.stat().st_mtime_ns)
+            self._known = counts
+            if self._monotonic() >= until_s:
+                break
         if bags:
             ms = round(ms_from_ns(time.perf_counter_ns() - begun), 3)
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)

@@ -12,6 +12,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses, unshipped
@@ -150,6 +151,18 @@ def test_losses_of_one_stretch_are_one(bag_dir: Path) -> None:
     assert found == [(T0 + hour * HOUR, 10, "expired") for hour in range(3)]
 
 
+def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
+    bag = split(bag_dir, 2, first=5 * S + 1)
+    until = T0 + 2 * HOUR + 5 * S
+    hidden = Overlap(None, None, (bag.name,))
+    write_handover(bag.parent, Handover(next="rec_B", counts_until=until, end=hidden))
+    counting = {one.topic for one in BagDirReader(McapReader()).summarize(bag).topics}
+    assert "/speech" in counts_of(bag).keys() - counting
+    house(bag_dir, cutter_of(bag_dir)).apply()
+    assert "/speech" not in counts_of(bag)
+    assert counts_of(bag)["/odom"] == 100
+
+
 def test_a_bag_may_lose_one_topic_after_another(bag_dir: Path) -> None:
     (bag_dir / "rec_A" / "rec_A_1.mcap").unlink()
     for topic_ages in (SPEECH, (*SPEECH, TopicAge("/bumper", 25 * HOUR))):
@@ -210,7 +223,7 @@ def test_nothing_is_cut_by_a_clock_that_may_be_wrong(bag_dir: Path) -> None:
 
 
 def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
-    ticks = iter([0.0, 0.0, 0.5, 1.5])
+    ticks = iter([0.0, 0.0, 0.5, 1.5, 1.5])
     house(bag_dir, cutter_of(bag_dir, monotonic=lambda: next(ticks))).apply()
     left = [counts_of(bag_dir / "rec_A" / f"rec_A_{hour}.mcap") for hour in (0, 1)]
     assert ["/speech" in counts for counts in left] == [False, True]
