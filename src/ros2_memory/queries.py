@@ -37,6 +37,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.history.context import READING_S
+from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
@@ -156,7 +157,7 @@ def topic_range(
     """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
-    total, picked = view.pick(name, window, max_samples)
+    total, picked = pick(view, name, window, max_samples)
     chosen = _each_shown(view, picked, fields)
     if not chosen:
         raise no_data_between(view, (name,), window)

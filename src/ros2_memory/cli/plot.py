@@ -27,6 +27,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.driven_path import robot_body
 from ros2_memory.history.no_data import (
@@ -403,7 +404,7 @@ def signals_of(
         NoDataError: there is no message in this time, or none can be decoded.
     """
     view, extractor = asked.view, asked.memory.extractor
-    total, picked = view.pick(topic, asked.window, _MOST_SAMPLES)
+    total, picked = pick(view, topic, asked.window, _MOST_SAMPLES)
     messages = [(stored, view.bags.decode(stored)) for stored in picked]
     readable = [(stored, message) for stored, message in messages if message is not None]
     if not readable:

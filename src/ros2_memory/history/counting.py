@@ -1,4 +1,4 @@
-"""How many messages of a topic there are in pieces of a window, each counted once.
+"""How many messages of a topic there are in pieces of a window, each counted once; some of them.
 
 The index knows that of every bag in which no piece ends, where no other recording may hold copies.
 Of the rest the times of messages are looked at, and where recordings overlap those that count.
@@ -6,20 +6,25 @@ Of the rest the times of messages are looked at, and where recordings overlap th
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.scan import holding_copies, scan
+from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import NDArray
 
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import TopicColumn
     from ros2_memory.storage.base import IntArray
@@ -103,3 +108,43 @@ def _overlap(firsts: IntArray, lasts: IntArray, spans: Spans) -> NDArray[np.bool
 
 def _one_by_one(times: IntArray, edges: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     return np.searchsorted(edges, times, side="right"), np.ones_like(times), times, times
+
+
+def pick(
+    view: View, topic: str, window: TimeWindow, at_most: int
+) -> tuple[int, Iterator[StoredMessage]]:
+    """Returns how many messages of a topic a window holds, and `at_most` of them, evenly spaced.
+
+    The first and the last are always among them. Each is read when it is its turn.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    begins = [each.bounds(topic)[0] for each in view.snapshot.timeline.segments_in(window)]
+    edges = np.unique(np.concatenate([np.empty(0, np.int64), *begins]))
+    counts = count_messages(view, topic, window, edges).messages
+    ends = np.cumsum(counts)
+    chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
+
+    def read() -> Iterator[StoredMessage]:
+        pieces = np.searchsorted(ends, chosen, side="right")
+        bounds = [MIN_NS, *edges.tolist(), MAX_NS]
+        for piece in np.unique(pieces).tolist():
+            part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
+            nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
+            yield from _at_positions(view, topic, part, nth.tolist())
+
+    return int(ends[-1]), read()
+
+
+def _at_positions(
+    view: View, topic: str, window: TimeWindow, positions: Sequence[int]
+) -> Iterator[StoredMessage]:
+    """Yields the messages at some positions, which ascend, among all in a window."""
+    rows = scan(view, topic, window, columns=False)
+    times = np.sort(np.concatenate([np.empty(0, np.int64), *(each.times for each in rows)]))
+    there = [nth for nth in positions if nth < times.size]  # fewer, where a bag was deleted since
+    for time, equal in groupby(there, key=lambda nth: int(times[nth])):
+        numbers = {nth - int(np.searchsorted(times, time)) for nth in equal}
+        at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
+        yield from (found for nth, found in enumerate(at_once) if nth in numbers)

@@ -7,13 +7,9 @@ Unix seconds or of a duration. "Ago" counts from the wall clock or, for replayed
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Final
-
-import numpy as np
 
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
@@ -29,22 +25,17 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
 from ros2_memory.history.scan import copies, scan
-from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from ros2_memory.history.bag_groups import Group
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.sessions import Sessions
-    from ros2_memory.storage.base import IntArray
 
 
 _CENSUSES: Final[Key[dict[str, dict[str, Census]]]] = Key()
@@ -108,79 +99,6 @@ class View:
         touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
         return without_steps(self, touched) if touched else touched
 
-    def pick(
-        self, topic: str, window: TimeWindow, at_most: int
-    ) -> tuple[int, Iterator[StoredMessage]]:
-        """Returns how many messages the window holds, and `at_most` of them, evenly spaced.
-
-        The first and the last are always among them. Reads payloads of the chosen ones only,
-        except where recordings overlap or latched messages may have been received again; each when
-        it is its turn.
-        """
-        groups = groups_of(self.stream, topic, window)
-        merged = {group: self._times_in(topic, group) for group in groups if group.has_duplicates}
-        sizes = [
-            merged[group].size if group in merged else self.count_in(topic, group)
-            for group in groups
-        ]
-        indices = evenly(sum(sizes), at_most)
-
-        def chosen() -> Iterator[StoredMessage]:
-            begin = 0
-            for group, size in zip(groups, sizes, strict=True):
-                inside = indices[bisect_left(indices, begin) : bisect_left(indices, begin + size)]
-                wanted = [index - begin for index in inside]
-                if group in merged:
-                    yield from self._fetch(topic, merged[group], wanted)
-                else:
-                    yield from group.fetch(wanted)
-                begin += size
-
-        return sum(sizes), chosen()
-
-    def _fetch(
-        self, topic: str, times: IntArray, indices: Sequence[int]
-    ) -> Iterator[StoredMessage]:
-        """Yields the messages at some indices (ascending) of all that have these times."""
-        for time, positions in groupby(indices, key=lambda index: int(times[index])):
-            numbers = {index - int(np.searchsorted(times, time)) for index in positions}
-            at_once = self.stream.messages([topic], TimeWindow(time, time + 1))
-            yield from (found for nth, found in enumerate(at_once) if nth in numbers)
-
-    def _times_in(self, topic: str, group: Group) -> IntArray:
-        """Returns the log times of the messages of a group, in order, each message once."""
-        files = {span.bag.file for span in group.bags}
-        part = group.window.intersect(TimeWindow(group.first, group.last + 1))
-        parts = [np.empty(0, np.int64)]
-        for rows in scan(self, topic, part, columns=False):
-            # Splits that follow each other in another group may share a time with this one.
-            parts += [rows.times[some] for bag, some in rows.bag_rows() if bag.file in files]
-        return np.sort(np.concatenate(parts))
-
-    def count_in(self, topic: str, group: Group) -> int:
-        """Returns how many messages of the window a group of the topic's bags holds."""
-        if group.has_duplicates:
-            return self._times_in(topic, group).size
-        if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
-            return group.count()
-        return _stated(topic, group.bags)
-
-    def apart(self, topic: str, group: Group) -> Sequence[Group]:
-        """Returns a group for each bag of one whose bags follow each other and hold no copy.
-
-        So recordings that begin when another ends are not read together; else the group itself.
-        """
-        bags = group.bags
-        if (
-            len(bags) == 1
-            or group.may_be_relatched
-            or not group.is_whole
-            or any(before.last >= after.first for before, after in pairwise(bags))
-            or self.count_in(topic, group) < _stated(topic, bags)
-        ):
-            return [group]
-        return [group.of(each) for each in bags]
-
     def census(self, topic: str) -> dict[str, Census]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
 
@@ -217,11 +135,6 @@ class View:
             if rows.table.channel.type == type_name:
                 newest = max(newest, rows.span[1])
         return newest
-
-
-def _stated(topic: str, bags: Sequence[BagSpan]) -> int:
-    """Returns how many messages of a topic bags hold, duplicates too."""
-    return sum(known.count for each in bags for known in each.bag.summary.of(topic))
 
 
 @dataclass(frozen=True, slots=True)

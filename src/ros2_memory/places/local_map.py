@@ -10,6 +10,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import empty_track, track_of
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.counting import pick
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -50,7 +51,7 @@ def local_frame(origin: Geodetic) -> str:
 
 def fixes_in(view: View, topic: str, window: TimeWindow) -> tuple[int, list[tuple[Ns, Geodetic]]]:
     """Returns how many messages a window holds, and the fixes among `MOST_FIXES` of them."""
-    total, messages = view.pick(topic, window, MOST_FIXES)
+    total, messages = pick(view, topic, window, MOST_FIXES)
     return total, [*_fixes(view, messages)]
 
 
