@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
+from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     SLICE_NS,
@@ -384,13 +385,11 @@ def newest_of_body(
     return None
 
 
-def poses_of_body(
-    view: View, window: TimeWindow, frame_id: str | None = None
-) -> list[tuple[Ns, Pose]]:
+def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     """Returns the poses of the robot's body by transforms, in order; none without such a body.
 
-    In the map or the root of its frames, or in `frame_id`. At most twenty a second: all are looked
-    up for each question.
+    In the map or the root of its frames. At most twenty a second: all are looked up for each
+    question.
 
     Raises:
         InvalidArgumentsError: there are too many bags for that.
@@ -406,9 +405,9 @@ def poses_of_body(
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions, parent = sessions_of(view), frame_id or body.parent
+    sessions, parent = sessions_of(view), body.parent
     for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
-        moving = moving_in(view, window, session)
+        moving = moving_in(view, window.widened(TF_CACHE_NS), session)
         frames = frames_of(view, static_transforms(view, session), moving, parent)
         own = [each for each in moving if each.child.lstrip("/") == body.child]
         own = [each for each in own if window.contains(each.log_time)]

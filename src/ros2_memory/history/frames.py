@@ -14,11 +14,11 @@ from ros2_memory.analysis.frames import (
     static_in,
 )
 from ros2_memory.columns.transforms import edges_in
-from ros2_memory.history.scan import decoded_rows, messages_of, scan
+from ros2_memory.history.scan import messages_of, of_columns, scan
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
 
     from ros2_memory.analysis.frames import Edges
     from ros2_memory.columns.units import Rows
@@ -26,23 +26,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
-
-
-def transform_rows(
-    view: View, topic: str, window: TimeWindow, among: Session
-) -> Iterator[tuple[Rows, Edges]]:
-    """Yields the transforms that a session received on a topic in a window, table by table.
-
-    In the order of the first log time of each table. A message that was received by several of its
-    recordings counts in each: a lookup takes no notice.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
-    sessions = sessions_of(view)
-    for rows in scan(view, topic, window, copies=True):
-        if sessions.holds_carried(rows.recording) or sessions.folder(rows.recording) in among:
-            yield rows, edges_of_rows(view, rows, among)
 
 
 def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
@@ -57,12 +40,10 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
         return _by_message(view, found)
     if sessions.folder(rows.recording) not in among:
         return {}
-    edges = edges_in(rows.table, rows.times, rows.index)
-    if edges is not None:
-        return edges
-    decoded = [edges_in(some.table, some.times, some.index) for some in decoded_rows(view, rows)]
-    known = [edges for edges in decoded if edges is not None]
-    if decoded and len(known) == len(decoded):
+    known = of_columns(view, rows, lambda each: edges_in(each.table, each.times, each.index))
+    if known is not None and len(known) == 1:
+        return known[0]
+    if known is not None:
         # As those of bags come in the order of their log times.
         return {
             pair: edge.rows(np.argsort(edge.log_times, kind="stable"))
@@ -83,9 +64,9 @@ def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> 
     limits = view.memory.limits
     around = window.widened(TF_CACHE_NS)
     moving = [
-        edges
+        edges_of_rows(view, rows, among)
         for topic in limits.tf_topics
-        for _, edges in transform_rows(view, topic, around, among)
+        for rows in scan(view, topic, around, copies=True)
     ]
     static = static_in(static_transforms(view, among), window)
     return Frames(static, joined_edges(moving), target, limits.tf_clock)

@@ -13,7 +13,6 @@ from ros2_memory.analysis.poses import Frames, Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
-from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
@@ -22,9 +21,9 @@ from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
     blocks,
-    decoded_rows,
     joined_back,
     messages_of,
+    of_columns,
     open_scan,
     scan,
 )
@@ -343,28 +342,15 @@ class PoseReader:
             InvalidArgumentsError: messages carry no position.
         """
         try:
-            found = self._columns.of(rows.table, rows.times, rows.index)
-            if found is None and isinstance(rows.table, StoredTable):
-                found = self._of_bags(rows)
+            found = of_columns(
+                self._view, rows, lambda each: self._columns.of(each.table, each.times, each.index)
+            )
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        return poses_of(self._decoded(rows)) if found is None else found
-
-    def _of_bags(self, rows: Rows) -> Poses | None:
-        """Returns the poses of a topic of which no columns are stored, as it is beyond its share.
-
-        None where the columns of its messages are not enough for them.
-        """
-        found: list[Poses] = []
-        for each in decoded_rows(self._view, rows):
-            poses = self._columns.of(each.table, each.times, each.index)
-            if poses is None:
-                return None
-            found.append(poses)
-        return joined_poses(found)
+        return poses_of(self._decoded(rows)) if found is None else joined_poses(found)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
         reader, extractor = self._view.memory.reader, self._view.memory.extractor

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
+V = TypeVar("V")
 
 
 def scan(
@@ -229,6 +230,19 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
             if table.channel.type == rows.table.channel.type and index.size:
                 unit = BagUnit(bag, table, nth)
                 yield Rows.of(unit, index)
+
+
+def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list[V] | None:
+    """Returns what is read of the columns of some rows: of those in the store, else in their bags.
+
+    A topic beyond its share has none in the store. None where only the messages have it.
+    """
+    found = read(rows)
+    if found is not None:
+        return [found]
+    every = [read(each) for each in decoded_rows(view, rows)]
+    known = [each for each in every if each is not None]
+    return known if every and len(known) == len(every) else None
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, FrameEdge, StampedTransform
+    from ros2_memory.core.model import FrameEdge, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -106,7 +106,7 @@ class Sessions:
         every = (by_folder.get(folder, {}) for folder in sorted(session))
         return {path: span for found in every for path, span in found.items()}
 
-    def _recordings_with(self, topics: tuple[str, ...]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
+    def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
         """Returns the recordings that hold some topics, by where they were recorded."""
         found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
         for topic in topics:
@@ -129,10 +129,6 @@ class Sessions:
     def has_all_kinds(self, session: Session) -> bool:
         """Whether a session holds moving and static transforms: then it borrows none."""
         return len(self._kinds(session)) == len(self._recorded.kinds)
-
-    def is_carried(self, bag: BagFile) -> bool:
-        """Whether a bag holds carried messages, which are of several sessions."""
-        return self.holds_carried(bag.recording)
 
     def holds_carried(self, recording: Path) -> bool:
         """Whether a recording is of carried messages."""
@@ -233,13 +229,12 @@ class Sessions:
         return self._recorded.joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
-        spans: dict[str, tuple[Ns, Ns]] = {}
-        for topic in topics:
-            for recording, (first, last) in self._view.snapshot.timeline.recordings(topic).items():
-                folder = self.folder(recording)
-                known = spans.get(folder, (first, last))
-                spans[folder] = min(first, known[0]), max(last, known[1])
-        return spans
+        """Returns the log times of the first and the last message of some topics, by folder."""
+        ends = {
+            folder: zip(*held.values(), strict=True)
+            for folder, held in self._recordings_with(topics).items()
+        }
+        return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
 
     def _find_recorded(self) -> _Recorded:
         limits, pose_topic = self._view.memory.limits, self._view.pose_topic

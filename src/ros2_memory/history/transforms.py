@@ -56,7 +56,7 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import decoded_rows, joined_back, messages_of, open_scan, scan
+from ros2_memory.history.scan import joined_back, messages_of, of_columns, open_scan, scan
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def _transform_in(
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
-        moving = list(_transforms(view, limits.tf_topics, window, among))
+        moving = moving_in(view, window, among)
         try:
             return look_up(moving)._replace(reach=half_width)
         except NoDataError as error:
@@ -208,9 +208,16 @@ def _transform_in(
 
 
 def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
-    """Returns the moving transforms of a session that a lookup at any moment of a window needs."""
-    topics = view.memory.limits.tf_topics
-    return list(_transforms(view, topics, window.widened(TF_CACHE_NS), among))
+    """Returns the moving transforms that a session received in a window, in log-time order."""
+    sessions, topics = sessions_of(view), _recorded(view, view.memory.limits.tf_topics)
+    bags = _bags_of(view, topics, window, among)
+    merged = view.stream.merged(bags, topics, window, newest_first=False)
+    return [
+        one
+        for found in view.bags.track_sources(merged)
+        if sessions.has(among, found)
+        for one in decoded_transforms(view, found)
+    ]
 
 
 def frames_of(
@@ -432,18 +439,11 @@ def _pairs_in(
 
 
 def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
-    """Returns the pairs in some rows: by their columns, by those of their bags, by their messages.
-
-    A topic beyond its share has none in the store.
-    """
-    pairs = pairs_in(rows.table, rows.index)
-    if pairs is not None:
-        return pairs
-    every = [pairs_in(decoded.table, decoded.index) for decoded in decoded_rows(view, rows)]
-    known = [each for each in every if each is not None]
-    if every and len(known) == len(every):
-        return frozenset[Pair]().union(*known)
-    return _pairs_of(view, messages_of(view, rows))
+    """Returns the pairs in some rows: by columns, else by their messages."""
+    known = of_columns(view, rows, lambda each: pairs_in(each.table, each.index))
+    if known is None:
+        return _pairs_of(view, messages_of(view, rows))
+    return frozenset[Pair]().union(*known)
 
 
 def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
@@ -585,41 +585,6 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
     known = set(view.snapshot.timeline.topics())
     return tuple(topic for topic in topics if topic in known)
-
-
-def _transforms(
-    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
-) -> Iterator[StampedTransform]:
-    """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
-    for each in _messages(view, topics, window, among):
-        yield from decoded_transforms(view, each)
-
-
-def _messages(
-    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
-) -> Iterator[StoredMessage]:
-    recorded = _recorded(view, topics)
-    if not recorded:
-        return iter(())
-    if among is None:
-        return view.stream.messages(recorded, window)
-    # A message that was relatched belongs to the recording that received it, too.
-    return _merged(view, recorded, _bags_of(view, recorded, window, among), window, among)
-
-
-def _merged(
-    view: View,
-    topics: Sequence[str],
-    bags: Sequence[BagSpan],
-    window: TimeWindow,
-    among: Session,
-) -> Iterator[StoredMessage]:
-    """Yields the messages of topics in some bags that are of a session."""
-    sessions = sessions_of(view)
-    merged = view.stream.merged(bags, topics, window, newest_first=False)
-    several = any(sessions.is_carried(span.bag) for span in bags)
-    tracked = view.bags.track_sources(merged)
-    return (each for each in tracked if not several or sessions.has(among, each))
 
 
 def _bags_of(
