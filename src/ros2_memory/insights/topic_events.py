@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.facts import State, Stated
     from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -61,22 +59,17 @@ def events_back(
     topic: str,
     window: TimeWindow,
     *,
-    may_match: Callable[[Table], bool | Mask] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[TopicEvents]:
     """Yields the events in times that do not overlap, the newest first.
 
-    Tables that cannot match need not show any. `reached` is called before each table, as by `scan`.
+    `reached` is called before each table, as by `scan`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     columns = StatedColumns(view.memory.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
-    if may_match is not None:
-        for together in blocks(opened.rows(newest_first=True), newest_first=True):
-            yield from _events(view, columns, together, may_match)
-        return
 
     def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
         rows = opened.rows(newest_first=True, among=stretch.window)
@@ -85,7 +78,8 @@ def events_back(
             is_whole = all(rows.part is not None for rows in together)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                for events in _events(view, columns, together):
+                events = _events(view, columns, together)
+                if events is not None:
                     yield first, events
 
     for _, events in joined_back(view, opened, EVENTS, make):
@@ -126,46 +120,28 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     return {topic: each for topic, each in events.items() if each is not None}
 
 
-def _events(
-    view: View,
-    columns: StatedColumns,
-    together: list[Rows],
-    may_match: Callable[[Table], bool | Mask] | None = None,
-) -> Iterator[TopicEvents]:
-    """Yields the events of tables that overlap in time; those of whole parts are remembered."""
-    first = together[0]
+def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents | None:
+    """Returns the events of tables that overlap in time; those of whole parts are remembered."""
     parts = tuple(rows.part for rows in together if rows.part is not None)
     known = view.memory.columns.fragments(EVENTS)
-    key = FragmentKey(first.first, "", parts) if len(parts) == len(together) else None
+    key = FragmentKey(together[0].first, "", parts) if len(parts) == len(together) else None
     events = None if key is None else known.get(key)
-    if events is None and len(together) == 1 and key and may_match and not may_match(first.table):
-        events = TopicEvents(*first.span)
-    if events is not None:
-        yield events
-        return
-    noted = view.notes.added
-    stated = [_stated(view, columns, rows, alone=len(together) == 1) for rows in together]
-    events = events_of(joined_stated(stated))
     if events is None:
-        return
-    if key is not None and view.notes.added == noted:
-        known.put(key, events)
-    yield events
+        noted = view.notes.added
+        events = events_of(joined_stated([_stated(view, columns, rows) for rows in together]))
+        if events is not None and key is not None and view.notes.added == noted:
+            known.put(key, events)
+    return events
 
 
-def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = False) -> Stated:
-    """Returns what the messages of some rows state: by their columns, else by reading them.
-
-    With `alone` no other messages lie between them: of those that state the same two are enough.
-    """
+def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:
+    """Returns what the messages of some rows state: by their columns, else by reading them."""
     found = columns.of(rows.table)
     if found is None:
         return _stated_by(view, messages_of(view, rows))
     stated, to_read = found.stated, found.to_read(rows.index)
     if rows.index is not None:
         stated = stated.at(rows.index)
-    if alone and not to_read.size and (settled := stated.unchanging(*rows.span)) is not None:
-        return settled
     stated = stated._replace(times=rows.times)
     if to_read.size:
         others = np.setdiff1d(np.arange(len(rows)), to_read)
