@@ -14,7 +14,7 @@ import numpy as np
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.history.scan import holding_copies, scan
+from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
         for rows in scan(view, topic, window, columns=False):
             counted.add(*_one_by_one(rows.times, edges))
         return counted
-    shared = holding_copies(view, topic, window)
+    shared = open_scan(view, topic, window).shared
     to_read: set[str] = set()
     spans: list[tuple[Ns, Ns]] = []
     for segment in view.snapshot.timeline.segments_in(window):

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -48,17 +47,22 @@ def scan(
     return map(noted, rows) if view.snapshot.timeline.thinned else rows
 
 
-class How(TypedDict, total=False):
+class Wanted(TypedDict, total=False):
+    """What of a topic a scan is of; each is as in `Asked`."""
+
+    shared: Sequence[tuple[Ns, Ns]]
+    may_match: Callable[[PartZones], bool | Mask]
+    may_not_match: bool
+    may_be_empty: bool
+    within: Sequence[tuple[Ns, Ns]]
+    stored: bool
+
+
+class How(Wanted, total=False):
     """What `open_scan` may be told."""
 
     columns: bool
     copies: bool
-    shared: Sequence[tuple[Ns, Ns]] | None
-    may_match: Callable[[PartZones], bool | Mask] | None
-    may_not_match: bool
-    may_be_empty: bool
-    within: Sequence[tuple[Ns, Ns]] | None
-    stored: bool
     reached: Callable[[Ns], None]
 
 
@@ -69,22 +73,15 @@ def open_scan(
     *,
     columns: bool = True,
     copies: bool = False,
-    shared: Sequence[tuple[Ns, Ns]] | None = None,
-    may_match: Callable[[PartZones], bool | Mask] | None = None,
-    may_not_match: bool = False,
-    may_be_empty: bool = False,
-    within: Sequence[tuple[Ns, Ns]] | None = None,
-    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
+    **wanted: Unpack[Wanted],
 ) -> Scan:
     """Returns the scan of a topic in a window.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
-    a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. With `stored` bags that are not stored have no
-    rows. `may_match`, `may_not_match`, `may_be_empty` and `within` are as in `Asked`.
+    a message counts in each recording that holds it.
     """
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
@@ -94,21 +91,10 @@ def open_scan(
         reached(at)
         view.bags.check_deadline()
 
-    if shared is None:
-        shared = () if copies else view.snapshot.timeline.shared_times
+    wanted.setdefault("shared", () if copies else view.snapshot.timeline.shared_times)
+    relatches = not copies and view.stream.may_be_relatched([topic])
     asked = Asked(
-        topic,
-        window,
-        view.snapshot.timeline,
-        decode,
-        shared=shared,
-        may_match=may_match,
-        may_not_match=may_not_match,
-        may_be_empty=may_be_empty,
-        within=within,
-        stored=stored,
-        relatches=not copies and view.stream.may_be_relatched([topic]),
-        check=check,
+        topic, window, view.snapshot.timeline, decode, relatches=relatches, check=check, **wanted
     )
     return Scan(view.memory.columns, asked)
 
@@ -163,16 +149,6 @@ def joined_back(
             yield stretch.window.start, one
 
 
-def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:
-    """Returns the half-open spans in which recordings may hold copies of a topic's messages.
-
-    As far as the times at which they were published are known.
-    """
-    timeline = view.snapshot.timeline
-    asked = Asked(topic, window, timeline, lambda *_: (), shared=timeline.shared_times)
-    return Scan(view.memory.columns, asked).shared
-
-
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
     """Yields the rows of a scan, those together that overlap in time: no other lies between.
 
@@ -195,29 +171,6 @@ def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows
 
 def _in_order(together: list[Rows]) -> list[Rows]:
     return sorted(together, key=lambda rows: rows.order) if len(together) > 1 else together
-
-
-def copies(view: View, topic: str) -> Iterator[Rows]:
-    """Yields the rows of a topic that do not count, as another recording has them, too.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
-    window = TimeWindow.everything()
-
-    def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, window, hashed=hashed, columns=False, around=True)
-
-    asked = Asked(
-        topic,
-        window,
-        view.snapshot.timeline,
-        decode,
-        shared=view.snapshot.timeline.shared_times,
-        relatches=view.stream.may_be_relatched([topic]),
-        check=lambda _: view.bags.check_deadline(),
-    )
-    return Scan(view.memory.columns, asked).copies()
 
 
 def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:

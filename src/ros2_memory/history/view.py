@@ -29,7 +29,7 @@ from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
-from ros2_memory.history.scan import copies, scan
+from ros2_memory.history.scan import open_scan, scan
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -119,7 +119,7 @@ class View:
             type_name: Census(*stated)
             for type_name, stated in self.snapshot.timeline.totals(topic).items()
         }
-        for rows in copies(self, topic):
+        for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
             type_name = rows.table.channel.type
             known = counted[type_name]
             last = known.last if rows.span[1] < known.last else self._last_of(topic, type_name)
