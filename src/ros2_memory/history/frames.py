@@ -14,6 +14,7 @@ from ros2_memory.analysis.frames import (
     static_in,
 )
 from ros2_memory.columns.transforms import edges_in
+from ros2_memory.core.arrays import rows_of
 from ros2_memory.history.scan import messages_of, of_columns, scan
 from ros2_memory.history.transforms import decoded_transforms, sessions_of, static_transforms
 
@@ -46,7 +47,7 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
     if known is not None:
         # As those of bags come in the order of their log times.
         return {
-            pair: edge.rows(np.argsort(edge.log_times, kind="stable"))
+            pair: rows_of(edge, np.argsort(edge.log_times, kind="stable"))
             for pair, edge in joined_edges(known).items()
         }
     return _by_message(view, messages_of(view, rows))

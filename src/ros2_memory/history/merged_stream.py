@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.duplicates import (
     BagSpan,
     Copy,
@@ -40,16 +40,10 @@ if TYPE_CHECKING:
 
 
 class MergedStream:
-    """Reads all bags of one call together.
-
-    Attributes:
-        originals_since: log time from which on bags were searched for originals of messages that
-            were received late; `MAX_NS` where there was none.
-    """
+    """Reads all bags of one call together."""
 
     def __init__(self, bags: BagAccess) -> None:
         self.bags = bags
-        self.originals_since: Ns = MAX_NS
         self._timeline = bags.snapshot.timeline
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
         self._searched: dict[str, Spans] = {}
@@ -178,7 +172,6 @@ class MergedStream:
         record = found.record
         if not record.may_be_relatched:
             return False
-        self.originals_since = min(self.originals_since, _since_published(found).start)
         self._find_first_copies(found)
         first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]

@@ -16,8 +16,8 @@ from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     Waypoint,
     drawn,
-    joined_lines,
 )
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
@@ -146,7 +146,7 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     """
     if not spans:
         return ()
-    inside = joined_lines([_part(line, span) for span in spans])
+    inside = stacked([_part(line, span) for span in spans])
     found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
     return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
 
@@ -157,4 +157,4 @@ def _part(line: Line, span: Inside) -> Line:
     ends = [span.start, span.stop] if span.stop > span.start else [span.start]
     first, last = line.at(np.array(ends[:1])), line.at(np.array(ends[1:], np.int64))
     begins = dataclasses.replace(first, jumps=np.array([True]))
-    return joined_lines([begins, line.rows(inner), last])
+    return stacked([begins, rows_of(line, inner), last])
