@@ -215,8 +215,7 @@ class BinnedWindow:
             return
         self._since = since
         self.counted = self.counted.intersect(TimeWindow(since, MAX_NS))
-        self.view.notes.complete = False
-        self.view.notes.add(
+        self.view.notes.add_lack(
             f"only what is after {unix_text(since)} is counted: "
             f"{self.view.bags.filling_progress() or 'out of time; '}"
             "ask about a shorter window"

@@ -191,8 +191,7 @@ def _note_limits(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:
         view.notes.add(f"{topic} changes too often to count all: {left_out} more")
     undecodable = sum(part.undecodable for part in parts)
     if undecodable:
-        view.notes.complete = False
-        view.notes.add(f"messages of {topic} that could not be decoded: {undecodable}")
+        view.notes.add_lack(f"messages of {topic} that could not be decoded: {undecodable}")
 
 
 def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueIntervals | None:

@@ -101,8 +101,7 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
 
 
 def _note_timeout(view: View) -> None:
-    view.notes.complete = False
-    view.notes.add(
+    view.notes.add_lack(
         "out of time before it was known whether the clock was set: durations are by the clock"
     )
 

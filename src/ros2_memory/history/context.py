@@ -407,6 +407,11 @@ class Notes:
         if known is None or known.until < note.until:
             self._notes[note.kind, note.file] = note
 
+    def add_lack(self, note: str | Note) -> None:
+        """Adds a note on what bears on the answer and could not be read."""
+        self.complete = False
+        self.add(note)
+
     @contextmanager
     def isolated(self) -> Iterator[None]:
         """Within the block, `complete` is about the block alone.

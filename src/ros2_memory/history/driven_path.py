@@ -115,8 +115,7 @@ def driven_path(
 def note_known_since(view: View, since: Ns | None) -> None:
     """Notes since when a path is known, where older bags were not read."""
     if since is not None:
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"the path is known back to {unix_text(since)}: out of time before older bags were read"
         )
 
@@ -253,8 +252,9 @@ def length_notes(path: Trajectory) -> Iterator[str]:
 
 def note_left_out(view: View, error: UndecodableError) -> None:
     """Notes that there are poses which cannot be decoded, and why."""
-    view.notes.complete = False
-    view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
+    view.notes.add_lack(
+        f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}"
+    )
 
 
 def pose_frame(view: View, topic: str) -> str:

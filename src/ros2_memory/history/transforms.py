@@ -607,6 +607,5 @@ def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransfo
             message = view.memory.reader.decode(found.record)
             return view.memory.extractor.transforms(message, found.time, static=is_static)
         except UndecodableError as error:
-            view.notes.complete = False
-            view.notes.add(Note(_UNDECODED, error.topic, error.reason))
+            view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
             return ()

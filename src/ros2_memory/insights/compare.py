@@ -15,7 +15,7 @@ from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
-from ros2_memory.history.driven_path import length_notes, pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import length_notes, resolve_path_topic
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
@@ -163,7 +163,7 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
 def _placement(view: View) -> MapPlacement | None:
     try:
         topic = resolve_path_topic(view)
-        return map_placement(view, pose_frame(view, topic), topic)
+        return map_placement(view, topic)
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None
 

@@ -108,8 +108,7 @@ def find_episodes(
         if not kept:
             raise out_of_time(view, values.reached) from error
         since = values.reached
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"the search ran out of time at {unix_text(since)}: to continue, pass that time as end"
         )
     if not kept:
@@ -199,8 +198,7 @@ class SaidMeanwhile:
                 return tuple(spell_of(each) for each in held if not each.is_blank)
             except QueryTimeoutError as error:
                 self._is_over = True
-                self._view.notes.complete = False
-                self._view.notes.add(
+                self._view.notes.add_lack(
                     f"{error} before what {self._topic} said was read for all of them: ask for "
                     "fewer, or in a shorter window"
                 )
@@ -235,8 +233,7 @@ def topic_changes(
         held = values.known[::-1]
         if not held:
             raise
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"{error}: only what is after {unix_text(values.reached)} is listed; to see the "
             "rest, ask again with that as end"
         )

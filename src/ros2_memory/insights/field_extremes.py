@@ -52,8 +52,7 @@ def extremes_of(
         view.notes.add(TOO_MANY)
         return ()
     if found.since is not None:
-        view.notes.complete = False
-        view.notes.add(f"out of time: extremes are of what is after {unix_text(found.since)}")
+        view.notes.add_lack(f"out of time: extremes are of what is after {unix_text(found.since)}")
     extremes = []
     for nth, field in enumerate(names):
         least, most = (found.extreme(nth, [0], sign) for sign in (LEAST, GREATEST))

@@ -12,7 +12,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import RobotTracks
@@ -55,8 +55,7 @@ def farthest_from(
         raise InvalidArgumentsError(f"{_ARGUMENT} has several places; give one, or x and y")
     if topic != (known := resolve_path_topic(view)):
         raise InvalidArgumentsError(f"{_ARGUMENT} is measured along {known}: leave out topic")
-    own = pose_frame(view, topic)
-    frame = map_placement(view, own, topic, place.frame_id or frame_id).frame_id
+    frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
     min_x, max_x, min_y, max_y = place.region.bounds
     x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
     if not spans:

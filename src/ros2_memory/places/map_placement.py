@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
+from ros2_memory.history.driven_path import pose_frame
 from ros2_memory.history.transforms import connected, connects, sessions_of
 
 if TYPE_CHECKING:
@@ -37,21 +38,20 @@ class MapPlacement:
         return tuple(dict.fromkeys((self.frame_id, self.pose_frame)))
 
 
-def map_placement(
-    view: View, pose_frame: str, topic: str, frame_id: str | None = None
-) -> MapPlacement:
-    """Returns how the poses of a topic in this frame are placed; in `frame_id` where one is given.
+def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPlacement:
+    """Returns how the poses of a topic are placed; in `frame_id` where one is given.
 
     Raises:
-        InvalidArgumentsError: places are in another frame than `frame_id`.
+        InvalidArgumentsError: places are in another frame than `frame_id`, or it is of no poses.
         QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
+        UndecodableError: no pose can be decoded.
     """
-    map_frame = view.memory.limits.map_frame
-    own = MapPlacement(pose_frame, pose_frame, pose_frame == map_frame)
+    frame = pose_frame(view, topic)
+    own = MapPlacement(frame, frame, frame == view.memory.limits.map_frame)
     asked_for = frame_id is not None
-    placement = own if frame_id == pose_frame else _map_or_own(view, topic, own, asked_for)
+    placement = own if frame_id == frame else _map_or_own(view, topic, own, asked_for)
     if frame_id not in (None, placement.frame_id):
-        known = " or ".join(dict.fromkeys((placement.frame_id, pose_frame)))
+        known = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)}; places are in {known}; "
             "get_transform_at converts from other frames"

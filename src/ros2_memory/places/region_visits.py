@@ -23,7 +23,7 @@ from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit
@@ -79,8 +79,7 @@ def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     """Returns what `track_in` does, and since when it is known."""
     joined = RobotTracks(view, frame_id).over(window)
     if joined.since is not None:
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"visits are known back to {unix_text(joined.since)}: out of time before older "
             "poses were placed"
         )
@@ -99,7 +98,7 @@ def make_tracks(view: View, window: TimeWindow) -> None:
     """Makes what the parts in a window say of where the robot was in the frames of places."""
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_path_topic(view)
-        for frame in map_placement(view, pose_frame(view, topic), topic).frames:
+        for frame in map_placement(view, topic).frames:
             RobotTracks(view, frame).make(window)
 
 

@@ -19,7 +19,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.regions import places_at
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.map_placement import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks
 
@@ -86,9 +86,8 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
     """
     try:
         topic = resolve_path_topic(view)
-        own = pose_frame(view, topic)
+        usual = map_placement(view, topic)
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None
-    usual = map_placement(view, own, topic).frame_id
-    asked = usual if frame_id is None else map_placement(view, own, topic, frame_id).frame_id
-    return RobotPlaces(view, window, asked, own, usual)
+    asked = usual if frame_id is None else map_placement(view, topic, frame_id)
+    return RobotPlaces(view, window, asked.frame_id, usual.pose_frame, usual.frame_id)

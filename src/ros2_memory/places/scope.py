@@ -14,7 +14,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.held_values import holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
@@ -121,7 +121,7 @@ def times_in_region(view: View, where: Where, window: TimeWindow) -> Sequence[In
 def _in_region(view: View, where: Where, window: TimeWindow) -> tuple[RobotTrack, Sequence[Inside]]:
     """Returns the robot's track, and when it was in a region."""
     topic = resolve_path_topic(view)
-    placement = map_placement(view, pose_frame(view, topic), topic, where.frame_id)
+    placement = map_placement(view, topic, where.frame_id)
     track = track_in(view, where.frame_id or placement.frame_id, window)
     found = robot_inside(track, where.region, window)
     if not found:

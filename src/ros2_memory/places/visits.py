@@ -25,7 +25,6 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import (
     driven_path,
-    pose_frame,
     resolve_path_topic,
 )
 from ros2_memory.history.no_data import require_recorded
@@ -92,8 +91,7 @@ def visits(
     mixed = note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
-    own_frame = pose_frame(view, topic)
-    placement = map_placement(view, own_frame, topic, asked)
+    placement = map_placement(view, topic, asked)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
         placed = places_in(view, memory.limits.places, placement, window)
@@ -121,7 +119,9 @@ def visits(
     if not placement.is_map:
         known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
     if not found.all and asked is None:
-        note_other_frame(view, place, placement, window, f'ask with frame_id "{own_frame}"')
+        note_other_frame(
+            view, place, placement, window, f'ask with frame_id "{placement.pose_frame}"'
+        )
     _note_doubts(view, known, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
@@ -266,7 +266,6 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     except (InvalidArgumentsError, NoDataError):
         return ()  # poses that cannot be read say nothing about resets
     except QueryTimeoutError:
-        view.notes.complete = False
-        view.notes.add("there was no time to check whether odometry restarted since")
+        view.notes.add_lack("there was no time to check whether odometry restarted since")
         return ()
     return () if path is None else path.trajectory.totals.resets
