@@ -203,9 +203,9 @@ def _position_in(
     view: View, found: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
 ) -> results.Position:
     """Returns the pose in a message, as that of a moment; see `position`."""
-    memory, name = view.memory, found.record.channel.topic
+    memory, name = view.memory, found.topic
     _note_held(view, found, at)
-    message, type_name = decode(view, found), found.record.channel.type
+    message, type_name = decode(view, found), found.type
     pose, geodetic = memory.extractor.pose(message, type_name), None
     if pose is None:
         geodetic = memory.extractor.geodetic(message, type_name)
@@ -234,11 +234,11 @@ def _position_in(
 def _note_reach(view: View, found: StoredMessage, pose: Pose) -> None:
     """Notes between which coordinates the robot was, in a second of which one pose stayed."""
     window = TimeWindow(found.time + 1, found.time + 2 * NS_PER_S)
-    newer = view.stream.first([found.record.channel.topic], window)
+    newer = view.stream.first([found.topic], window)
     message = None if newer is None else view.bags.decode(newer)
     if newer is None or message is None:
         return
-    after = view.memory.extractor.pose(message, newer.record.channel.type)
+    after = view.extractor.pose(message, newer.type)
     if after is not None and math.dist(after.position, pose.position) > _REACH_M:
         spans = zip("xy", pose.position[:2], after.position[:2], strict=True)
         ends = [f"{axis} {min(span):.2f} to {max(span):.2f}" for axis, *span in spans]
@@ -260,7 +260,7 @@ def _position_of_body(
     Raises:
         NoDataError: none places it at the moment that is asked, or within the tolerance before.
     """
-    limits, extractor = view.memory.limits, view.memory.extractor
+    limits, extractor = view.limits, view.extractor
     window, tolerance = _within(view, *asked)
     of_body = newest_of_body(view, body, window, frame_id)
     if of_body is None:
@@ -274,8 +274,8 @@ def _position_of_body(
     near = TimeWindow.around(found.time, ns_from_unix(limits.time_tolerance_s))
     fix = view.stream.newest(fixes[0], near) if len(fixes) == 1 else None
     if fix is not None and (message := view.bags.decode(fix)) is not None:
-        geodetic = extractor.geodetic(message, fix.record.channel.type)
-    topic, notes = found.record.channel.topic, view.notes.sentences()
+        geodetic = extractor.geodetic(message, fix.type)
+    topic, notes = found.topic, view.notes.sentences()
     return results.Position(topic, found.time, pose, _age(found, now), geodetic, notes=notes)
 
 
@@ -307,7 +307,7 @@ def velocity(
     _require_kind(view, name, "velocity")
     found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     _note_held(view, found, at)
-    twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
+    twist = memory.extractor.twist(decode(view, found), found.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", found))
     return results.Velocity(name, found.time, twist, _age(found, now), notes=view.notes.sentences())
@@ -451,7 +451,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
         require_bags(view)
     notes = _notes_by_topic(view.snapshot)
     rows = []
-    for topic in view.snapshot.timeline.topics():
+    for topic in view.timeline.topics():
         reasons = undecodable_types(view, topic)
         for type_name, census in sorted(view.census(topic).items()):
             rows.append(
@@ -583,7 +583,7 @@ def _with_few_waypoints(path: Trajectory, at_most: int) -> Trajectory:
 
 def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
     """Returns what a search went through to reach its match, as far as there can be messages."""
-    stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
+    stop = until if view.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
 
 
@@ -664,7 +664,7 @@ def _found_at(
     Raises:
         NoDataError: there is none within the tolerance.
     """
-    limits = view.memory.limits
+    limits = view.limits
     window, tolerance = _within(view, at, tolerance_s, rest_s)
     found = view.stream.newest(topic, window)
     if found is None and tolerance_s is None and is_pose:
@@ -690,7 +690,7 @@ def _within(
     view: View, at: Ns, tolerance_s: float | None, rest_s: float
 ) -> tuple[TimeWindow, Ns | None]:
     """Returns when a message is near enough before a moment, and the tolerance; None for any."""
-    limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
+    limit = view.limits.time_tolerance_s if tolerance_s is None else tolerance_s
     tolerance: Ns | None = ns_argument("tolerance_s", limit)
     start = at - (tolerance or 0) - START_SLACK_NS
     if start <= MIN_NS:
@@ -705,7 +705,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
     Raises:
         InvalidArgumentsError: none of its types carries the `what` that is asked for, or another.
     """
-    extractor, types = view.memory.extractor, view.snapshot.timeline.types_of(topic)
+    extractor, types = view.extractor, view.timeline.types_of(topic)
     if any(
         not extractor.is_mapped(each) or extractor.kinds_of(each) & {what, *or_else}
         for each in types
@@ -720,7 +720,7 @@ def _held(
     view: View, value: results.TopicValue, found: StoredMessage, at: Ns
 ) -> results.TopicValue:
     """Returns a value with whether it is latched, and then how old it is."""
-    if not view.memory.limits.latching.holds(view.snapshot, found):
+    if not view.limits.latching.holds(view.snapshot, found):
         return value
     age = max(at - found.time, 0) if value.age is None else value.age
     return replace(value, latched=True, age=age)
@@ -728,8 +728,8 @@ def _held(
 
 def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
-    if view.memory.limits.latching.holds(view.snapshot, found):
-        topic = found.record.channel.topic
+    if view.limits.latching.holds(view.snapshot, found):
+        topic = found.topic
         view.notes.add(
             f"{topic} is latched: its value of {seconds(max(at - found.time, 0))} before is still "
             "valid"
@@ -744,7 +744,7 @@ def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extra
 def _decoded(view: View, found: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
     with view.call.stages.timed("extract"):
         message = decode(view, found)
-        return message, view.memory.extractor.shown(message, found.record.channel.type, fields)
+        return message, view.extractor.shown(message, found.type, fields)
 
 
 def _value(
@@ -758,7 +758,7 @@ def _value(
         channel.type,
         Sample(found.time, shown.value),
         _age(found, now),
-        frame_id=view.memory.extractor.frame(message),
+        frame_id=view.extractor.frame(message),
         notes=(*view.notes.sentences(), *shown.notes),
     )
 
@@ -776,7 +776,7 @@ def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[st
     """Returns messages as a reply shows them. None is in memory when the next one is read."""
     found: list[_Shown] = []
     for each in picked:
-        type_name = each.record.channel.type
+        type_name = each.type
         try:
             found.append(_Shown(each.time, type_name, _extracted(view, each, fields)))
         except NoDataError as error:

@@ -47,13 +47,13 @@ class CandidateRows:
         self.condition = condition
         self.ruled_out = False
         self.has_looked = False
-        newest = max((part.latest for part in view.snapshot.timeline.segments), default=MIN_NS)
+        newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
         self._ready: list[tuple[Ns, int]] = []
         self._view = view
         self._topics = topics
         self._until = until
-        self._test = ColumnCondition(condition, view.memory.extractor)
+        self._test = ColumnCondition(condition, view.extractor)
 
     def windows(self) -> Iterator[Candidate]:
         """Yields the times at which a match can lie, newest first; they do not overlap."""

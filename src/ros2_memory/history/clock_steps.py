@@ -174,8 +174,8 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
 def _step_in(view: View, pause: Pause) -> ClockStep | None:
     """Returns the step that a pause is, which is looked at once if its bags are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
-    bags = view.snapshot.timeline.overlapping(around)
-    topic = view.pose_topic if view.pose_topic in view.snapshot.timeline.topics() else None
+    bags = view.timeline.overlapping(around)
+    topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
     key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
@@ -197,7 +197,7 @@ def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep 
         return step
     before = TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)
     after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
-    bags = [view.snapshot.timeline.overlapping(window) for window in (before, after)]
+    bags = [view.timeline.overlapping(window) for window in (before, after)]
     # A recording that ended before the hole tells nothing about one that began after it.
     through = set.intersection(*({bag.recording for bag in each} for each in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
@@ -208,7 +208,7 @@ def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
     """Returns the step that a hole is by the header stamps of topics on both sides of it."""
     around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
-    for bag in view.snapshot.timeline.overlapping(around):
+    for bag in view.timeline.overlapping(around):
         counts.update({known.topic: known.count for known in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):

@@ -67,7 +67,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
     shared = open_scan(view, topic, window).shared
     to_read: set[str] = set()
     spans: list[tuple[Ns, Ns]] = []
-    for segment in view.snapshot.timeline.segments_in(window):
+    for segment in view.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:
             continue
@@ -120,7 +120,7 @@ def pick(
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    begins = [each.bounds(topic)[0] for each in view.snapshot.timeline.segments_in(window)]
+    begins = [each.bounds(topic)[0] for each in view.timeline.segments_in(window)]
     edges = np.unique(np.concatenate([np.empty(0, np.int64), *begins]))
     counts = count_messages(view, topic, window, edges).messages
     ends = np.cumsum(counts)

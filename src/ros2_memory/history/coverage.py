@@ -88,7 +88,7 @@ def note_unread(
     absent = _absent(view) if nothing or search else ()
     odd = [
         bag
-        for bag in view.snapshot.timeline.faulty(window)
+        for bag in view.timeline.faulty(window)
         # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
@@ -97,7 +97,7 @@ def note_unread(
     if nothing or search:
         for sentence in describe_thinned(view.snapshot, window):
             view.notes.add(sentence)
-    bag_dir = view.memory.index.bag_dir
+    bag_dir = view.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
         for sentence in (
             *describe_deleted(view.snapshot, bag_dir, window),
@@ -152,7 +152,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
 
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
-    bag_dir, touched = view.memory.index.bag_dir, view.gaps(window)
+    bag_dir, touched = view.bag_dir, view.gaps(window)
     if not touched:
         return
     known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
@@ -219,7 +219,7 @@ def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Span
 
 def deleted_length(view: View, window: TimeWindow) -> Ns:
     """Returns for how long something was recorded in a window that retention deleted since."""
-    parts = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    parts = deleted_between(view.snapshot, view.bag_dir, window)
     return sum(stop - start for start, stop in parts)
 
 
@@ -292,10 +292,10 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    whole = all(map(is_whole, view.snapshot.timeline.faulty(window)))
-    excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
-    forgotten = any(was_forgotten(view.memory.index.bag_dir, each, window) for each in topics)
-    forgotten |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
+    whole = all(map(is_whole, view.timeline.faulty(window)))
+    excluded = excluded_between(view.bag_dir, window.start, window.stop)
+    forgotten = any(was_forgotten(view.bag_dir, each, window) for each in topics)
+    forgotten |= bool(deleted_between(view.snapshot, view.bag_dir, window))
     forgotten |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not forgotten:
         return ()

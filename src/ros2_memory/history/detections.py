@@ -66,7 +66,7 @@ class DetectionRows:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._columns = DetectionColumns(view.memory.extractor)
+        self._columns = DetectionColumns(view.extractor)
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns in which parts some message may hold a detection, by their zones."""
@@ -92,7 +92,7 @@ class DetectionRows:
 
     def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
         """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
-        extractor = self._view.memory.extractor
+        extractor = self._view.extractor
         try:
             message = self._view.memory.reader.decode(found.record)
         except UndecodableError:
@@ -101,7 +101,7 @@ class DetectionRows:
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
         detections = [
             one if one.frame_id else one._replace(frame_id=frame)
-            for one in detections_of(extractor.exact(message, found.record.channel.type))
+            for one in detections_of(extractor.exact(message, found.type))
         ]
         return [(found.time, found.time if stamp is None else stamp, detections)]
 

@@ -125,7 +125,7 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
 
     Messages that cannot be decoded are left out, with a note.
     """
-    fastest = view.memory.limits.max_plausible_speed_mps
+    fastest = view.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
     found, since = _slices_in(view, topic, window, failures)
     if failures and not found:
@@ -172,7 +172,7 @@ def slices_of_path(
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
-    fastest = view.memory.limits.max_plausible_speed_mps
+    fastest = view.limits.max_plausible_speed_mps
 
     def make(some: PoseSlice) -> PathSlice:
         return path_slice(some.poses, fastest)
@@ -202,7 +202,7 @@ def slices_by_poses(
     Raises:
         InvalidArgumentsError: a message carries no position.
     """
-    if topic not in view.memory.limits.tf_topics:
+    if topic not in view.limits.tf_topics:
         twice = () if view.call.stored else beside_path(view, topic, window)
         yield from slices_of_poses(
             view, topic, window, kind, make, failures=failures,
@@ -266,7 +266,7 @@ def pose_frame(view: View, topic: str) -> str:
     """
     known = view.memo.of(_POSE_FRAMES, dict)
     if topic not in known:
-        body = robot_body(view) if topic in view.memory.limits.tf_topics else None
+        body = robot_body(view) if topic in view.limits.tf_topics else None
         known[topic] = _newest_frame(view, topic) if body is None else body.parent
     return known[topic]
 
@@ -280,7 +280,7 @@ def _newest_frame(view: View, topic: str) -> str:
         except UndecodableError as error:
             failure = failure or error
             continue
-        pose = view.memory.extractor.pose(message, found.record.channel.type)
+        pose = view.extractor.pose(message, found.type)
         if pose is None:
             raise InvalidArgumentsError(describe_lack(view, "position", found))
         if failure is not None:
@@ -312,7 +312,7 @@ def robot_body(view: View) -> Body | None:
         return None
     above = {child: _above(child, parents) for child in moving}
     body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
-    map_frame = view.memory.limits.map_frame
+    map_frame = view.limits.map_frame
     root = map_frame if map_frame in above[body] else above[body][-1]
     return Body(root, body, tuple(sorted({each for each in moving if each != body})))
 

@@ -36,6 +36,16 @@ class StoredMessage(NamedTuple):
         """Log time."""
         return self.record.log_time
 
+    @property
+    def topic(self) -> str:
+        """The name of its topic."""
+        return self.record.channel.topic
+
+    @property
+    def type(self) -> str:
+        """The name of its type."""
+        return self.record.channel.type
+
 
 class BagSpan(NamedTuple):
     """A bag and the log times of its first and last message of some topics, both inclusive."""

@@ -62,7 +62,7 @@ def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    limits = view.memory.limits
+    limits = view.limits
     around = window.widened(TF_CACHE_NS)
     moving = [
         edges_of_rows(view, rows, among)

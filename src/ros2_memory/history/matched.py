@@ -89,7 +89,7 @@ class Matching:
         self.ruled_out = False
         self._view = view
         self._search = search
-        self._test = ColumnCondition(search.condition, view.memory.extractor)
+        self._test = ColumnCondition(search.condition, view.extractor)
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
@@ -185,7 +185,7 @@ class Matching:
         # The newest first, as a search reports what it cannot decode.
         for each in self._view.stream.messages([topic], window, newest_first=True):
             met = self._search.matches(each)
-            source = numbers[each.bag.recording, each.record.channel.type]
+            source = numbers[each.bag.recording, each.type]
             found = read[each.time, source]
             found.append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
@@ -201,7 +201,7 @@ class Matching:
     def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
         if topic not in self._numbers:
-            timeline = self._view.snapshot.timeline
+            timeline = self._view.timeline
             recordings = sorted(timeline.recordings(topic), key=str)
             sources = product(recordings, sorted(timeline.types_of(topic)))
             self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}

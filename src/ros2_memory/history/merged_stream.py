@@ -161,7 +161,7 @@ class MergedStream:
 
     def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        topic, window = found.record.channel.topic, _since_published(found)
+        topic, window = found.topic, _since_published(found)
         if found.record.may_be_relatched and self.may_be_relatched([topic]):
             bags = self.overlapping_bags([topic], window)
             copies = self.merged(bags, [topic], window, newest_first=False)
@@ -182,7 +182,7 @@ class MergedStream:
         Late messages come many at once. So the search covers the rest of the late one's bag, and as
         much again before its window: a few searches serve them all.
         """
-        topic, window = late.record.channel.topic, _since_published(late)
+        topic, window = late.topic, _since_published(late)
         searched = self._searched.setdefault(topic, [])
         if not without([(window.start, window.stop)], searched):
             return

@@ -66,7 +66,7 @@ def resolve_topic(view: View, name: str) -> str:
     Raises:
         NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
     """
-    topics = view.snapshot.timeline.topics()
+    topics = view.timeline.topics()
     for candidate in (name, f"/{name}", name.removeprefix("/")):
         if candidate in topics:
             return candidate
@@ -80,8 +80,8 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
     count.
     """
-    configured = view.memory.limits.pose_topic
-    is_recorded = configured in view.snapshot.timeline.topics()
+    configured = view.limits.pose_topic
+    is_recorded = configured in view.timeline.topics()
     if configured != _DEFAULT_POSES or is_recorded:
         return None
     found = topics_of_robot(view, what)
@@ -98,9 +98,9 @@ def topics_of_robot(view: View, what: str) -> list[str]:
 
 def has_poses(view: View) -> bool:
     """Whether a topic has the robot's poses; `View.has_poses` remembers it."""
-    extractor = view.memory.extractor
+    extractor = view.extractor
     # Asked first, and cheap: of other topics it takes longer to know.
-    for type_name in view.snapshot.timeline.types_of(view.memory.limits.pose_topic):
+    for type_name in view.timeline.types_of(view.limits.pose_topic):
         if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
             return True
     return bool(topics_of_robot(view, "position") or topics_that_show_poses(view))
@@ -128,7 +128,7 @@ def resolve_pose_topic(
     """
     if name is not None:
         return resolve_topic(view, name)
-    configured = view.memory.limits.pose_topic
+    configured = view.limits.pose_topic
     only = only_pose_topic(view, what, degrees=degrees)
     if only is not None:
         view.notes.add(
@@ -190,7 +190,7 @@ def topics_that_show_poses(view: View) -> list[str]:
 
     Each with its type behind it, of at most `MOST_TRIED` topics: for an error alone.
     """
-    extractor, timeline = view.memory.extractor, view.snapshot.timeline
+    extractor, timeline = view.extractor, view.timeline
     unmapped = [
         topic
         for topic in timeline.topics()
@@ -203,7 +203,7 @@ def topics_that_show_poses(view: View) -> list[str]:
             newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
             if newest is None:
                 continue
-            type_name = newest.record.channel.type
+            type_name = newest.type
             pose = extractor.pose(decode(view, newest), type_name)
             if pose is not None and pose.orientation is not None:
                 shown.append(f"{topic} ({type_name})")
@@ -212,8 +212,8 @@ def topics_that_show_poses(view: View) -> list[str]:
 
 def transform_topics(view: View) -> list[str]:
     """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
-    recorded = view.snapshot.timeline.topics()
-    return [topic for topic in view.memory.limits.tf_topics if topic in recorded]
+    recorded = view.timeline.topics()
+    return [topic for topic in view.limits.tf_topics if topic in recorded]
 
 
 def topics_with(view: View, what: str) -> list[str]:
@@ -221,7 +221,7 @@ def topics_with(view: View, what: str) -> list[str]:
 
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
-    kinds_of, types = view.memory.extractor.kinds_of, view.snapshot.timeline.types
+    kinds_of, types = view.extractor.kinds_of, view.timeline.types
     carriers = {each for each in set(chain(*types.values())) if what in kinds_of(each)}
     return [
         f"{topic} ({type_name})"
@@ -239,7 +239,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     """
     if not any(mark in pattern for mark in "*?["):
         return (resolve_topic(view, pattern),)
-    matched = tuple(match_topics(view.snapshot.timeline.topics(), pattern))
+    matched = tuple(match_topics(view.timeline.topics(), pattern))
     if not matched:
         raise not_recorded(view, pattern)
     return matched
@@ -260,7 +260,7 @@ def require_bags(view: View) -> None:
             f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the first split is still being written; ask again when it closes, in "
-            f"{view.memory.limits.closed_after_s:g} s or less",
+            f"{view.limits.closed_after_s:g} s or less",
         )
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
@@ -355,7 +355,7 @@ def _within_recording(
 
 def _usual_period(view: View, found: StoredMessage) -> Ns:
     """Returns the mean time between the messages of a topic in the recording of one of them."""
-    pace = view.snapshot.timeline.pace(found.record.channel.topic, found.bag.recording).topic
+    pace = view.timeline.pace(found.topic, found.bag.recording).topic
     return (pace.last - pace.first) // max(pace.messages - 1, 1)
 
 
@@ -403,7 +403,7 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         when = f"after {unix_text(start)}"
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, asked)
+    deleted = deleted_between(view.snapshot, view.bag_dir, asked)
     detail = [why_nothing(when, deleted=bool(deleted))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
@@ -443,7 +443,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     It names topics there that carry what these do (poses, velocities). In a folder with the bags of
     several robots, the nearest message of a topic may be another robot's.
     """
-    timeline, whole = view.snapshot.timeline, view.snapshot.metadata_folders
+    timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}
     held: set[str] = set()
     for bag in timeline.overlapping(window):
@@ -470,9 +470,7 @@ def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
 
     def carried(topic: str) -> set[str]:
         return {
-            kind
-            for each in view.snapshot.timeline.types_of(topic)
-            for kind in view.memory.extractor.kinds_of(each)
+            kind for each in view.timeline.types_of(topic) for kind in view.extractor.kinds_of(each)
         }
 
     wanted = {kind for topic in topics for kind in carried(topic)}
@@ -488,7 +486,7 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     """
     if being_written(view.snapshot, window):
         return NoDataReason.NOT_CLOSED_YET
-    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    deleted = deleted_between(view.snapshot, view.bag_dir, window)
     return NoDataReason.DELETED if deleted else NoDataReason.GAP
 
 
@@ -535,15 +533,11 @@ def describe_lack(view: View, what: str, found: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
     channel = found.record.channel
     has = f"carries no {what}"
-    if "geodetic" in view.memory.extractor.kinds_of(channel.type):
+    if "geodetic" in view.extractor.kinds_of(channel.type):
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
-    if (
-        not topics
-        and what == "velocity"
-        and "position" in view.memory.extractor.kinds_of(channel.type)
-    ):
+    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(channel.type):
         return (
             f"topic: {channel.topic} is a {channel.type}, which {has}, and no topic recorded does; "
             "trajectory_summary returns speeds from its poses"
@@ -569,6 +563,6 @@ def _advice(view: View, reason: NoDataReason) -> list[str]:
             f"ask about an earlier moment, or again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the split being written is not read until it closes: ask about an earlier "
-            f"moment, or again in {view.memory.limits.closed_after_s:g} s"
+            f"moment, or again in {view.limits.closed_after_s:g} s"
         )
     return advice

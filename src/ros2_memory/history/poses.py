@@ -296,7 +296,7 @@ class PoseReader:
         self._view = view
         self._failures = failures
         self._beside = beside
-        self._columns = PoseColumns(view.memory.extractor)
+        self._columns = PoseColumns(view.extractor)
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the poses of rows that overlap in time, in the order of `blocks`."""
@@ -353,10 +353,10 @@ class PoseReader:
         return poses_of(self._decoded(rows)) if found is None else joined_poses(found)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
-        reader, extractor = self._view.memory.reader, self._view.memory.extractor
+        reader, extractor = self._view.memory.reader, self._view.extractor
         samples: list[tuple[Ns, Pose, float | None]] = []
         for found in messages_of(self._view, rows):
-            type_name = found.record.channel.type
+            type_name = found.type
             try:
                 message = reader.decode(found.record)
             except UndecodableError as error:

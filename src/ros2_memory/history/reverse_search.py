@@ -79,7 +79,7 @@ def condition_of(
     memory = view.memory
     limits = memory.limits
     least = limits.min_score if min_score is None else min_score
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
     if field and len(types) == 1:
         (type_name,) = types
@@ -99,7 +99,7 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     Else the value. A field is a number where the definition has one of its name.
     """
     word = value.strip() if isinstance(value, str) else ""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     topic = next((each for each in timeline.topics() if type_name in timeline.types_of(each)), None)
     if not _CONSTANT_NAME.fullmatch(word) or topic is None:
         return value
@@ -143,7 +143,7 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
 
     They are in the map where transforms lead there.
     """
-    target = view.memory.limits.map_frame
+    target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
     frames = {each for topic in topics[:_MOST_FRAMES] for each in _frames_of(view, topic)}
@@ -179,7 +179,7 @@ def _frames_of(view: View, topic: str) -> list[str]:
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return []
-    extractor, type_name = view.memory.extractor, found.record.channel.type
+    extractor, type_name = view.extractor, found.type
     own = extractor.frame(message)
     seen = detections_of(extractor.exact(message, type_name), own)
     frames = {each.frame_id for each in seen if each.place is not None}
@@ -321,7 +321,7 @@ class ReverseSearch:
     def _value(self, found: StoredMessage) -> JsonValue:
         message = self._view.bags.decode(found)
         type_name = found.record.channel.schema.name
-        return None if message is None else self._view.memory.extractor.exact(message, type_name)
+        return None if message is None else self._view.extractor.exact(message, type_name)
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""

@@ -44,7 +44,7 @@ def scan(
         return rows
 
     rows = open_scan(view, topic, window, **how).rows(newest_first=newest_first)
-    return map(noted, rows) if view.snapshot.timeline.thinned else rows
+    return map(noted, rows) if view.timeline.thinned else rows
 
 
 class Wanted(TypedDict, total=False):
@@ -91,11 +91,9 @@ def open_scan(
         reached(at)
         view.bags.check_deadline()
 
-    wanted.setdefault("shared", () if copies else view.snapshot.timeline.shared_times)
+    wanted.setdefault("shared", () if copies else view.timeline.shared_times)
     relatches = not copies and view.stream.may_be_relatched([topic])
-    asked = Asked(
-        topic, window, view.snapshot.timeline, decode, relatches=relatches, check=check, **wanted
-    )
+    asked = Asked(topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted)
     return Scan(view.memory.columns, asked)
 
 
@@ -206,6 +204,6 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
         left = Counter(wanted.tolist())
         for found in view.bags.read(bag, [channel.topic], window):
-            if left[found.time] and found.record.channel.type == channel.type:
+            if left[found.time] and found.type == channel.type:
                 left[found.time] -= 1
                 yield found

@@ -77,13 +77,13 @@ class Sessions:
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
         self._view = view
         self._children = children
-        self._names = HardLinks(view.memory.index.bag_dir)
-        self._root = str(view.memory.index.bag_dir).rstrip("/")
+        self._names = HardLinks(view.bag_dir)
+        self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._recorded = view.snapshot.timeline.memo.of(_RECORDED, self._find_recorded)
+        self._recorded = view.timeline.memo.of(_RECORDED, self._find_recorded)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
-        self.linked = view.snapshot.timeline.memo.of(_LINKED, set)
+        self.linked = view.timeline.memo.of(_LINKED, set)
         self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
@@ -110,7 +110,7 @@ class Sessions:
         """Returns the recordings that hold some topics, by where they were recorded."""
         found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
         for topic in topics:
-            for path, span in self._view.snapshot.timeline.recordings(topic).items():
+            for path, span in self._view.timeline.recordings(topic).items():
                 there = found.setdefault(self.folder(path), {})
                 first, last = there.get(path, span)
                 there[path] = min(first, span[0]), max(last, span[1])
@@ -220,7 +220,7 @@ class Sessions:
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Returns the folders of the recordings that went on at a moment."""
-        bags = self._view.snapshot.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
+        bags = self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
     def _of(self, folder: str) -> Session:
@@ -237,9 +237,9 @@ class Sessions:
         return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
 
     def _find_recorded(self) -> _Recorded:
-        limits, pose_topic = self._view.memory.limits, self._view.pose_topic
+        limits, pose_topic = self._view.limits, self._view.pose_topic
         topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
-        recordings = map(self._view.snapshot.timeline.recordings, topics)
+        recordings = map(self._view.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
         chains = _joined(paths) if len(paths) > 1 else {}
         return _Recorded(

@@ -123,7 +123,7 @@ def transform_at(
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
             or no transform brackets the moment on one of the edges between them.
     """
-    limits = view.memory.limits
+    limits = view.limits
     if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), sessions_of(view)
@@ -182,7 +182,7 @@ def _transform_in(
     view: View, among: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
     """Does as `transform_at`, by the transforms of one session."""
-    limits, (parent, child) = view.memory.limits, frames
+    limits, (parent, child) = view.limits, frames
     static = static_at(static_transforms(view, among), at)
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
@@ -209,7 +209,7 @@ def _transform_in(
 
 def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
     """Returns the moving transforms that a session received in a window, in log-time order."""
-    sessions, topics = sessions_of(view), _recorded(view, view.memory.limits.tf_topics)
+    sessions, topics = sessions_of(view), _recorded(view, view.limits.tf_topics)
     bags = _bags_of(view, topics, window, among)
     merged = view.stream.merged(bags, topics, window, newest_first=False)
     return [
@@ -227,7 +227,7 @@ def frames_of(
     target: str,
 ) -> Frames:
     """Returns frames in a target frame by some transforms, of which none holds on."""
-    clock = view.memory.limits.tf_clock
+    clock = view.limits.tf_clock
     return Frames(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
 
@@ -240,11 +240,11 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    sessions, timeline, scanner = sessions_of(view), view.snapshot.timeline, view.memory.columns
+    sessions, timeline, scanner = sessions_of(view), view.timeline, view.memory.columns
     known = sessions.statics.get(among)
     if known is not None:
         return known
-    topics = _recorded(view, view.memory.limits.tf_static_topics)
+    topics = _recorded(view, view.limits.tf_static_topics)
     key = (among, topics)
     kept = scanner.statics.get(key)
     if kept is not None and kept[0] is timeline:
@@ -268,9 +268,9 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
 
 def _find_all_statics(view: View, topics: Sequence[str]) -> None:
     """Finds the static transforms of all sessions that are stored, unless some are carried."""
-    sessions, root = sessions_of(view), view.memory.index.bag_dir
-    coverage = view.memory.columns.coverage(view.snapshot.timeline)
-    recordings = [path for topic in topics for path in view.snapshot.timeline.recordings(topic)]
+    sessions, root = sessions_of(view), view.bag_dir
+    coverage = view.memory.columns.coverage(view.timeline)
+    recordings = [path for topic in topics for path in view.timeline.recordings(topic)]
     if coverage is None or any(map(sessions.holds_carried, recordings)):
         return
     found: dict[Session, list[StampedTransform]] = {}
@@ -286,7 +286,7 @@ def _find_all_statics(view: View, topics: Sequence[str]) -> None:
 
 def make_statics(view: View, window: TimeWindow) -> None:
     """Makes the static transforms of the parts in a window."""
-    for topic in _recorded(view, view.memory.limits.tf_static_topics):
+    for topic in _recorded(view, view.limits.tf_static_topics):
         deque(_statics_back(view, topic, window), maxlen=0)
 
 
@@ -325,7 +325,7 @@ def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
 def _changes_in(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
     scanner, part = view.memory.columns, rows.part
-    recording = relative(str(rows.recording), str(view.memory.index.bag_dir))
+    recording = relative(str(rows.recording), str(view.bag_dir))
     if part is None:
         return Statics(recording, tuple(_decoded(view, rows)))
     known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
@@ -362,7 +362,7 @@ def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
 def sessions_of(view: View) -> Sessions:
     """Returns the sessions of a view, made once."""
     if view.sessions is None:
-        limits = view.memory.limits
+        limits = view.limits
         topics = (*limits.tf_topics, *limits.tf_static_topics)
         view.sessions = Sessions(
             view, lambda among: {child for _, child in _pairs(view, topics, among=among)}
@@ -380,7 +380,7 @@ def newest_in_session(
     newest = view.stream.newest(topic, window)
     sessions = sessions_of(view)
     own = sessions.of(recording)
-    if not any(sessions.folder(each) in own for each in view.snapshot.timeline.recordings(topic)):
+    if not any(sessions.folder(each) in own for each in view.timeline.recordings(topic)):
         return newest
     bags = _bags_of(view, (topic,), window, own)
     if newest is not None and newest.bag in {each.bag for each in bags}:
@@ -394,7 +394,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     A pair that was published in both directions appears once, as moving. A pair with an unnamed
     frame is invalid in tf2, and is left out with a note.
     """
-    limits, sessions = view.memory.limits, sessions_of(view)
+    limits, sessions = view.limits, sessions_of(view)
     if sessions.edges is not None:
         return sessions.edges
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
@@ -464,7 +464,7 @@ def _explained(
 
     A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
     """
-    topics = _recorded(view, view.memory.limits.tf_topics)
+    topics = _recorded(view, view.limits.tf_topics)
     near = TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
@@ -512,7 +512,7 @@ def connects(
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
     """
-    limits, known = view.memory.limits, sessions_of(view).linked
+    limits, known = view.limits, sessions_of(view).linked
     if (frames, among) in known:
         return True
     pairs: set[Pair] = set()
@@ -570,7 +570,7 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
         zones = parts.zone(_STAMPS)
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
-    for topic in _recorded(view, view.memory.limits.tf_topics):
+    for topic in _recorded(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
             is_mixed = sessions.holds_carried(rows.recording)
@@ -583,7 +583,7 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
-    known = set(view.snapshot.timeline.topics())
+    known = set(view.timeline.topics())
     return tuple(topic for topic in topics if topic in known)
 
 
@@ -601,11 +601,11 @@ def _bags_of(
 
 def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
     """Returns the transforms of a message; none, with a note, where it cannot be decoded."""
-    is_static = found.record.channel.topic in view.memory.limits.tf_static_topics
+    is_static = found.topic in view.limits.tf_static_topics
     with view.call.stages.timed("extract"):
         try:
             message = view.memory.reader.decode(found.record)
-            return view.memory.extractor.transforms(message, found.time, static=is_static)
+            return view.extractor.transforms(message, found.time, static=is_static)
         except UndecodableError as error:
             view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
             return ()

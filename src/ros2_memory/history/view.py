@@ -58,8 +58,12 @@ class View:
     far, it is scanned again.
 
     Attributes:
+        limits: the settings of the memory.
+        extractor: reads its decoded messages.
+        bag_dir: where its bags are.
         bags: each bag by itself.
         stream: all bags as one stream.
+        timeline: the bags in the order of time.
         memo: what was found out in this call.
         sessions: which recordings belong together, once that is asked (see `transforms`).
     """
@@ -70,6 +74,9 @@ class View:
         self.bags = BagAccess(memory, call, reach)
         self.stream = MergedStream(self.bags)
         self.snapshot = self.bags.snapshot
+        self.timeline = self.snapshot.timeline
+        self.limits, self.extractor = memory.limits, memory.extractor
+        self.bag_dir = memory.index.bag_dir
         self.notes = self.bags.notes
         self.memo = Memo()
         self.sessions: Sessions | None = None
@@ -80,7 +87,7 @@ class View:
 
         See `only_pose_topic`; it need not be recorded.
         """
-        return only_pose_topic(self) or self.memory.limits.pose_topic
+        return only_pose_topic(self) or self.limits.pose_topic
 
     @cached_property
     def has_poses(self) -> bool:
@@ -89,7 +96,7 @@ class View:
 
     def note_thinned(self, window: TimeWindow) -> None:
         """Records that what was read lies in a window, where that is partly in thinned days."""
-        for day in self.snapshot.timeline.thinned:
+        for day in self.timeline.thinned:
             if window.overlaps(day.start, day.end):
                 self.call.note_thinned(max(window.start, day.start), min(window.stop - 1, day.end))
 
@@ -105,7 +112,7 @@ class View:
         From the summaries of bags; messages are read only where recordings overlap. What is counted
         without a doubt stays in memory until a bag comes or goes.
         """
-        counted = self.snapshot.timeline.memo.of(_CENSUSES, dict)
+        counted = self.timeline.memo.of(_CENSUSES, dict)
         if topic in counted:
             return counted[topic]
         before = self.notes.added
@@ -116,8 +123,7 @@ class View:
 
     def _census(self, topic: str) -> dict[str, Census]:
         counted = {
-            type_name: Census(*stated)
-            for type_name, stated in self.snapshot.timeline.totals(topic).items()
+            type_name: Census(*stated) for type_name, stated in self.timeline.totals(topic).items()
         }
         for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
             type_name = rows.table.channel.type

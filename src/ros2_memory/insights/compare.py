@@ -121,7 +121,7 @@ def _things(
     view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
 ) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
-    limits = view.memory.limits
+    limits = view.limits
     known = known_things(view, limits.min_score, limits.labels)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
     frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
@@ -196,7 +196,7 @@ def _paths_apart(
         )
         return _WaysApart()
     region = None if where is None else where.region
-    places = places_asked(view.memory.limits, where, (frame,))
+    places = places_asked(view.limits, where, (frame,))
     tracks = [track_in(view, frame, each) for each in windows]
     stands = [
         [
@@ -231,7 +231,7 @@ def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
     topic, sessions = resolve_path_topic(view), sessions_of(view)
     found = {
         sessions.of(recording)
-        for recording, span in view.snapshot.timeline.recordings(topic).items()
+        for recording, span in view.timeline.recordings(topic).items()
         if any(each.overlaps(*span) for each in windows)
     }
     return len(found) < 2
@@ -245,7 +245,7 @@ def _places(
     elapsed: Sequence[Elapsed],
 ) -> list[dict[str, float | None]]:
     """Returns the minutes in each named place, or in a region, of each window."""
-    places = view.memory.limits.places
+    places = view.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
     found: list[dict[str, float | None]] = []

@@ -253,7 +253,7 @@ def topic_changes(
     note_unread(view, window, gaps=len(found) > max_samples)
     note_edges(view, window)
     note_robots(view, topic, window)
-    types = view.snapshot.timeline.types_of(topic)
+    types = view.timeline.types_of(topic)
     return Changes(
         topic,
         ", ".join(sorted(types)),

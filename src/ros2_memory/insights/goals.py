@@ -83,7 +83,7 @@ def goals_in(
     `found_of` has what the messages of each topic report in the window.
     """
     for topic, found in found_of.items():
-        if found is None or GOALS not in view.snapshot.timeline.types_of(topic):
+        if found is None or GOALS not in view.timeline.types_of(topic):
             continue
         # Which goals it listed before: what a window's first message lists need not be new.
         before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
@@ -106,7 +106,7 @@ def goals_asked(
         InvalidArgumentsError: no status meets the condition.
         QueryTimeoutError: the call's time is over.
     """
-    types = {name for topic in topics for name in view.snapshot.timeline.types_of(topic)}
+    types = {name for topic in topics for name in view.timeline.types_of(topic)}
     field = None if condition.field is None else condition.field.rsplit(".", 1)[-1]
     if types != {GOALS} or field not in {None, _STATUS}:
         return None

@@ -213,7 +213,7 @@ def recap(
 
 def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
     """Notes the logs whose errors are no events: those that ROS writes alone are read for them."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     for topic in timeline.topics():
         types = timeline.types_of(topic)
         if FOXGLOVE_LOGS.isdisjoint(types):
@@ -316,7 +316,7 @@ def found_events(
     view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
 ) -> dict[str, TopicEvents | None]:
     """Returns the events of each topic whose type can have them; None where it has no message."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     return {
         topic: events_in(view, topic, window)
         for topic in timeline.topics()

@@ -143,7 +143,7 @@ def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | 
     matching = Matching(view, search)
     # What lies outside of a scope is not read, and may well be decodable.
     matching.ruled_out = scope.is_bounded
-    is_log = view.snapshot.timeline.is_log
+    is_log = view.timeline.is_log
     topics = {topic: _OfTopic(topic, apart=is_log(topic)) for topic in search.topics}
     reached = searched = scope.window.stop
     try:

@@ -281,7 +281,7 @@ def read_sightings(
     found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if found.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    is_log = view.snapshot.timeline.is_log
+    is_log = view.timeline.is_log
     logs = {topic for topic in topics if is_log(topic)}
     spans = [
         (run.first, run.last if run.topic in logs else _until(view, run, scope))
@@ -302,7 +302,7 @@ def _until(view: View, run: Run, scope: Scope) -> Ns:
     To its last match where a silence, or the end of a scope, is next; so does a log entry.
     """
     last, until = run.last, run.until
-    if view.snapshot.timeline.is_log(run.topic):
+    if view.timeline.is_log(run.topic):
         return last
     if until is None:
         after = TimeWindow(last + 1, last + SILENCE_NS + 1)
@@ -326,8 +326,8 @@ def _sighting(
     What happens is where the robot was when it began; a thing is where it was last seen from.
     """
     message = view.memory.reader.decode(newest.record)
-    value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
-    seen = detections_of(value, view.memory.extractor.frame(message))
+    value = condition.counted(view.extractor.exact(message, newest.type))
+    seen = detections_of(value, view.extractor.frame(message))
     thing, labels = _matching(seen, condition), {each.label for each in seen}
     robot_at_first = thing is None and run.begun
     at = run.first if robot_at_first else newest.time
@@ -385,7 +385,7 @@ def _with_fields(
         record = newest.record
         message = view.memory.reader.decode(record)
         try:
-            shown = view.memory.extractor.shown(message, record.channel.type, fields)
+            shown = view.extractor.shown(message, record.channel.type, fields)
         except InvalidArgumentsError as error:
             refused.append(error)
             extended.append(sighting)
@@ -400,7 +400,7 @@ def _with_fields(
 
 def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
     """Returns the recording of a sighting's message at a time: its last may be of a later one."""
-    topic, own = newest.record.channel.topic, newest.bag.recording
+    topic, own = newest.topic, newest.bag.recording
     bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
     every = {each.bag.recording for each in bags}
     return own if own in every else min(every, default=own)
@@ -431,15 +431,15 @@ def _spot_of(
             return spot
     except QueryTimeoutError:
         return spot
-    topic = newest.record.channel.topic
+    topic = newest.topic
     window = TimeWindow(first, newest.time)
-    extractor = view.memory.extractor
+    extractor = view.extractor
     before = view.stream.messages([topic], window, newest_first=True)
     for found in islice(before, _MOST_TRIED):
         message = view.bags.decode(found)
         if message is None:
             continue
-        value = condition.counted(extractor.exact(message, found.record.channel.type))
+        value = condition.counted(extractor.exact(message, found.type))
         if condition.matches(value):
             seen = _matching(detections_of(value, extractor.frame(message)), condition)
             earlier = _spot(view, seen, found, robot, frame_id)
@@ -456,7 +456,7 @@ def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str,
     """Returns the frames that places are given in, the first that can be had."""
     if frame_id is not None:
         return (frame_id,)
-    frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
+    frames = (view.limits.map_frame, "" if robot is None else robot.frame_id)
     return tuple(dict.fromkeys(filter(None, frames)))
 
 

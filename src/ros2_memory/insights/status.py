@@ -331,20 +331,20 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
     """Returns the topics with messages that cannot be decoded, with type and reason."""
     return tuple(
         Undecodable(topic, type_name, reason)
-        for topic in view.snapshot.timeline.topics()
+        for topic in view.timeline.topics()
         for type_name, reason in sorted(undecodable_types(view, topic).items())
     )
 
 
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
     """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
-    types = view.snapshot.timeline.types_of(topic)
+    types = view.timeline.types_of(topic)
     reasons = {type_name: _why_undecodable(view, topic, type_name) for type_name in types}
     return {type_name: reason for type_name, reason in reasons.items() if reason}
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    timeline, columns = view.snapshot.timeline, view.memory.columns
+    timeline, columns = view.timeline, view.memory.columns
     bag = timeline.first_with(topic, type_name)
     channels = columns.channels(timeline, bag)
     reasons = [

@@ -68,7 +68,7 @@ def events_back(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    columns = StatedColumns(view.memory.extractor)
+    columns = StatedColumns(view.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
 
     def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
@@ -108,7 +108,7 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     Raises:
         BagError: the bag cannot be read.
     """
-    reader, columns = view.memory.reader, StatedColumns(view.memory.extractor)
+    reader, columns = view.memory.reader, StatedColumns(view.extractor)
     found: dict[str, list[Stated]] = {}
     for tables in decoded(reader, bag.path, topics=topics) if topics else ():
         for nth, table in enumerate(tables):
@@ -164,7 +164,7 @@ def _state(view: View, found: StoredMessage) -> State | None:
         message = view.memory.reader.decode(found.record)
     except UndecodableError:
         return None
-    return state_of(view.memory.extractor.exact(message, channel.type), channel.type)
+    return state_of(view.extractor.exact(message, channel.type), channel.type)
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

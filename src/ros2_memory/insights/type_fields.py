@@ -27,7 +27,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
     """
     view = open_view(memory, call, memory.clock.now())
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:
         known = sorted(set(chain.from_iterable(timeline.types.values())))
@@ -38,7 +38,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     failure = ""
     for topic in topics:
         found = view.stream.newest(topic, TimeWindow.everything())
-        if found is None or found.record.channel.type != type_name:
+        if found is None or found.type != type_name:
             continue
         try:
             message = memory.reader.decode(found.record)

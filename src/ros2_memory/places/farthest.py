@@ -50,7 +50,7 @@ def farthest_from(
         InvalidArgumentsError: `value` is no point, or the poses are not in its frame.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    place = parse_where(view.memory.limits, value, 1.0, _ARGUMENT)
+    place = parse_where(view.limits, value, 1.0, _ARGUMENT)
     if place.several:
         raise InvalidArgumentsError(f"{_ARGUMENT} has several places; give one, or x and y")
     if topic != (known := resolve_path_topic(view)):
@@ -80,7 +80,7 @@ def farthest_from(
     if best is None:
         return None
     away_m, time, *there = best
-    inside = places_at(view.memory.limits.places, frame, *there)
+    inside = places_at(view.limits.places, frame, *there)
     return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
 
 

@@ -47,7 +47,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         UndecodableError: no pose can be decoded.
     """
     frame = pose_frame(view, topic)
-    own = MapPlacement(frame, frame, frame == view.memory.limits.map_frame)
+    own = MapPlacement(frame, frame, frame == view.limits.map_frame)
     asked_for = frame_id is not None
     placement = own if frame_id == frame else _map_or_own(view, topic, own, asked_for)
     if frame_id not in (None, placement.frame_id):
@@ -61,12 +61,12 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
 
 def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> MapPlacement:
     """Returns the placement in the map, where transforms of some recording lead there."""
-    target, pose_frame = view.memory.limits.map_frame, own.pose_frame
+    target, pose_frame = view.limits.map_frame, own.pose_frame
     # No answer is better than one that denies a frame which is asked for, since the time is over.
     leads = connects if asked_for else connected
     if not target or target == pose_frame or not leads(view, (target, pose_frame)):
         return own
-    recordings = view.snapshot.timeline.recordings(topic).items()
+    recordings = view.timeline.recordings(topic).items()
     lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
     if any(leads(view, (target, pose_frame), among=each) for each in lending):
         return MapPlacement(target, pose_frame, is_map=True)

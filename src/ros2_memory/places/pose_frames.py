@@ -65,7 +65,7 @@ def newest_pose(
     Where the session of a `recording` has the topic, it is one of its messages. None where there is
     no message, or it cannot be decoded.
     """
-    body = robot_body(view) if topic in view.memory.limits.tf_topics else None
+    body = robot_body(view) if topic in view.limits.tf_topics else None
     if body is not None:
         return newest_of_body(view, body, window, recording=recording)
     if recording is None:
@@ -75,7 +75,7 @@ def newest_pose(
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return None
-    return found, view.memory.extractor.pose(message, found.record.channel.type)
+    return found, view.extractor.pose(message, found.type)
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
@@ -99,7 +99,7 @@ def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | No
     Raises:
         InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
     """
-    target = frame_id or view.memory.limits.map_frame
+    target = frame_id or view.limits.map_frame
     found = None if not target else pose_in(view, pose, target, time, recording)
     if found is None and frame_id is not None:
         raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
@@ -159,7 +159,7 @@ def _unreachable(frame_id: str, own_frame: str) -> str:
 
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
     """Returns a pose with the names of the places that it is in."""
-    places = view.memory.limits.places
+    places = view.limits.places
     for frame in dict.fromkeys(each.frame_id for each in places):
         there = pose_in(view, pose, frame, time, recording)
         if there is None:

@@ -55,7 +55,7 @@ class RobotPlaces:
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""
-        places = self.view.memory.limits.places
+        places = self.view.limits.places
         if not any(each.frame_id == self.map_frame for each in places):
             return ()
         point = place_at(self._track, time, SILENCE_NS)

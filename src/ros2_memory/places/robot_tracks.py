@@ -121,7 +121,7 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body_by_transforms(view)
-        tf_topics = view.memory.limits.tf_topics
+        tf_topics = view.limits.tf_topics
         self._topics = (view.pose_topic,) if self._body is None else tf_topics
         own = pose_frame(view, view.pose_topic) if self._body is None else self._body.child
         self._own_frame = own
@@ -164,7 +164,7 @@ class RobotTracks:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in found)
         one, *others = _by_robot(found)
-        fastest = view.memory.limits.max_plausible_speed_mps
+        fastest = view.limits.max_plausible_speed_mps
         tracks = tuple(joined_track(parts, fastest) for parts in others)
         return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
@@ -195,9 +195,9 @@ class RobotTracks:
 
     def _moving_scans(self, window: TimeWindow) -> list[Scan]:
         """Returns the scans of the moving transforms of a window, and around it."""
-        topics = self._view.snapshot.timeline.topics()
+        topics = self._view.timeline.topics()
         around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
-        named = self._view.memory.limits.tf_topics
+        named = self._view.limits.tf_topics
         return [
             open_scan(self._view, each, around, copies=True) for each in named if each in topics
         ]
@@ -270,7 +270,7 @@ class RobotTracks:
 
     def _settings(self, placed_by: Sequence[object]) -> str:
         """Returns what a track depends on besides the poses and transforms in parts, as a text."""
-        clock = self._view.memory.limits.tf_clock
+        clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
 
@@ -287,7 +287,7 @@ class RobotTracks:
                 raise QueryTimeoutError("to place poses takes too long")
             noted = self._view.notes.added, len(self._failures)
             placed = self._placed(rows, groups, thins=True)
-            recording = relative(str(rows.recording), str(self._view.memory.index.bag_dir))
+            recording = relative(str(rows.recording), str(self._view.bag_dir))
             part = track_part(*placed)._replace(recording=recording)
             is_sure = noted == (self._view.notes.added, len(self._failures))
             if key is not None and is_sure:

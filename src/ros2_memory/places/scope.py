@@ -68,7 +68,7 @@ class Scope:
         self.unknown: Spans = []
         self._inside: list[tuple[Ns, Ns]] | None = None
         if where is not None:
-            track, inside = _in_region(view, parse_where(view.memory.limits, where), window)
+            track, inside = _in_region(view, parse_where(view.limits, where), window)
             self._inside = [(each.start, each.stop) for each in inside]
             known = placed_times(track, note_robots(view, resolve_path_topic(view), window))
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
@@ -159,7 +159,7 @@ class _States:
 
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when the topics said something: without silences, unless that holds on."""
-        topics, timeline = self._search.topics, self._view.snapshot.timeline
+        topics, timeline = self._search.topics, self._view.timeline
         if self._holds_on:
             begins = [span[0] for topic in topics for span in timeline.recordings(topic).values()]
             known = [(min(begins, default=MAX_NS), MAX_NS)]
@@ -205,7 +205,7 @@ def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
     spans = [(np.empty(0, np.int64), np.empty(0, np.int64))]
     for topic in topics:
         within: list[tuple[Ns, Ns]] = []
-        for segment in view.snapshot.timeline.segments_in(window):
+        for segment in view.timeline.segments_in(window):
             firsts, lasts = segment.bounds(topic)
             is_long = lasts - firsts > SILENCE_NS
             spans.append((firsts[~is_long], lasts[~is_long]))

@@ -223,7 +223,7 @@ def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
 
 def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
     """Whether the newest pose is recent enough to know where the robot is now."""
-    stale = _SPLITS * ns_from_unix(view.memory.limits.split_duration_s)
+    stale = _SPLITS * ns_from_unix(view.limits.split_duration_s)
     return newest is not None and newest >= now - stale
 
 
