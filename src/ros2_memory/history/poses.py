@@ -25,6 +25,7 @@ from ros2_memory.history.scan import (
     messages_of,
     of_columns,
     open_scan,
+    remembered,
     scan,
 )
 
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.fragments import Fragments, Kind, Sized
+    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
@@ -54,13 +55,11 @@ class PoseRows:
         span: log times (ns) that none of them is earlier or later than.
         load: returns the poses.
         parts: the numbers of the parts of which all rows are here; None if there are others, too.
-        trouble: differs from before where something could not be read since.
 
     Attributes:
         first: a log time (ns) that none of the poses is earlier than.
         last: one that none is later than.
         parts: see above.
-        trouble: see above.
     """
 
     def __init__(
@@ -68,11 +67,9 @@ class PoseRows:
         span: tuple[Ns, Ns],
         load: Callable[[], Poses],
         parts: tuple[int, ...] | None = None,
-        trouble: Callable[[], Hashable] = lambda: None,
     ) -> None:
         self.first, self.last = span
         self.parts = parts
-        self.trouble = trouble
         self._load = load
 
     def slices(self, length: Ns) -> Iterable[int]:
@@ -152,7 +149,6 @@ def slices_of_poses(
     """
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
     reader = PoseReader(view, failures, twice)
-    known = view.memory.columns.fragments(kind)
 
     def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
         around = stretch.window.widened(beside)
@@ -162,7 +158,8 @@ def slices_of_poses(
         found = (block for block in every if block.parts or needs_all)
         for some in slices_back(found, length, beside):
             if stretch.window.overlaps(some.start, some.stop - 1):
-                yield some.start, some.remembered(known, make, settings)
+                made = partial(make, some)
+                yield some.start, remembered(view, kind, some.key(settings), made, reader.trouble)
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
         around = stretch.window.widened(beside)
@@ -199,27 +196,14 @@ class PoseSlice:
         start, stop = self.start - self._beside, self.stop + self._beside
         return joined_poses([block.poses.between(start, stop) for block in self._blocks])
 
-    def remembered(
-        self, known: Fragments[T] | None, make: Callable[[PoseSlice], T], settings: str = ""
-    ) -> T:
-        """Returns what is made of it, and remembers that where it follows from whole parts alone.
-
-        Raises:
-            InvalidArgumentsError: messages carry no position.
-        """
+    def key(self, settings: str) -> FragmentKey | None:
+        """Returns what the poses are told apart by; None where not all are of whole parts."""
         parts: list[int] = []
         for block in self._blocks:
-            if known is None or block.parts is None:
-                return make(self)
+            if block.parts is None:
+                return None
             parts += block.parts
-        key = FragmentKey(self.start, settings, tuple(parts))
-        found = None if known is None else known.get(key)
-        if found is None:
-            before = [block.trouble() for block in self._blocks]
-            found = make(self)
-            if known is not None and before == [block.trouble() for block in self._blocks]:
-                known.put(key, found)
-        return found
+        return FragmentKey(self.start, settings, tuple(parts))
 
 
 def slices_back(blocks: Iterable[PoseRows], length: Ns, beside: Ns = 0) -> Iterator[PoseSlice]:
@@ -305,7 +289,7 @@ class PoseReader:
         numbers = tuple(part for part in known if part is not None)
         is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
         parts = numbers if is_whole else None
-        return PoseRows(span, partial(self._joined, rows), parts, self.trouble)
+        return PoseRows(span, partial(self._joined, rows), parts)
 
     def trouble(self) -> Hashable:
         """Returns what differs from before where something could not be read since."""

@@ -147,6 +147,28 @@ def joined_back(
             yield stretch.window.start, one
 
 
+def remembered(
+    view: View,
+    kind: Kind[T],
+    key: FragmentKey | None,
+    make: Callable[[], T],
+    trouble: Callable[[], Hashable] = lambda: None,
+) -> T:
+    """Returns what follows from whole parts: what is known of it, else made now.
+
+    That is remembered unless something could not be read; see `joined_back`. A key of None stands
+    for what may still change.
+    """
+    known = view.memory.columns.fragments(kind)
+    found = None if key is None else known.get(key)
+    if found is None:
+        before = trouble(), view.notes.added
+        found = make()
+        if key is not None and before == (trouble(), view.notes.added):
+            known.put(key, found)
+    return found
+
+
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
     """Yields the rows of a scan, those together that overlap in time: no other lies between.
 

@@ -56,7 +56,14 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import joined_back, messages_of, of_columns, open_scan, scan
+from ros2_memory.history.scan import (
+    joined_back,
+    messages_of,
+    of_columns,
+    open_scan,
+    remembered,
+    scan,
+)
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
@@ -324,21 +331,16 @@ def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
 
 def _changes_in(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
-    scanner, part = view.memory.columns, rows.part
-    recording = relative(str(rows.recording), str(view.bag_dir))
-    if part is None:
-        return Statics(recording, tuple(_decoded(view, rows)))
-    known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
-    made = known.get(key)
-    if made is None:
-        noted = view.notes.added
+
+    def make() -> Statics:
         times = static_times(rows.table, rows.times, rows.index)
-        new = None if times is None else np.flatnonzero(np.isin(rows.times, times))
-        received = _decoded(view, rows if new is None else rows.some(new))
-        made = Statics(recording, tuple(_changes(sorted(received, key=lambda one: one.log_time))))
-        if view.notes.added == noted:
-            known.put(key, made)
-    return made
+        some = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
+        received = sorted(_decoded(view, some), key=lambda one: one.log_time)
+        return Statics(relative(str(rows.recording), str(view.bag_dir)), tuple(_changes(received)))
+
+    part = rows.part
+    key = None if part is None else FragmentKey(rows.first, "", (part,))
+    return remembered(view, STATICS, key, make)
 
 
 def _decoded(view: View, rows: Rows) -> Iterator[StampedTransform]:

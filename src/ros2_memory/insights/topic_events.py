@@ -19,7 +19,7 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan
+from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan, remembered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -78,9 +78,7 @@ def events_back(
             is_whole = all(rows.part is not None for rows in together)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                events = _events(view, columns, together)
-                if events is not None:
-                    yield first, events
+                yield first, _events(view, columns, together)
 
     for _, events in joined_back(view, opened, EVENTS, make):
         yield events
@@ -120,18 +118,16 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     return {topic: each for topic, each in events.items() if each is not None}
 
 
-def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents | None:
+def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents:
     """Returns the events of tables that overlap in time; those of whole parts are remembered."""
+
+    def make() -> TopicEvents:
+        stated = joined_stated([_stated(view, columns, rows) for rows in together])
+        return events_of(stated) or TopicEvents(1, 0)
+
     parts = tuple(rows.part for rows in together if rows.part is not None)
-    known = view.memory.columns.fragments(EVENTS)
     key = FragmentKey(together[0].first, "", parts) if len(parts) == len(together) else None
-    events = None if key is None else known.get(key)
-    if events is None:
-        noted = view.notes.added
-        events = events_of(joined_stated([_stated(view, columns, rows) for rows in together]))
-        if events is not None and key is not None and view.notes.added == noted:
-            known.put(key, events)
-    return events
+    return remembered(view, EVENTS, key, make)
 
 
 def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:

@@ -42,7 +42,7 @@ from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.frames import edges_of_rows, frames_over
 from ros2_memory.history.poses import PoseReader
-from ros2_memory.history.scan import joined_back, open_scan, scan
+from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
 from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
 
 if TYPE_CHECKING:
@@ -281,18 +281,15 @@ class RobotTracks:
         self, rows: Rows, key: FragmentKey | None, groups: Sequence[_Group], reading: Deadline
     ) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
-        part = self._known(key)
-        if part is None:
+
+        def make() -> TrackPart:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
-            noted = self._view.notes.added, len(self._failures)
             placed = self._placed(rows, groups, thins=True)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
-            part = track_part(*placed)._replace(recording=recording)
-            is_sure = noted == (self._view.notes.added, len(self._failures))
-            if key is not None and is_sure:
-                self._view.memory.columns.fragments(TRACKS).put(key, part)
-        return part
+            return track_part(*placed)._replace(recording=recording)
+
+        return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
 
     def _key(
         self, rows: Rows, groups: Sequence[_Group], scans: Sequence[Scan]

@@ -23,7 +23,7 @@ from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
 from ros2_memory.columns.sights import packed
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import remembered, scan
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
@@ -304,22 +304,18 @@ class Watching:
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
         if is_open or not self._lasts:
             return self._read(around)
-        before = self._view.notes.added
         followed = self._follows_from(around)
         if around.parts is not None:
-            fragments = scanner.fragments(SIGHTS)
             part_key = FragmentKey(around.window.start, followed, around.parts)
-            known = fragments.get(part_key)
-            if known is None:
-                known = SeenBytes(self._read(around))
-                if self._view.notes.added == before:
-                    fragments.put(part_key, known)
-            return known.data
+            return remembered(
+                self._view, SIGHTS, part_key, lambda: SeenBytes(self._read(around))
+            ).data
         # Parts, as these, are of certain recordings.
         bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
         key = (around.window.start, followed, tuple(bags))
         data = scanner.sights.get(key)
         if data is None:
+            before = self._view.notes.added
             data = self._read(around)
             if self._view.notes.added == before:
                 scanner.sights.put(key, data, 200 + len(data) + 100 * len(bags))
