@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -16,6 +18,8 @@ from ros2_memory.analysis.motion.trajectory import (
     joined_slices,
     path_slice,
 )
+from ros2_memory.analysis.poses import Poses, joined_poses
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -36,8 +40,9 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseRows, poses_of, slices_back, slices_of_poses
+from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
 from ros2_memory.history.robots import beside_path
+from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
 from ros2_memory.history.transforms import (
     decoded_transforms,
     edges,
@@ -49,13 +54,13 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.columns.fragments import Kind, Sized
+    from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
@@ -194,26 +199,121 @@ def slices_by_poses(
     settings: str = "",
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the robot's poses in slices, the newest first; see `slices_of_poses`.
+    """Yields what is made of the robot's poses in slices of the clock, the newest first.
 
-    Of a topic of transforms they are those of the robot's body. Where two recordings have poses of
-    their own, or one has a time twice, they are those that come first.
+    Each with a time (log time, ns) that no pose of it is earlier than. Of a topic of transforms
+    they are the poses of the robot's body. Where two recordings have poses of their own, or one has
+    a time twice, they are those that come first.
+
+    Args:
+        view: of the call.
+        topic: of the poses.
+        window: of log time.
+        kind: what is made; it is stored, and joined by stretches of the clock.
+        make: makes it.
+        failures: as for `pose_rows`.
+        beside: poses so far before and after a slice (ns) are with it, too.
+        settings: what it depends on besides the poses.
+        reached: as for `scan`.
 
     Raises:
-        InvalidArgumentsError: a message carries no position.
+        InvalidArgumentsError: while it is iterated, messages carry no position.
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    if topic not in view.limits.tf_topics:
-        twice = () if view.call.stored else beside_path(view, topic, window)
-        yield from slices_of_poses(
-            view, topic, window, kind, make, failures=failures,
-            length=SLICE_NS, beside=beside, settings=settings, reached=reached, twice=twice,
-        )  # fmt: skip
-        return
-    poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-    if len(poses):
-        every = PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
-        for some in slices_back([every], SLICE_NS, beside):
+    if topic in view.limits.tf_topics:
+        poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
+        span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
+        every = [PoseRows(span, lambda: poses)] if len(poses) else []
+        for some in slices_back(every, beside):
             yield some.start, make(some)
+        return
+    twice = () if view.call.stored else beside_path(view, topic, window)
+    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    reader = PoseReader(view, failures, twice)
+
+    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
+        around = stretch.window.widened(beside)
+        rows = opened.rows(newest_first=True, among=around)
+        every = map(reader.block, blocks(rows, newest_first=True))
+        needs_all = stretch.parts is not None or not view.call.stored
+        found = (block for block in every if block.parts or needs_all)
+        for some in slices_back(found, beside):
+            if stretch.window.overlaps(some.start, some.stop - 1):
+                made = partial(make, some)
+                yield some.start, remembered(view, kind, some.key(settings), made, reader.trouble)
+
+    def key_of(stretch: Stretch) -> FragmentKey | None:
+        around = stretch.window.widened(beside)
+        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
+        if not near:
+            return stretch.key(settings)
+        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
+        left_out = repr(
+            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
+        )
+        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
+
+    yield from joined_back(
+        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
+    )
+
+
+class PoseSlice:
+    """The poses in a slice of the clock, and those beside it.
+
+    Attributes:
+        start: log time (ns) where it begins.
+        stop: where it ends.
+    """
+
+    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
+        self.start, self.stop = start, stop
+        self._beside = beside
+        self._blocks = blocks
+
+    @property
+    def poses(self) -> Poses:
+        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
+        start, stop = self.start - self._beside, self.stop + self._beside
+        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
+
+    def key(self, settings: str) -> FragmentKey | None:
+        """Returns what the poses are told apart by; None where not all are of whole parts."""
+        parts: list[int] = []
+        for block in self._blocks:
+            if block.parts is None:
+                return None
+            parts += block.parts
+        return FragmentKey(self.start, settings, tuple(parts))
+
+
+def slices_back(found: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+    """Yields the slices of the clock in which there may be poses, the newest first.
+
+    Args:
+        found: poses, the newest first.
+        beside: poses so far before and after a slice (ns) are with it, too.
+    """
+    held: list[PoseRows] = []
+    waiting: set[int] = set()
+
+    def done(oldest: Ns) -> Iterator[PoseSlice]:
+        """Yields the slices that reach no poses older than the oldest that is held."""
+        for number in sorted(waiting, reverse=True):
+            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+            if start - beside < oldest:
+                return
+            waiting.discard(number)
+            near = [each for each in held if each.last >= start - beside]
+            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
+
+    for block in found:
+        newest = max(waiting, default=block.last // SLICE_NS)
+        held = [each for each in held if each.first < (newest + 1) * SLICE_NS + beside]
+        held.append(block)
+        waiting.update(block.slices(SLICE_NS))
+        yield from done(block.first)
+    yield from done(MIN_NS)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:

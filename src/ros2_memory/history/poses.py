@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, partial
-from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses, joined_poses
-from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
     blocks,
-    joined_back,
     messages_of,
     of_columns,
-    open_scan,
-    remembered,
     scan,
 )
 
@@ -33,8 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.fragments import Kind, Sized
-    from ros2_memory.columns.scan import Stretch
+    from ros2_memory.columns.fragments import Sized
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import Beside
@@ -110,130 +103,6 @@ def pose_rows(
     counting = (rows for rows in scan(view, topic, window) if among(rows.recording))
     for together in blocks(counting, newest_first=False):
         yield reader.block(together)
-
-
-def slices_of_poses(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    kind: Kind[T],
-    make: Callable[[PoseSlice], T],
-    *,
-    failures: list[UndecodableError],
-    length: Ns,
-    beside: Ns = 0,
-    settings: str = "",
-    reached: Callable[[Ns], None] = lambda _: None,
-    twice: Sequence[Beside] = (),
-) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the poses of a topic in slices of the clock, the newest first.
-
-    Each with a time (log time, ns) that no pose of it is earlier than.
-
-    Args:
-        view: of the call.
-        topic: of the poses.
-        window: of log time.
-        kind: what is made; it is stored, and joined by stretches of the clock.
-        make: makes it.
-        failures: as for `pose_rows`.
-        length: of a slice (ns); they are counted from the epoch.
-        beside: poses so far before and after a slice (ns) are with it, too.
-        settings: what it depends on besides the poses.
-        reached: as for `scan`.
-        twice: recordings that are beside each other: the poses are those of the first.
-
-    Raises:
-        InvalidArgumentsError: while it is iterated, messages carry no position.
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
-    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
-    reader = PoseReader(view, failures, twice)
-
-    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
-        around = stretch.window.widened(beside)
-        rows = opened.rows(newest_first=True, among=around)
-        every = map(reader.block, blocks(rows, newest_first=True))
-        needs_all = stretch.parts is not None or not view.call.stored
-        found = (block for block in every if block.parts or needs_all)
-        for some in slices_back(found, length, beside):
-            if stretch.window.overlaps(some.start, some.stop - 1):
-                made = partial(make, some)
-                yield some.start, remembered(view, kind, some.key(settings), made, reader.trouble)
-
-    def key_of(stretch: Stretch) -> FragmentKey | None:
-        around = stretch.window.widened(beside)
-        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
-        if not near:
-            return stretch.key(settings)
-        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
-        left_out = repr(
-            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
-        )
-        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
-
-    yield from joined_back(
-        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
-    )
-
-
-class PoseSlice:
-    """The poses in a slice of the clock, and those beside it.
-
-    Attributes:
-        start: log time (ns) where it begins.
-        stop: where it ends.
-    """
-
-    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
-        self.start, self.stop = start, stop
-        self._beside = beside
-        self._blocks = blocks
-
-    @property
-    def poses(self) -> Poses:
-        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
-        start, stop = self.start - self._beside, self.stop + self._beside
-        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
-
-    def key(self, settings: str) -> FragmentKey | None:
-        """Returns what the poses are told apart by; None where not all are of whole parts."""
-        parts: list[int] = []
-        for block in self._blocks:
-            if block.parts is None:
-                return None
-            parts += block.parts
-        return FragmentKey(self.start, settings, tuple(parts))
-
-
-def slices_back(blocks: Iterable[PoseRows], length: Ns, beside: Ns = 0) -> Iterator[PoseSlice]:
-    """Yields the slices of the clock in which there may be poses, the newest first.
-
-    Args:
-        blocks: from `pose_rows`, the newest first.
-        length: of a slice (ns); they are counted from the epoch.
-        beside: poses so far before and after a slice (ns) are with it, too.
-    """
-    held: list[PoseRows] = []
-    waiting: set[int] = set()
-
-    def done(oldest: Ns) -> Iterator[PoseSlice]:
-        """Yields the slices that reach no poses older than the oldest that is held."""
-        for number in sorted(waiting, reverse=True):
-            start, stop = number * length, (number + 1) * length
-            if start - beside < oldest:
-                return
-            waiting.discard(number)
-            near = [each for each in held if each.last >= start - beside]
-            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
-
-    for block in blocks:
-        newest = max(waiting, default=block.last // length)
-        held = [each for each in held if each.first < (newest + 1) * length + beside]
-        held.append(block)
-        waiting.update(block.slices(length))
-        yield from done(block.first)
-    yield from done(MIN_NS)
 
 
 def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:

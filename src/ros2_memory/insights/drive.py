@@ -50,8 +50,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.driven_path import DrivenPath
-    from ros2_memory.history.poses import PoseSlice
+    from ros2_memory.history.driven_path import DrivenPath, PoseSlice
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
