@@ -19,7 +19,8 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import GAP_PERIODS, TimedPosition, is_place
+from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
+from ros2_memory.analysis.poses import NO_POSES, joined_poses
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.driven_path import DrivenPath
@@ -253,14 +255,11 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntA
     return found
 
 
-def _poses(
-    view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
-) -> list[TimedPosition]:
-    found: list[TimedPosition] = []
+def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:
+    """Returns the poses of some recordings in a window that are at a place."""
+    found = pose_rows(view, topic, window, [], among=recordings.__contains__)
     try:
-        for block in pose_rows(view, topic, window, [], among=recordings.__contains__):
-            rows = zip(block.poses.times.tolist(), block.poses.positions.tolist(), strict=True)
-            found += [TimedPosition(time, (x, y, z)) for time, (x, y, z) in rows]
+        poses = joined_poses([each.poses for each in found])
     except InvalidArgumentsError:
-        return []
-    return [pose for pose in found if is_place(pose.position)]
+        return NO_POSES
+    return poses.rows(np.flatnonzero(are_places(poses.positions)))
