@@ -100,7 +100,7 @@ def note_unread(
     bag_dir = view.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
         for sentence in (
-            *describe_deleted(view.snapshot, bag_dir, window),
+            *describe_deleted(view, window),
             *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         ):
@@ -187,20 +187,20 @@ def _unrecorded(
     return [(start, end) for start, end in parts if end - start > snapshot.shortest_gap]
 
 
-def deleted_between(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+def deleted_between(view: View, window: TimeWindow) -> Spans:
     """Returns the parts of a window that were recorded, and that retention deleted since.
 
     Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
     """
     return [
         (max(start, window.start), min(stop, window.stop))
-        for start, stop in _deleted_near(snapshot, bag_dir, window)
+        for start, stop in _deleted_near(view, window)
     ]
 
 
-def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+def _deleted_near(view: View, window: TimeWindow) -> Spans:
     """Returns the same, as far as it reaches out of the window."""
-    gone = deleted_spans(bag_dir)
+    snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
         return []
     found: Spans = []
@@ -219,13 +219,13 @@ def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Span
 
 def deleted_length(view: View, window: TimeWindow) -> Ns:
     """Returns for how long something was recorded in a window that retention deleted since."""
-    parts = deleted_between(view.snapshot, view.bag_dir, window)
+    parts = deleted_between(view, window)
     return sum(stop - start for start, stop in parts)
 
 
-def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on what retention deleted of a window, if it did, and around that."""
-    spans = [_span_text(*each) for each in _deleted_near(snapshot, bag_dir, window)]
+    spans = [_span_text(*each) for each in _deleted_near(view, window)]
     if spans:
         named = listed(spans[-MAX_NAMED:], len(spans))
         yield f"recorded, and deleted by retention since: {named}"
@@ -295,7 +295,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     whole = all(map(is_whole, view.timeline.faulty(window)))
     excluded = excluded_between(view.bag_dir, window.start, window.stop)
     forgotten = any(was_forgotten(view.bag_dir, each, window) for each in topics)
-    forgotten |= bool(deleted_between(view.snapshot, view.bag_dir, window))
+    forgotten |= bool(deleted_between(view, window))
     forgotten |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not forgotten:
         return ()
@@ -493,7 +493,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     whole = end - start
     window = f"between {unix_text(start)} and {unix_text(end)}"
     asked_for = TimeWindow(start, end)
-    deleted = deleted_between(view.snapshot, memory.index.bag_dir, asked_for)
+    deleted = deleted_between(view, asked_for)
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(window, deleted=bool(deleted)))
     elif gaps or max(outside) > _EDGE_NS:

@@ -330,10 +330,14 @@ def no_data_at(
     if older and newer and around is None and reason is NoDataReason.GAP:
         reason, why = _within_recording(view, older, newer)
         detail += why
-    detail += _advice(view, reason)
-    if _is_to_come(view, at):
-        detail.append(_to_come(view, at))
-    elif older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
+    to_come = _to_come(view, at)
+    detail += [*_advice(view, reason), *to_come]
+    if (
+        not to_come
+        and older
+        and tolerance is not None
+        and at - older.time <= max(_NEAR_NS, 2 * tolerance)
+    ):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -375,9 +379,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
         detail.append(f"the first one after is at {unix_text(newer.time)}")
     newest = min(end, max(start, view.memory.clock.now()))
     reason = between(view, window) if is_between else beyond(view, newest)
-    detail += _advice(view, reason)
-    if _is_to_come(view, start):
-        detail.append(_to_come(view, start))
+    detail += [*_advice(view, reason), *_to_come(view, start)]
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -403,16 +405,14 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         when = f"after {unix_text(start)}"
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = deleted_between(view.snapshot, view.bag_dir, asked)
+    deleted = deleted_between(view, asked)
     detail = [why_nothing(when, deleted=bool(deleted))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
         reason = between(view, asked)
     else:
         reason = beyond(view, start)
-    detail += _advice(view, reason)
-    if _is_to_come(view, start):
-        detail.append(_to_come(view, start))
+    detail += [*_advice(view, reason), *_to_come(view, start)]
     raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
 
 
@@ -486,26 +486,24 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     """
     if being_written(view.snapshot, window):
         return NoDataReason.NOT_CLOSED_YET
-    deleted = deleted_between(view.snapshot, view.bag_dir, window)
+    deleted = deleted_between(view, window)
     return NoDataReason.DELETED if deleted else NoDataReason.GAP
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:
     """Returns why a moment with no message on one of its sides has no answer."""
     latest = view.snapshot.latest
-    if latest is not None and at > latest and view.snapshot.active and not _is_to_come(view, at):
+    if latest is not None and at > latest and view.snapshot.active and not _to_come(view, at):
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.OUTSIDE_RANGE
 
 
-def _is_to_come(view: View, at: Ns) -> bool:
-    """Whether a moment is later than now by more than two clocks differ: nothing waits for it."""
-    return at > view.memory.clock.now() + _CLOCKS_DIFFER_NS
-
-
-def _to_come(view: View, at: Ns) -> str:
+def _to_come(view: View, at: Ns) -> list[str]:
+    """Returns a sentence for a moment that is later than now by more than two clocks differ."""
     now = view.memory.clock.now()
-    return f"the time asked is {seconds(at - now)} in the future: it is {unix_text(now)} now"
+    if at <= now + _CLOCKS_DIFFER_NS:
+        return []
+    return [f"the time asked is {seconds(at - now)} in the future: it is {unix_text(now)} now"]
 
 
 def undecodable(error: UndecodableError) -> NoDataError:
