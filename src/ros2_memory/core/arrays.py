@@ -41,7 +41,7 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
     return greatest
 
 
-def rows_of(table: T, which: Ints | NDArray[np.bool_]) -> T:
+def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
     """Returns some rows of a table, which is a dataclass with a column in each field."""
     names = [each.name for each in fields(table)]
     return replace(table, **{name: getattr(table, name)[which] for name in names})

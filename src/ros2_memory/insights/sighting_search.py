@@ -18,6 +18,7 @@ import numpy as np
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns.stored import StoredTable, joined_stored
 from ros2_memory.columns.truth import ColumnCondition, Truth
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
@@ -47,7 +48,8 @@ _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
 
 
-class Tested(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
     """Messages of a topic, ordered by log time, and which of them meet a condition.
 
     Attributes:
@@ -59,14 +61,6 @@ class Tested(NamedTuple):
     times: IntArray
     met: NDArray[np.uint8]
     sources: IntArray
-
-    def until(self, stop: int) -> Tested:
-        """Returns the first `stop` of them."""
-        return Tested(self.times[:stop], self.met[:stop], self.sources[:stop])
-
-    def since(self, start: int) -> Tested:
-        """Returns the others."""
-        return Tested(self.times[start:], self.met[start:], self.sources[start:])
 
 
 class Block(NamedTuple):
@@ -158,26 +152,14 @@ class Matching:
         truth = self._test.truth(table) if parts[0].may_match else Truth(len(table))
         self.ruled_out |= truth.is_none
         first, last = max(parts[0].first, window.start), min(parts[-1].last, window.stop - 1)
-        if truth.is_none:
+        tested = partial(self._tested, topic, parts, truth)
+        return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
-            def none_met() -> Tested:
-                times = _times(parts)
-                none = np.zeros(times.size, np.uint8)
-                return Tested(times, none, self._sources(topic, parts))
-
-            return Block(topic, first, last, has_match=False, tested=none_met)
-        met, unsure = truth.met, truth.unsure
-        if any(rows.index is not None for rows in parts):
-            counting = np.concatenate([rows.mask() for rows in parts])
-            met, unsure = met[counting], unsure[counting]
+    def _tested(self, topic: str, parts: Sequence[Rows], truth: Truth) -> Tested:
+        counting = np.concatenate([rows.mask() for rows in parts])
+        met, unsure = truth.met[counting], truth.unsure[counting]
         self.ruled_out |= not (met | unsure).all()
-        test = partial(self._tested, topic, parts, met, unsure)
-        return Block(topic, first, last, has_match=bool((met | unsure).any()), tested=test)
-
-    def _tested(
-        self, topic: str, parts: Sequence[Rows], met: NDArray[np.bool_], unsure: NDArray[np.bool_]
-    ) -> Tested:
-        times, found = _times(parts), met.astype(np.uint8)
+        times, found = np.concatenate([rows.times for rows in parts]), met.astype(np.uint8)
         sources = self._sources(topic, parts)
         undecided = np.flatnonzero(unsure)
         if undecided.size:
@@ -230,10 +212,6 @@ def _follows(older: Rows, newer: Rows) -> bool:
     )
 
 
-def _times(parts: Sequence[Rows]) -> IntArray:
-    return np.concatenate([rows.times for rows in parts])
-
-
 def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
     """Returns two blocks that overlap as those messages that are newer than both can share, if any.
 
@@ -243,18 +221,11 @@ def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
         if not empty.tested().times.size:
             return None, rest
     in_order = sorted((one, other), key=lambda block: (block.first, block.last))
-    joined = _joined([block.tested() for block in in_order])
+    joined = stacked([block.tested() for block in in_order])
+    joined = rows_of(joined, np.lexsort((joined.sources, joined.times)))
     cut = int(np.searchsorted(joined.times, other.last, side="right"))
-    newer, older = joined.since(cut), joined.until(cut)
+    newer, older = rows_of(joined, slice(cut, None)), rows_of(joined, slice(cut))
     return _of(one.topic, newer) if newer.times.size else None, _of(one.topic, older)
-
-
-def _joined(parts: Sequence[Tested]) -> Tested:
-    times = np.concatenate([part.times for part in parts])
-    met = np.concatenate([part.met for part in parts])
-    sources = np.concatenate([part.sources for part in parts])
-    order = np.lexsort((sources, times))
-    return Tested(times[order], met[order], sources[order])
 
 
 def _of(topic: str, tested: Tested) -> Block:
@@ -290,7 +261,7 @@ def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
     A run ends with a message that does not match, and where none comes for longer than
     `silence_ns`. With `apart` each match is a run of its own.
     """
-    times, met, _ = tested
+    times, met = tested.times, tested.met
     begins = np.empty(times.size, np.bool_)
     begins[0], begins[1:] = False, np.diff(times) > silence_ns
     # Of two matches, this differs where a message that is none, or a silence, lies between them.
@@ -476,7 +447,7 @@ def _counting(block: Block, scope: Scope) -> Block:
         counts = np.array([scope.holds_at(time) for time in times], np.bool_)
         met = found.met.copy()
         met[matches[~counts]] = NOT_MET
-        return found._replace(met=met)
+        return replace(found, met=met)
 
     return block._replace(tested=tested)
 
