@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -232,27 +232,20 @@ def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
     return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
 
 
-def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
+def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, IntArray]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
-    found: dict[Path, tuple[IntArray, IntArray]] = {}
+    found: dict[Path, list[IntArray]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.columns
 
     for rows in scan(view, topic, window, may_match=may_match):
         column = rows.table.columns.get(_STAMP)
-        if column is None or isinstance(column, Texts):
-            continue
-        stamps = np.asarray(column, np.int64)
-        stamps = stamps if rows.index is None else stamps[rows.index]
-        inside = (rows.times >= window.start) & (rows.times < window.stop)
-        times, stamps = rows.times[inside], stamps[inside]
-        known = found.get(rows.recording, (times[:0], stamps[:0]))
-        found[rows.recording] = (
-            np.concatenate([known[0], times]),
-            np.concatenate([known[1], stamps]),
-        )
-    return found
+        if column is not None and not isinstance(column, Texts):
+            stamps = np.asarray(column, np.int64)
+            stamps = stamps if rows.index is None else stamps[rows.index]
+            found[rows.recording].append(np.stack((rows.times, stamps)))
+    return {path: np.concatenate(parts, axis=1) for path, parts in found.items()}
 
 
 def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:

@@ -120,8 +120,7 @@ def pick(
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    begins = [each.bounds(topic)[0] for each in view.timeline.segments_in(window)]
-    edges = np.unique(np.concatenate([np.empty(0, np.int64), *begins]))
+    edges = np.unique(view.bounds(topic, window)[0])
     counts = count_messages(view, topic, window, edges).messages
     ends = np.cumsum(counts)
     chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)

@@ -10,7 +10,6 @@ from ros2_memory.analysis.frames import AGREEMENT_NS
 from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.arrays import merged_times
-from ros2_memory.core.errors import UndecodableError
 from ros2_memory.history.scan import messages_of
 from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import detections_of
@@ -92,10 +91,8 @@ class DetectionRows:
 
     def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
         """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
-        extractor = self._view.extractor
-        try:
-            message = self._view.memory.reader.decode(found.record)
-        except UndecodableError:
+        extractor, message = self._view.extractor, self._view.bags.decode(found)
+        if message is None:
             return []
         frame = extractor.frame(message)
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))

@@ -423,7 +423,7 @@ class ReverseSearch:
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
         found = self._view.stream.newest(topic, TimeWindow.everything())
-        value = None if found is None else self._value(found)
+        value = None if found is None else self._view.value(found)
         field = self.condition.field
         if found is None or value is None:
             return None
@@ -432,7 +432,7 @@ class ReverseSearch:
             older = self._view.stream.messages(
                 [topic], TimeWindow(MIN_NS, found.time), newest_first=True
             )
-            values = map(self._value, islice(older, _MOST_EMPTY))
+            values = map(self._view.value, islice(older, _MOST_EMPTY))
             value = next((each for each in values if not is_unknown_below(each, field)), value)
         schema = found.record.channel.schema
         refusal = refusal_for(self.condition, value)
@@ -442,11 +442,6 @@ class ReverseSearch:
         field = (self.condition.field or "").rpartition(".")[2]
         constants = _constants_named(schema, field, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
-
-    def _value(self, found: StoredMessage) -> JsonValue:
-        message = self._view.bags.decode(found)
-        type_name = found.record.channel.schema.name
-        return None if message is None else self._view.extractor.exact(message, type_name)
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""

@@ -291,18 +291,19 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
-    for each in found:
-        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
-        view.notes.add(
-            f"{each.first.name} and {each.other.name} have different messages on {topic} from "
-            f"{start} to {stop}, as after a clock was set back, or from two robots: the path there "
-            f"is that of {each.first.name}"
+    for each in [*found, *_beside_themselves(view, window)]:
+        name, start, stop = (
+            each.first.name,
+            unix_text(each.span.start),
+            unix_text(each.span.stop - 1),
         )
-    for each in _beside_themselves(view, window):
-        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
         view.notes.add(
-            f"{each.first.name} has the time from {start} to {stop} twice, as the clock was set "
-            "back meanwhile: the path there is that from before"
+            f"{name} has the time from {start} to {stop} twice, as the clock was set back "
+            "meanwhile: the path there is that from before"
+            if each.first == each.other
+            else f"{name} and {each.other.name} have different messages on {topic} from {start} to "
+            f"{stop}, as after a clock was set back, or from two robots: the path there is that of "
+            f"{name}"
         )
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
@@ -34,8 +36,11 @@ from ros2_memory.history.scan import open_scan, scan
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions
+    from ros2_memory.storage.base import IntArray
 
 
 _CENSUSES: Final[Key[dict[str, dict[str, Census]]]] = Key()
@@ -93,6 +98,18 @@ class View:
     def has_poses(self) -> bool:
         """Whether a topic has the robot's poses; else transforms may place it."""
         return has_poses(self)
+
+    def value(self, found: StoredMessage) -> JsonValue:
+        """Returns all that a message has; None where it cannot be decoded."""
+        message = self.bags.decode(found)
+        return None if message is None else self.extractor.exact(message, found.type)
+
+    def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
+        """Returns the first and the last log time of a topic in each bag of a window, or near."""
+        none = np.empty(0, np.int64)
+        every = [each.bounds(topic) for each in self.timeline.segments_in(window)]
+        firsts, lasts = zip((none, none), *every, strict=True)
+        return np.concatenate(firsts), np.concatenate(lasts)
 
     def note_thinned(self, window: TimeWindow) -> None:
         """Records that what was read lies in a window, where that is partly in thinned days."""

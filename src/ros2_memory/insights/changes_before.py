@@ -405,8 +405,6 @@ def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
         if BATTERY not in timeline.types_of(topic):
             continue
         found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
-        message = None if found is None else view.bags.decode(found)
-        if message is not None:
-            part = charge_of(view.extractor.exact(message, BATTERY))
-            if part is not None:
-                yield topic, f"{part:.0%}"
+        part = None if found is None else charge_of(view.value(found))
+        if part is not None:
+            yield topic, f"{part:.0%}"

@@ -84,9 +84,7 @@ def unrecorded_length(view: View, topic: str, path: DrivenPath, elapsed: Elapsed
     That is between two bags with poses, whatever others hold, and while the topic was silent.
     """
     window = TimeWindow(path.first, path.last + 1)
-    every = [each.bounds(topic) for each in view.timeline.segments_in(window)]
-    firsts = np.concatenate([np.empty(0, np.int64), *(first for first, _ in every)])
-    lasts = np.concatenate([np.empty(0, np.int64), *(last for _, last in every)])
+    firsts, lasts = view.bounds(topic, window)
     order = np.argsort(firsts, kind="stable")
     begins, ends = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
     apart = begins - ends > SHORTEST_GAP_NS

@@ -15,7 +15,6 @@ from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
@@ -155,12 +154,8 @@ def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
 
 def _state(view: View, found: StoredMessage) -> State | None:
     """Returns what a message states; None where it cannot be decoded."""
-    channel = found.record.channel
-    try:
-        message = view.memory.reader.decode(found.record)
-    except UndecodableError:
-        return None
-    return state_of(view.extractor.exact(message, channel.type), channel.type)
+    value = view.value(found)
+    return None if value is None else state_of(value, found.type)
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

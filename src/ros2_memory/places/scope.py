@@ -204,13 +204,11 @@ def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
     """
     spans = [(np.empty(0, np.int64), np.empty(0, np.int64))]
     for topic in topics:
-        within: list[tuple[Ns, Ns]] = []
-        for segment in view.timeline.segments_in(window):
-            firsts, lasts = segment.bounds(topic)
-            is_long = lasts - firsts > SILENCE_NS
-            spans.append((firsts[~is_long], lasts[~is_long]))
-            within += zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
-        if within:
+        firsts, lasts = view.bounds(topic, window)
+        is_long = lasts - firsts > SILENCE_NS
+        spans.append((firsts[~is_long], lasts[~is_long]))
+        within = zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
+        if is_long.any():
             every = scan(view, topic, window, columns=False, within=united(within))
             spans += [pieces_of(rows.times, rows.times) for rows in every]
     starts, stops = (np.concatenate(some) for some in zip(*spans, strict=True))
