@@ -542,7 +542,7 @@ def trajectory_summary(
     """
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
+    path, _ = driven_path(view, name, window)
     if path is None:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -553,7 +553,8 @@ def trajectory_summary(
     note_edges(view, window)
     elapsed = elapsed_in(view, window)
     unrecorded = unrecorded_length(view, name, path, elapsed)
-    driven = while_recorded(across_steps(path, elapsed), elapsed, path, unrecorded)
+    whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
+    driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path, unrecorded)
     drawn = _with_few_waypoints(driven, max_waypoints)
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)

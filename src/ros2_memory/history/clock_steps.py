@@ -38,11 +38,10 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import Pause
     from ros2_memory.storage.base import IntArray
@@ -108,12 +107,11 @@ def _note_timeout(view: View) -> None:
     )
 
 
-def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
+def across_steps(found: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
     """Returns the trajectory of a path on which a step of the clock is no gap, and takes no time.
 
     A step is a gap among poses that are often enough for it; see `odometry`.
     """
-    found = path.trajectory
     duration_s = found.totals.duration_s
     skipped = elapsed.skipped_between(path.first, path.last)
     if not skipped or found.poses < 2:
@@ -133,7 +131,7 @@ def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
 
 
 def while_recorded(
-    found: Trajectory, elapsed: Elapsed, path: DrivenPath, unrecorded: Ns
+    found: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
 ) -> Trajectory:
     """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
 

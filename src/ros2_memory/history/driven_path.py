@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
 from itertools import islice
@@ -13,7 +12,6 @@ import numpy as np
 
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import (
-    MAX_WAYPOINTS,
     SLICE_NS,
     joined_slices,
     path_slice,
@@ -76,59 +74,36 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-@dataclass(frozen=True, slots=True)
-class DrivenPath:
-    """A path, its frames in order of appearance, and the times of its first and last message.
+class FoundWay(NamedTuple):
+    """The path of a window, None where there is no message.
 
     From `since` (log time, ns) on, where older bags were not read.
     """
-
-    trajectory: Trajectory
-    frames: tuple[str, ...]
-    first: Ns
-    last: Ns
-    since: Ns | None = None
-
-
-class FoundWay(NamedTuple):
-    """The path of a window; from `since` (log time, ns) on, where older bags were not read."""
 
     way: PathSlice | None
     since: Ns | None = None
 
 
-def driven_path(
-    view: View, topic: str, window: TimeWindow, max_waypoints: int = MAX_WAYPOINTS
-) -> DrivenPath | None:
-    """Returns the path in a window by the poses of one topic; None where there is no message.
+def driven_path(view: View, topic: str, window: TimeWindow) -> FoundWay:
+    """Does as `way_in`; a note says how far back it is known where not all was read."""
+    found = way_in(view, topic, window)
+    if found.since is not None:
+        view.notes.add_lack(
+            f"the path is known back to {unix_text(found.since)}: out of time before older bags "
+            "were read"
+        )
+    return found
 
-    It is drawn with `max_waypoints` (2 or more) at most, or not at all for 0. Notes say what cannot
-    be decoded, and how far back it is known where the time was over before all was read.
+
+def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
+    """Returns the path in a window by the poses of one topic.
+
+    Messages that cannot be decoded are left out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
         NoDataError: no message can be decoded.
         QueryTimeoutError: the call's time runs out before any result.
-    """
-    way, since = way_in(view, topic, window)
-    note_known_since(view, since)
-    if way is None:
-        return None
-    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last, since)
-
-
-def note_known_since(view: View, since: Ns | None) -> None:
-    """Notes since when a path is known, where older bags were not read."""
-    if since is not None:
-        view.notes.add_lack(
-            f"the path is known back to {unix_text(since)}: out of time before older bags were read"
-        )
-
-
-def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
-    """Returns the path in a window by the poses of one topic; raises as `driven_path`.
-
-    Messages that cannot be decoded are left out, with a note.
     """
     fastest = view.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []

@@ -29,7 +29,7 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
 )
-from ros2_memory.history.driven_path import length_notes, resolve_path_topic, way_in
+from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
@@ -204,7 +204,7 @@ def recap(
     if there is None or region is None:
         answer = _with_way(view, answer, drive)
     else:
-        answer = _with_way_there(view, answer, drive, window, there)
+        answer = _with_way_there(answer, drive, there)
         answer = replace(answer, where=region.shown)
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
@@ -272,7 +272,7 @@ class _There:
 
 
 def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
-    for note in () if drive.path is None else length_notes(drive.path.trajectory):
+    for note in () if drive.trajectory is None else length_notes(drive.trajectory):
         view.notes.add(note)
     known = drive.known
     if known is None:
@@ -286,14 +286,10 @@ def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
     )
 
 
-def _with_way_there(
-    view: View, answer: Recap, drive: Drive, window: TimeWindow, there: _There
-) -> Recap:
+def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    driven = None
-    if drive.path is not None:
-        way, _ = way_in(view, resolve_path_topic(view), window)
-        driven = totals_inside(way.line, there.spans) if way is not None and way.poses else None
+    way = drive.path
+    driven = None if way is None or not way.poses else totals_inside(way.line, there.spans)
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.analysis.motion.trajectory import PathSlice
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
-    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
 
@@ -78,7 +78,7 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[N
     return united([*recording_gaps(view, window), *_silent(view, topic, window)])
 
 
-def unrecorded_length(view: View, topic: str, path: DrivenPath, elapsed: Elapsed) -> Ns:
+def unrecorded_length(view: View, topic: str, path: PathSlice, elapsed: Elapsed) -> Ns:
     """Returns for how long no poses were recorded between the first and the last of a path.
 
     That is between two bags with poses, whatever others hold, and while the topic was silent.

@@ -21,7 +21,7 @@ from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
-from ros2_memory.history.driven_path import note_known_since, resolve_path_topic, way_in
+from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
@@ -70,8 +70,7 @@ def driven_inside(
     region = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    way, since = way_in(view, name, window)
-    note_known_since(view, since)
+    way, _ = driven_path(view, name, window)
     if way is None or not way.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)

@@ -238,10 +238,10 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     None, with a note, if the time for the answer runs out first.
     """
     try:
-        path = driven_path(view, topic, TimeWindow(since, MAX_NS))
+        path, _ = driven_path(view, topic, TimeWindow(since, MAX_NS))
     except (InvalidArgumentsError, NoDataError):
         return ()  # poses that cannot be read say nothing about resets
     except QueryTimeoutError:
         view.notes.add_lack("there was no time to check whether odometry restarted since")
         return ()
-    return () if path is None else path.trajectory.totals.resets
+    return () if path is None else path.totals.resets
