@@ -268,10 +268,10 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     foreign_files = frozenset[str]() if foreign is None else foreign.files
     foreign_bytes = None if foreign is None else foreign.total_bytes
     used -= 0 if foreign is None else foreign.bag_bytes
+    state = state_bytes_in(memory.index.bag_dir)
+    used += state
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
     if heartbeat is None or not (recording and heartbeat.is_live(wall)):
-        state = state_bytes_in(memory.index.bag_dir)
-        used += state
         return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes, state)
     grown, since = 0, latest
     if latest is not None:
@@ -282,8 +282,6 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
                 continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
-    state = state_bytes_in(memory.index.bag_dir)
-    used += state
     if heartbeat.counted_bytes is not None:
         used, state = heartbeat.counted_bytes, heartbeat.state_bytes
     span = 0 if latest is None or since is None else latest - since

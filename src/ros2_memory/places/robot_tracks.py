@@ -410,15 +410,10 @@ NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zero
 
 def _joined(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    times = np.concatenate([part.times for part in parts])
-    order = np.argsort(times, kind="stable")
-    return Placed(
-        times[order],
-        np.concatenate([part.x for part in parts])[order],
-        np.concatenate([part.y for part in parts])[order],
-        np.concatenate([part.heading for part in parts])[order],
-        sum(part.left_out for part in parts),
-    )
+    times, x, y, heading, left_out = zip(*parts, strict=True)
+    order = np.argsort(np.concatenate(times), kind="stable")
+    columns = (np.concatenate(column)[order] for column in (times, x, y, heading))
+    return Placed(*columns, left_out=sum(left_out))
 
 
 def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
@@ -558,8 +553,7 @@ def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
     if not count:
         return []
     # A piece of a single vertex is a step of no length.
-    ends = np.append(track.begins[1:], [True])
-    after = np.where(ends, np.arange(count), np.arange(count) + 1)
+    after = np.arange(count) + ~track.ends
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
     parts = parts_inside(region, steps)
     lasted = track.times[after] - track.times

@@ -68,10 +68,14 @@ class RobotTrack:
     fastest_mps: float = math.inf
 
     @property
+    def ends(self) -> Mask:
+        """Whether a piece ends at the vertex."""
+        return np.append(self.begins[1:], [True])[: len(self.times)]
+
+    @property
     def pieces(self) -> tuple[Times, Times]:
         """The first and the last time of each piece (ns, inclusive)."""
-        ends = np.append(self.begins[1:], [True])[: len(self.times)]
-        return self.times[self.begins], self.times[ends]
+        return self.times[self.begins], self.times[self.ends]
 
 
 class TrackPart(NamedTuple):
