@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import has_errors
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted
@@ -21,7 +21,7 @@ from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.map_placement import known_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
@@ -83,7 +83,7 @@ def compare(
     frame, things = _things(view, windows, region)
     drives = [drive_in(view, each) for each in windows]
     ways = [_way(view, drive, each) for drive, each in zip(drives, windows, strict=True)]
-    placement = _placement(view)
+    placement = known_placement(view)
     elapsed = [each.elapsed for each in drives]
     places = _places(view, placement, windows, region, elapsed)
     apart = _paths_apart(view, placement, drives, windows, region)
@@ -158,14 +158,6 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
         "stood_s": None if stood is None else unix_from_ns(stood),
         "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
-
-
-def _placement(view: View) -> MapPlacement | None:
-    try:
-        topic = resolve_path_topic(view)
-        return map_placement(view, topic)
-    except (InvalidArgumentsError, NoDataError, UndecodableError):
-        return None
 
 
 class _WaysApart(NamedTuple):

@@ -18,11 +18,9 @@ from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.geometry import transform_point
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import (
     MIN_NS,
@@ -38,7 +36,7 @@ from ros2_memory.history.reverse_search import (
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.transforms import connects, transform_at
+from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.episodes import (
     SaidMeanwhile,
@@ -51,7 +49,7 @@ from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import robot_at
+from ros2_memory.places.pose_frames import pose_in, robot_at
 from ros2_memory.places.scope import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
@@ -61,7 +59,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue, Pose
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -421,8 +419,8 @@ def _spot_of(
     The newest message of all may be newer than the last transform: then one of those just before it
     counts. A note says where none of them can be placed.
     """
-    spot = _spot(view, thing, newest, robot, frame_id)
     targets = _targets(view, robot, frame_id)
+    spot = _spot(view, thing, newest, targets)
     if spot is None or spot.frame_id in targets:
         return spot
     try:
@@ -442,7 +440,7 @@ def _spot_of(
         value = condition.counted(extractor.exact(message, found.type))
         if condition.matches(value):
             seen = _matching(detections_of(value, extractor.frame(message)), condition)
-            earlier = _spot(view, seen, found, robot, frame_id)
+            earlier = _spot(view, seen, found, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
@@ -461,27 +459,16 @@ def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str,
 
 
 def _spot(
-    view: View,
-    thing: Detection | None,
-    found: StoredMessage,
-    robot: Pose | None,
-    frame_id: str | None,
+    view: View, thing: Detection | None, found: StoredMessage, targets: Sequence[str]
 ) -> LabelledPlace | None:
-    """Returns where the thing of a message was: in a frame of `_targets`, or the message's own."""
+    """Returns where the thing of a message was: in one of some frames, or the message's own."""
     if thing is None or thing.place is None:
         return None
-    for target in _targets(view, robot, frame_id):
-        if target == thing.frame_id:
-            return LabelledPlace(thing.label, thing.place, target)
-        try:
-            recording = found.bag.recording
-            found_transform = transform_at(
-                view, target, thing.frame_id, found.time, recording, explains=False
-            )
-        except NoDataError:
-            continue
-        in_target = transform_point(found_transform.transform, thing.place)
-        return LabelledPlace(thing.label, in_target, target)
+    seen = Pose(thing.place, None, thing.frame_id)
+    for target in targets:
+        there = pose_in(view, seen, target, found.time, found.bag.recording)
+        if there is not None:
+            return LabelledPlace(thing.label, there.position, target)
     return LabelledPlace(thing.label, thing.place, thing.frame_id)
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.history.driven_path import pose_frame
+from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
 from ros2_memory.history.transforms import connected, connects, sessions_of
 
 if TYPE_CHECKING:
@@ -57,6 +57,14 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
             "get_transform_at converts from other frames"
         )
     return placement
+
+
+def known_placement(view: View) -> MapPlacement | None:
+    """Returns how the robot's poses are placed; None where no topic of them is recorded."""
+    try:
+        return map_placement(view, resolve_path_topic(view))
+    except (InvalidArgumentsError, NoDataError, UndecodableError):
+        return None
 
 
 def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> MapPlacement:

@@ -12,15 +12,12 @@ from typing import TYPE_CHECKING
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import empty_track, place_at
 from ros2_memory.core.errors import (
-    InvalidArgumentsError,
-    NoDataError,
     QueryTimeoutError,
-    UndecodableError,
 )
 from ros2_memory.core.regions import places_at
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.map_placement import known_placement, map_placement
 from ros2_memory.places.robot_tracks import RobotTracks
 
 if TYPE_CHECKING:
@@ -84,10 +81,8 @@ def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) ->
     Raises:
         InvalidArgumentsError: no position is given in `frame_id`.
     """
-    try:
-        topic = resolve_path_topic(view)
-        usual = map_placement(view, topic)
-    except (InvalidArgumentsError, NoDataError, UndecodableError):
+    usual = known_placement(view)
+    if usual is None:
         return None
-    asked = usual if frame_id is None else map_placement(view, topic, frame_id)
+    asked = usual if frame_id is None else map_placement(view, resolve_path_topic(view), frame_id)
     return RobotPlaces(view, window, asked.frame_id, usual.pose_frame, usual.frame_id)
