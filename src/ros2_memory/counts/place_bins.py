@@ -15,7 +15,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.time_bins import TimeBins
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.where import places_setting

@@ -117,11 +117,14 @@ def deduplicate_backward(
 
     newer: list[StoredMessage] = []
     for number, some in groupby(found, key=slice_of):
-        older = [] if number is None else [*some]
-        yield from _kept(newer, older, spans)
-        newer = older
         if number is None:
+            yield from _kept(newer, [], spans)
+            newer = []
             yield from some
+        else:
+            older = [*some]
+            yield from _kept(newer, older, spans)
+            newer = older
     yield from _kept(newer, [], spans)
 
 

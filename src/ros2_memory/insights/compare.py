@@ -21,7 +21,7 @@ from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
-from ros2_memory.places.map_placement import known_placement
+from ros2_memory.places.pose_frames import known_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
     from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.pose_frames import MapPlacement
     from ros2_memory.places.two_paths import FarPoint
     from ros2_memory.places.where import Where
 

@@ -13,7 +13,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.places.where import parse_where

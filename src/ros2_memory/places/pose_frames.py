@@ -2,18 +2,20 @@
 
 Tools beyond the specification answer in `data.map_frame` where transforms lead there from the
 pose's own frame at the time in question, else in that frame; the specification's tools in the
-pose's own frame. `frame_id` asks for another.
+pose's own frame. `frame_id` asks for another. Places are in the map where transforms of some
+recording lead there, and else in the poses' own frame: odometry, which begins at its origin
+whenever the robot is started.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.frames import HOLD_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.regions import places_at
@@ -22,10 +24,17 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.driven_path import (
     body_by_transforms,
     newest_of_body,
+    pose_frame,
     resolve_path_topic,
     robot_body,
 )
-from ros2_memory.history.transforms import connects, newest_in_session, transform_at
+from ros2_memory.history.transforms import (
+    connected,
+    connects,
+    newest_in_session,
+    sessions_of,
+    transform_at,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -168,3 +177,66 @@ def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
         if names:
             return replace(pose, places=names)
     return pose
+
+
+@dataclass(frozen=True, slots=True)
+class MapPlacement:
+    """Which frames the robot's places are in.
+
+    Attributes:
+        frame_id: of the places.
+        pose_frame: of the poses.
+        is_map: whether the coordinates of places keep their meaning when odometry is reset.
+    """
+
+    frame_id: str
+    pose_frame: str
+    is_map: bool
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """The frames that positions are known in."""
+        return tuple(dict.fromkeys((self.frame_id, self.pose_frame)))
+
+
+def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPlacement:
+    """Returns how the poses of a topic are placed; in `frame_id` where one is given.
+
+    Raises:
+        InvalidArgumentsError: places are in another frame than `frame_id`, or it is of no poses.
+        QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
+        UndecodableError: no pose can be decoded.
+    """
+    frame = pose_frame(view, topic)
+    own = MapPlacement(frame, frame, frame == view.limits.map_frame)
+    asked_for = frame_id is not None
+    placement = own if frame_id == frame else _map_or_own(view, topic, own, asked_for)
+    if frame_id not in (None, placement.frame_id):
+        known = " or ".join(placement.frames)
+        raise InvalidArgumentsError(
+            f"frame_id was {abbreviate(frame_id)}; places are in {known}; "
+            "get_transform_at converts from other frames"
+        )
+    return placement
+
+
+def known_placement(view: View) -> MapPlacement | None:
+    """Returns how the robot's poses are placed; None where no topic of them is recorded."""
+    try:
+        return map_placement(view, resolve_path_topic(view))
+    except (InvalidArgumentsError, NoDataError, UndecodableError):
+        return None
+
+
+def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> MapPlacement:
+    """Returns the placement in the map, where transforms of some recording lead there."""
+    target, pose_frame = view.limits.map_frame, own.pose_frame
+    # No answer is better than one that denies a frame which is asked for, since the time is over.
+    leads = connects if asked_for else connected
+    if not target or target == pose_frame or not leads(view, (target, pose_frame)):
+        return own
+    recordings = view.timeline.recordings(topic).items()
+    lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
+    if any(leads(view, (target, pose_frame), among=each) for each in lending):
+        return MapPlacement(target, pose_frame, is_map=True)
+    return own

@@ -24,7 +24,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.spans import Spans
     from ros2_memory.history.view import View
-    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.pose_frames import MapPlacement
     from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
 

@@ -17,7 +17,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.regions import places_at
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.map_placement import known_placement, map_placement
+from ros2_memory.places.pose_frames import known_placement, map_placement
 from ros2_memory.places.robot_tracks import RobotTracks
 
 if TYPE_CHECKING:

@@ -40,10 +40,15 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
-from ros2_memory.history.frames import edges_of_rows, frames_over
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
-from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
+from ros2_memory.history.transforms import (
+    edges_of_rows,
+    frames_over,
+    lending_to,
+    sessions_of,
+    static_transforms,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -19,7 +19,7 @@ from ros2_memory.history.held_values import holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.where import note_other_frame, parse_where

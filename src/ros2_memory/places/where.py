@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.regions import Region
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
-    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.pose_frames import MapPlacement
     from ros2_memory.places.robot_tracks import Inside
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"

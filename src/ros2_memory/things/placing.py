@@ -23,10 +23,9 @@ from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import DetectionRows, joined_detected
-from ros2_memory.history.frames import frames_over
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
-from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.transforms import frames_over, sessions_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -17,9 +17,8 @@ from ros2_memory.analysis.frames import edges_of
 from ros2_memory.columns.transforms import pairs_in, stamped_between
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.frames import frames_over, transform_rows
 from ros2_memory.history.scan import scan
-from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.transforms import frames_over, sessions_of, transform_rows
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, tf, transform, write_mcap
 from tests.support.column_worlds import EVERYTHING, World

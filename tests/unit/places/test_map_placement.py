@@ -11,7 +11,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import connected
 from ros2_memory.history.view import View
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
