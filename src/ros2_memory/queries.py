@@ -89,7 +89,7 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
-from ros2_memory.insights.field_extremes import extremes_of
+from ros2_memory.insights.fields import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
 from ros2_memory.insights.status import (
     bags_with_remarks,

@@ -243,7 +243,7 @@ class _There:
     @property
     def length(self) -> Ns:
         """How long they were in all."""
-        return sum(self._elapsed.between(each.start, each.stop) for each in self.spans)
+        return self._elapsed.among((each.start, each.stop) for each in self.spans)
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""

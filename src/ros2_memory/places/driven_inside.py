@@ -78,12 +78,12 @@ def driven_inside(
     totals = totals_inside(way.line, inside)
     waypoints = way_inside(way.line, inside, max_waypoints)
     elapsed = elapsed_in(view, window)
-    duration = sum(elapsed.between(each.start, each.stop) for each in inside)
+    spans = [(each.start, each.stop) for each in inside]
+    duration = elapsed.among(spans)
     average = totals.distance_m / unix_from_ns(duration) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     require_one_robot(view, name, window)
-    spans = [(each.start, each.stop) for each in inside]
     away = None if farthest is None else farthest_from(view, farthest, name, spans, frame_id)
     note_unread(view, window)
     note_edges(view, window)

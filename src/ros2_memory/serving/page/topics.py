@@ -17,7 +17,7 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.no_data import topics_of_robot, topics_that_show_poses, topics_with
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
-from ros2_memory.insights.type_fields import fields_of
+from ros2_memory.insights.fields import fields_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
