@@ -193,13 +193,10 @@ class Beyond:
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any number at any depth is on that side."""
         return any(
-            self._is_beyond(leaf)
+            leaf > self.limit if self.above else leaf < self.limit
             for leaf in leaves(value)
             if isinstance(leaf, int | float) and not isinstance(leaf, bool)
         )
-
-    def _is_beyond(self, number: float) -> bool:
-        return number > self.limit if self.above else number < self.limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,12 +260,10 @@ class Condition:
     def _passes(self, value: JsonValue) -> bool:
         if self.field is None:
             return self.test.matches(value)
-        return any(self._meets(target) for target in at_field(value, self.field))
-
-    def _meets(self, target: JsonValue) -> bool:
-        if isinstance(self.test, Contains) and self.test.has_element(target):
+        targets, test = at_field(value, self.field), self.test
+        if isinstance(test, Contains) and any(map(test.has_element, targets)):
             return True
-        return self.test.matches(target)
+        return any(map(test.matches, targets))
 
     @property
     def can_be_refused(self) -> bool:
@@ -528,19 +523,19 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
     An empty list or a null in the value may be anything in another message, so nothing is refused
     for what would be below it.
     """
+    targets = [value]
     if condition.field is not None:
         if is_unknown_below(value, condition.field):
             return None
         targets = at_field(value, condition.field)
-        if targets:
-            return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
-        known = ", ".join(_paths(value)) or "none"
-        return f"the values have no field {condition.field!r}; their fields are: {known}"
-    if isinstance(condition.test, NearPosition):
+        if not targets:
+            known = ", ".join(_paths(value)) or "none"
+            return f"the values have no field {condition.field!r}; their fields are: {known}"
+    elif isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
         return _refusal_for_position(value)
-    return _refusal_for_number(condition, [value]) or _refusal_for_text(condition, [value])
+    return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
 
 
 def _refusal_for_position(value: JsonValue) -> str:

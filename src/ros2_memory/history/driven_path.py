@@ -448,7 +448,7 @@ def newest_of_body(
     if own and not sessions.recordings_of(own, tuple(topics)):
         own = None
     for found in view.stream.messages(topics, window, newest_first=True):
-        for each in decoded_transforms(view, found):
+        for each in decoded_transforms(view, [found]):
             if each.child.lstrip("/") != body.child or (own and not sessions.has(own, found)):
                 continue
             clock = frames_of(view, (), [each], parent).clock

@@ -350,17 +350,12 @@ def _within_recording(
     if is_thinned(older.bag.file):
         why = "of that time only some messages stayed: retention deleted the others"
         return NoDataReason.DELETED, [why]
-    period = _usual_period(view, older)
+    pace = view.timeline.pace(older.topic, older.bag.recording).topic
+    period = (pace.last - pace.first) // max(pace.messages - 1, 1)
     if newer.time - older.time <= 2 * period:
         every = f"the topic has a message every {seconds(period)}"
         return NoDataReason.BETWEEN_MESSAGES, [every]
     return NoDataReason.GAP, []
-
-
-def _usual_period(view: View, found: StoredMessage) -> Ns:
-    """Returns the mean time between the messages of a topic in the recording of one of them."""
-    pace = view.timeline.pace(found.topic, found.bag.recording).topic
-    return (pace.last - pace.first) // max(pace.messages - 1, 1)
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:

@@ -134,6 +134,10 @@ class Sessions:
         """Whether a recording is of carried messages."""
         return self.folder(recording) == self._carried
 
+    def may_hold(self, session: Session, recording: Path) -> bool:
+        """Whether messages of a recording may be of a session."""
+        return self.holds_carried(recording) or self.folder(recording) in session
+
     def of(self, recording: Path) -> Session:
         """Returns the session of a recording."""
         return self._of(self.folder(recording))
@@ -241,21 +245,16 @@ class Sessions:
         topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
         recordings = map(self._view.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
-        chains = _joined(paths) if len(paths) > 1 else {}
+        chains = components(
+            (folder, f"{folder.rpartition('/')[0]}/{name}")
+            for folder, path in (paths.items() if len(paths) > 1 else ())
+            for name in _neighbours(path)
+        )
         return _Recorded(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
             [*self._spans_of((pose_topic,)).items()],
             {folder: frozenset(each | {self._carried}) for folder, each in chains.items()},
         )
-
-
-def _joined(paths: Mapping[str, Path]) -> dict[str, set[str]]:
-    """Returns, by folder, all folders that are joined with it by handovers, itself included."""
-    return components(
-        (folder, f"{folder.rpartition('/')[0]}/{name}")
-        for folder, path in paths.items()
-        for name in _neighbours(path)
-    )
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:

@@ -224,12 +224,9 @@ def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTra
     sessions, topics = sessions_of(view), _recorded(view, view.limits.tf_topics)
     bags = _bags_of(view, topics, window, among)
     merged = view.stream.merged(bags, topics, window, newest_first=False)
-    return [
-        one
-        for found in view.bags.track_sources(merged)
-        if sessions.has(among, found)
-        for one in decoded_transforms(view, found)
-    ]
+    tracked = view.bags.track_sources(merged)
+    own = (found for found in tracked if sessions.has(among, found))
+    return [*decoded_transforms(view, own)]
 
 
 def frames_of(
@@ -320,9 +317,7 @@ def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransfo
     sessions = sessions_of(view)
     for rows in scan(view, topic, _span_of(view, topic, among), copies=True):
         if sessions.holds_carried(rows.recording):
-            for found in messages_of(view, rows):
-                if sessions.has(among, found):
-                    yield from decoded_transforms(view, found)
+            yield from decoded_transforms(view, _messages_in(view, rows, among))
         elif sessions.folder(rows.recording) in among:
             yield from _changes_in(view, rows).transforms
 
@@ -340,17 +335,14 @@ def _changes_in(view: View, rows: Rows) -> Statics:
     def make() -> Statics:
         times = static_times(rows.table, rows.times, rows.index)
         some = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
-        received = sorted(_decoded(view, some), key=lambda one: one.log_time)
+        received = sorted(
+            decoded_transforms(view, messages_of(view, some)), key=lambda one: one.log_time
+        )
         return Statics(relative(str(rows.recording), str(view.bag_dir)), tuple(_changes(received)))
 
     part = rows.part
     key = None if part is None else FragmentKey(rows.first, "", (part,))
     return remembered(view, STATICS, key, make)
-
-
-def _decoded(view: View, rows: Rows) -> Iterator[StampedTransform]:
-    for found in messages_of(view, rows):
-        yield from decoded_transforms(view, found)
 
 
 def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
@@ -433,9 +425,7 @@ def _pairs_in(
         window = window.intersect(_span_of(view, topic, among))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
         if among is not None and sessions_of(view).holds_carried(rows.recording):
-            sessions = sessions_of(view)
-            found = (each for each in messages_of(view, rows) if sessions.has(among, each))
-            yield _pairs_of(view, found)
+            yield _pairs_of(view, _messages_in(view, rows, among))
         elif among is None or sessions_of(view).folder(rows.recording) in among:
             part = rows.part
             known = None if part is None else scanner.pairs.get(part)
@@ -454,8 +444,7 @@ def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
 
 
 def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
-    read = (one for each in messages for one in decoded_transforms(view, each))
-    return frozenset((one.parent, one.child) for one in read)
+    return frozenset((one.parent, one.child) for one in decoded_transforms(view, messages))
 
 
 def _explained(
@@ -580,13 +569,10 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
     for topic in _recorded(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
-            is_mixed = sessions.holds_carried(rows.recording)
-            if not is_mixed and sessions.folder(rows.recording) not in among:
-                continue
-            near = stamped_between(rows.table, rows.index, earliest, latest)
-            for found in messages_of(view, rows if near is None else rows.some(near)):
-                if not is_mixed or sessions.has(among, found):
-                    yield from decoded_transforms(view, found)
+            if sessions.may_hold(among, rows.recording):
+                near = stamped_between(rows.table, rows.index, earliest, latest)
+                some = rows if near is None else rows.some(near)
+                yield from decoded_transforms(view, _messages_in(view, some, among))
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
@@ -606,16 +592,24 @@ def _bags_of(
     return [each for each in bags if each.bag.recording in chosen]
 
 
-def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
-    """Returns the transforms of a message; none, with a note, where it cannot be decoded."""
-    is_static = found.topic in view.limits.tf_static_topics
-    with view.call.stages.timed("extract"):
-        try:
-            message = view.memory.reader.decode(found.record)
-            return view.extractor.transforms(message, found.time, static=is_static)
-        except UndecodableError as error:
-            view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
-            return ()
+def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:
+    """Yields the transforms of messages; a note names the topics that cannot be decoded."""
+    for found in messages:
+        is_static = found.topic in view.limits.tf_static_topics
+        with view.call.stages.timed("extract"):
+            try:
+                message = view.memory.reader.decode(found.record)
+                some = view.extractor.transforms(message, found.time, static=is_static)
+            except UndecodableError as error:
+                view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
+                continue
+        yield from some
+
+
+def _messages_in(view: View, rows: Rows, among: Session) -> Iterator[StoredMessage]:
+    """Returns the messages of some rows that are of a session."""
+    has = sessions_of(view).has
+    return (found for found in messages_of(view, rows) if has(among, found))
 
 
 def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
@@ -625,11 +619,10 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
         QueryTimeoutError: the call's time is over.
     """
     sessions = sessions_of(view)
-    if sessions.holds_carried(rows.recording):
-        found = (each for each in messages_of(view, rows) if sessions.has(among, each))
-        return _by_message(view, found)
-    if sessions.folder(rows.recording) not in among:
+    if not sessions.may_hold(among, rows.recording):
         return {}
+    if sessions.holds_carried(rows.recording):
+        return edges_of(decoded_transforms(view, _messages_in(view, rows, among)))
     known = of_columns(view, rows, lambda each: edges_in(each.table, each.times, each.index))
     if known is not None and len(known) == 1:
         return known[0]
@@ -639,7 +632,7 @@ def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
             pair: rows_of(edge, np.argsort(edge.log_times, kind="stable"))
             for pair, edge in joined_edges(known).items()
         }
-    return _by_message(view, messages_of(view, rows))
+    return edges_of(decoded_transforms(view, messages_of(view, rows)))
 
 
 def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
@@ -660,7 +653,3 @@ def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> 
     ]
     static = static_in(static_transforms(view, among), window)
     return Frames(static, joined_edges(moving), target, limits.tf_clock)
-
-
-def _by_message(view: View, messages: Iterable[StoredMessage]) -> Edges:
-    return edges_of(one for each in messages for one in decoded_transforms(view, each))

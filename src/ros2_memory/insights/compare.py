@@ -6,6 +6,7 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import has_errors
@@ -73,7 +74,11 @@ def compare(
         QueryTimeoutError: the call's time is over.
     """
     region = None if where is None else parse_where(memory.limits, where)
-    asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
+    asked = TimeWindow.from_unix(start_s, end_s)
+    try:
+        other = TimeWindow.from_unix(with_start_s, with_end_s)
+    except InvalidArgumentsError as error:
+        raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
     for window in (asked, other):
@@ -91,7 +96,8 @@ def compare(
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
-    _note_lengths(view, recorded)
+    if differ(recorded[0], recorded[1], 10.0):
+        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),
@@ -108,13 +114,6 @@ def compare(
         farthest=apart.farthest,
         notes=view.notes.sentences(),
     )
-
-
-def _other(start_s: float, end_s: float) -> TimeWindow:
-    try:
-        return TimeWindow.from_unix(start_s, end_s)
-    except InvalidArgumentsError as error:
-        raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
 
 
 def _things(
@@ -259,21 +258,20 @@ def _places(
     return found
 
 
-def _errors(view: View, window: TimeWindow) -> dict[str, float | None]:
+def _errors(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported."""
-    counts: dict[str, float | None] = {}
+    counts: dict[str, float] = defaultdict(float)
     for found in found_events(view, window, has_errors).values():
         for error in () if found is None else found.errors:
-            text = Quoted(error.text)
-            counts[text] = (counts.get(text) or 0.0) + error.reports
+            counts[Quoted(error.text)] += error.reports
     return counts
 
 
-def _silent(view: View, window: TimeWindow) -> dict[str, float | None]:
+def _silent(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns for how many seconds each topic was silent while the robot was on."""
-    silent: dict[str, float | None] = {}
+    silent: dict[str, float] = defaultdict(float)
     for each in silences_in(view, window):
-        silent[each.topic] = (silent.get(each.topic) or 0.0) + unix_from_ns(each.end - each.start)
+        silent[each.topic] += unix_from_ns(each.end - each.start)
     return silent
 
 
@@ -296,11 +294,6 @@ def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
         if begin < last and first < stop
     )
     return unix_from_ns(max(0, elapsed.between(first, last) - gaps))
-
-
-def _note_lengths(view: View, recorded: list[float]) -> None:
-    if differ(recorded[0], recorded[1], 10.0):
-        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
 
 
 def _differing(

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.held_values import Held
     from ros2_memory.history.view import TimeRange
@@ -69,17 +68,13 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
         return False
     # With notes of its own: what cannot be read there may lie outside of the window.
     values = HeldValues(View(view.memory, view.call), topics[0])
-    newest = takewhile(_may_be_state, values.back(MAX_NS))
+    newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
     try:
         return any(held.is_blank for held in islice(newest, _LOOKED_AT))
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
         return False  # The time for reading is over: what can be found without them is.
-
-
-def _may_be_state(held: Held) -> bool:
-    return len(held.word) <= _LONGEST_STATE
 
 
 def find_episodes(
@@ -159,11 +154,9 @@ def episode_times(
 
 def spell_of(held: Held) -> Spell:
     """Returns a value that held as replies show it."""
-    return Spell(_cut(held.value), held.start, held.stop, held.ended)
-
-
-def _cut(value: JsonValue) -> JsonValue:
-    return shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
+    value = held.value
+    shown = shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
+    return Spell(shown, held.start, held.stop, held.ended)
 
 
 def with_robot(view: View, topic: str, found: Episode, frame_id: str | None) -> Episode:

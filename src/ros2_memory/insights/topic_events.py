@@ -23,7 +23,7 @@ from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.facts import State, Stated
+    from ros2_memory.analysis.facts import Stated
     from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.core.model import BagFile
@@ -146,16 +146,13 @@ def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:
 
 
 def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
-    states = [(found.time, _state(view, found)) for found in messages]
+    states = []
+    for found in messages:
+        value = view.value(found)
+        states.append((found.time, None if value is None else state_of(value, found.type)))
     # Those of a part come bag after bag, in the order in which bags were stored.
     states.sort(key=lambda each: each[0])
     return stated_by([time for time, _ in states], [state for _, state in states])
-
-
-def _state(view: View, found: StoredMessage) -> State | None:
-    """Returns what a message states; None where it cannot be decoded."""
-    value = view.value(found)
-    return None if value is None else state_of(value, found.type)
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

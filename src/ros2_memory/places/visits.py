@@ -114,7 +114,9 @@ def visits(
         )
     found = region_visits(view, placement.frame_id, place, window)
     newest = _newest(view, topic, found.track, window)
-    current = newest if _is_current(view, newest, now) else None
+    # A newer pose shows where the robot is now.
+    stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
+    current = newest if newest is not None and newest >= stale else None
     by_poses, found = shown_visits(found, window, limit, place, current)
     shown = tuple(_within_asked(each, window) for each in by_poses)
     if not placement.is_map:
@@ -196,12 +198,6 @@ def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
     if visit.arrived == window.start:
         visit = replace(visit, arrived=start)
     return replace(visit, departed=end) if visit.departed == window.stop - 1 else visit
-
-
-def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
-    """Whether the newest pose is recent enough to know where the robot is now."""
-    stale = _SPLITS * ns_from_unix(view.limits.split_duration_s)
-    return newest is not None and newest >= now - stale
 
 
 def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) -> tuple[Visit, ...]:

@@ -10,6 +10,7 @@ from ros2_memory import queries
 from ros2_memory.counts.column_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
+from ros2_memory.insights import fields
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
