@@ -111,19 +111,18 @@ def parse_where(
         raise InvalidArgumentsError(
             f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
-    found = tuple(
-        _called(name, _one(limits, each, default_radius_m, f"{what}: {abbreviate(name)}"))
+    every = (
+        (name, _one(limits, each, default_radius_m, f"{what}: {abbreviate(name)}"))
         for name, each in several.items()
+    )
+    found = tuple(
+        replace(place, name=name) if place.name is None else place for name, place in every
     )
     if len(found) == 1:
         return found[0]
     region = AnyOf(tuple(each.region for each in found))
     names = ", ".join(each.title for each in found)
     return Where(region, _frame_of(found), names, found)
-
-
-def _called(name: str, place: Where) -> Where:
-    return place if place.name is not None else replace(place, name=name)
 
 
 def _several(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
