@@ -482,8 +482,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
-    for sentence in describe_absent(memory.absent_splits(snapshot)):
-        view.notes.add(sentence)
+    view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
     undecodable = undecodable_topics(view)
     steps = clock_steps(view)
     return results.DataTimeRange(
@@ -803,8 +802,7 @@ def _samples(
             continue
         samples.append(Sample(time, shown.value))
         types[type_name] = None
-        for sentence in shown.notes:
-            view.notes.add(sentence)
+        view.notes.add(*shown.notes)
     if failures and not samples:
         undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
         raise with_notes(view, window, undecodable)
@@ -841,5 +839,4 @@ def _topics_of(bag: BagFile) -> frozenset[str]:
 def _note_odd_bags(view: View) -> None:
     """Notes what is wrong with the newest faulty bags, except crashes and wrong clocks."""
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(view.snapshot)]
-    for sentence in by_remark(odd, _MAX_ODD_BAGS):
-        view.notes.add(sentence)
+    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))

@@ -92,21 +92,17 @@ def note_unread(
         # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
-    for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ():
-        view.notes.add(sentence)
+    view.notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ())
     if nothing or search:
-        for sentence in describe_thinned(view.snapshot, window):
-            view.notes.add(sentence)
+        view.notes.add(*describe_thinned(view.snapshot, window))
     bag_dir = view.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
-        for sentence in (
+        view.notes.add(
             *describe_deleted(view, window),
             *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
-        ):
-            view.notes.add(sentence)
-    for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
-        view.notes.add(sentence)
+        )
+    view.notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.notes.add_remarks(odd)

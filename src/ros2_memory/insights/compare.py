@@ -136,8 +136,7 @@ def _things(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    for note in vague_notes(known, windows):
-        view.notes.add(note)
+    view.notes.add(*vague_notes(known, windows))
     places = places_asked(limits, where, known.frames)
     return frame, ThingsBetween(known, first, second, where, places).compared()
 
@@ -147,8 +146,7 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
     known = drive.known
     if known is None:
         return dict.fromkeys(_LEAST)
-    for note in length_notes(known):
-        view.notes.add(note)
+    view.notes.add(*length_notes(known))
     start, end = window.asked()
     stood = drive.stood(end - start)
     return {

@@ -272,8 +272,7 @@ class _There:
 
 
 def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
-    for note in () if drive.trajectory is None else length_notes(drive.trajectory):
-        view.notes.add(note)
+    view.notes.add(*() if drive.trajectory is None else length_notes(drive.trajectory))
     known = drive.known
     if known is None:
         return answer

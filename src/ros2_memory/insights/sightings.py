@@ -146,10 +146,8 @@ def find_matches(
     )
     if rows.is_nothing:
         silences = describe_silences(view, topics, rows.searched)
-        for sentence in (*silences, *unasked_limit(condition, min_score)):
-            view.notes.add(sentence)
-    for sentence in (*compared_frames(view, topics, condition), *scope.compared_frames):
-        view.notes.add(sentence)
+        view.notes.add(*silences, *unasked_limit(condition, min_score))
+    view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
     # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
@@ -388,8 +386,7 @@ def _with_fields(
             refused.append(error)
             extended.append(sighting)
             continue
-        for sentence in shown.notes:
-            view.notes.add(sentence)
+        view.notes.add(*shown.notes)
         extended.append(replace(sighting, matched=(), value=quote(shown.value)))
     if refused and len(refused) == len(extended):
         raise refused[0]
