@@ -236,7 +236,7 @@ def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags
     with spinner("looking what was recorded when"):
         found = asked.recap()
         rows = [*event_rows(asked, found), *topic_rows(asked)]
-    left_out = len(asked.view.snapshot.timeline.topics()) - _MOST_TOPICS
+    left_out = len(asked.view.timeline.topics()) - _MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
     size = (11.0, 1.3 + 0.27 * len(rows))
     with drawing.picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
@@ -426,10 +426,7 @@ def signals_of(
     times = np.array([stored.time for stored, _ in readable])
     signals: list[Signal] = []
     for name in fields:
-        found = [
-            extractor.exact_at(message, stored.record.channel.type, name)
-            for stored, message in readable
-        ]
+        found = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
         values = [float(one) if isinstance(one, bool | int | float) else math.nan for one in found]
         if all(map(math.isnan, values)):
             raise InvalidArgumentsError(f"{name} of {topic} holds no number")
@@ -491,7 +488,7 @@ def _until(event: Event) -> Ns:
 
 def topic_rows(asked: Asked) -> Iterator[TimelineRow]:
     """Yields when each topic was recorded, of the topics with the most messages, by name."""
-    timeline = asked.view.snapshot.timeline
+    timeline = asked.view.timeline
     messages = {
         topic: sum(totals.messages for totals in timeline.totals(topic).values())
         for topic in timeline.topics()

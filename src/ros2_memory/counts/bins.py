@@ -109,8 +109,8 @@ class BinnedWindow:
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
-        pause = round(2 * NS_PER_S * self.view.memory.limits.split_duration_s)
-        parts = self.view.snapshot.timeline.segments_in(self.counted)
+        pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
+        parts = self.view.timeline.segments_in(self.counted)
         spans = np.concatenate(
             [np.empty((2, 0), np.int64), *(part.bounds_in(topics, self.counted) for part in parts)],
             axis=1,

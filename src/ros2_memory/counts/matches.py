@@ -151,7 +151,7 @@ def _by_events(
     None where events do not show it.
     """
     view = binned.view
-    if not any(map(has_events, view.snapshot.timeline.types_of(topic))):
+    if not any(map(has_events, view.timeline.types_of(topic))):
         return None, None
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None and (condition.field is not None or not isinstance(value, str)):

@@ -46,13 +46,13 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
     topic = resolve_path_topic(view)
     asked_frame = None if where is None else where.frame_id
     placement = map_placement(view, topic, asked_frame)
-    named = view.memory.limits.places if where is None else where.places(placement.frame_id)
+    named = view.limits.places if where is None else where.places(placement.frame_id)
     places = places_in(view, named, placement, window)
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"by place needs named places in {frames}, and there is none in "
-            f"{places_setting(view.memory.limits)}"
+            f"{places_setting(view.limits)}"
         )
     track = track_in(view, placement.frame_id, window)
     inside = [

@@ -115,7 +115,7 @@ class Placer:
         poses = self._poses(own, window)
         target, frames = self._frames(among, window, poses)
         sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
-        if target == self._view.memory.limits.map_frame and len(poses):
+        if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([each.log_times for each in detected.values()])
             fixes = self._fixes(own, poses.frames.words[0], frames, times)
             sights[0] = sights[0].with_fixes(fixes)
@@ -150,7 +150,7 @@ class Placer:
     def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, Frames]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""
         own = poses.frames.words[0] if len(poses) else ""
-        target = self._view.memory.limits.map_frame or own
+        target = self._view.limits.map_frame or own
         if not among:
             target = own if len(poses) else target
             return target, Frames((), {}, target)
@@ -188,7 +188,7 @@ class Placer:
 
     def _localised(self, own: Session, window: TimeWindow) -> tuple[Ints, Floats]:
         """Returns what the localiser said: when, and its standard deviation (m)."""
-        timeline = self._view.snapshot.timeline
+        timeline = self._view.timeline
         topics = [topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)]
         found = sorted(each for topic in topics for each in self._covariances(topic, own, window))
         times = np.array([time for time, _ in found], np.int64)

@@ -176,13 +176,13 @@ class Watching:
         self._placer = Placer(view)
         self._sessions = sessions_of(view)
         self._of: dict[Path, Session] = {}
-        timeline = view.snapshot.timeline
+        timeline = view.timeline
         self._topics = [
             topic
             for topic in timeline.topics()
             if any(map(may_have_detections, timeline.types_of(topic)))
         ]
-        limits = view.memory.limits
+        limits = view.limits
         self._needed = (
             *self._topics,
             view.pose_topic,
@@ -254,7 +254,7 @@ class Watching:
             ends = [*accumulate(lengths, initial=at)]
             parts = tuple(data[begin:end] for begin, end in pairwise(ends))
             at = ends[-1]
-            in_map = frame == self._view.memory.limits.map_frame
+            in_map = frame == self._view.limits.map_frame
             found.append(Stretch(start, frame, None if in_map else sessions[nth], spots, parts))
         return found
 
@@ -340,7 +340,7 @@ class Watching:
         ]
         # Mostly they are those of the stretch before, object by object.
         if self._followed[0] != (statics, of):
-            limits = self._view.memory.limits
+            limits = self._view.limits
             every = [
                 [(one.parent, one.child, one.transform, time) for one, time in some]
                 for some in statics
@@ -392,7 +392,7 @@ class _Bags:
         around = window.widened(AROUND_NS)
         self._bags = [
             bag
-            for bag in view.snapshot.timeline.overlapping(around)
+            for bag in view.timeline.overlapping(around)
             if not is_carried(bag.file) or any(map(bag.summary.of, needed))
         ]
         count = len(self._bags)
@@ -448,7 +448,7 @@ class _Parts(NamedTuple):
             return None
         # Before the parts: what is merged meanwhile is in none of those that are known.
         unmerged = scanner.store.unmerged()
-        coverage = scanner.coverage(view.snapshot.timeline)
+        coverage = scanner.coverage(view.timeline)
         if coverage is None:
             return None
         merged = {
