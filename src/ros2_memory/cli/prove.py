@@ -154,12 +154,6 @@ class _Reads:
 
         return map(noted, self._reader.batches(path, topics, window, **more))
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """As above."""
-        times = self._reader.log_times(path, topic, window)
-        _widen(self._call(), topic, times)
-        return times
-
     def _call(self) -> dict[str, tuple[Ns, Ns]]:
         self._calls.append({})
         return self._calls[-1]

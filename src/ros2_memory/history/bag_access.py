@@ -117,16 +117,6 @@ class BagAccess:
         if any(aside.until is not None for aside in self.snapshot.active):
             self.call.used_active = True
 
-    def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of one bag's messages; none, with a note, where it is damaged."""
-        self.check_deadline()
-        with self.call.stages.timed("read"):
-            try:
-                return self.memory.reader.log_times(bag.path, topic, _indexed_part(bag, window))
-            except BagError as error:
-                self._note_unreadable(bag, error, window)
-                return ()
-
     def channels(self, bag: BagFile) -> Sequence[Channel]:
         """Returns the channels one bag declares; none, with a note, where it is damaged."""
         self.check_deadline()
