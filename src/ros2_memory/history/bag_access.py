@@ -126,11 +126,19 @@ class BagAccess:
             self._note_unreadable(bag, error, TimeWindow.everything())
             return ()
 
-    def decode(self, found: StoredMessage) -> object | None:
-        """Returns the decoded message; None where its type or its bytes are not understood."""
+    def decode(
+        self, found: StoredMessage, failures: list[UndecodableError] | None = None
+    ) -> object | None:
+        """Returns the decoded message; None where its type or its bytes are not understood.
+
+        Why is added to `failures`.
+        """
         try:
             return self.memory.reader.decode(found.record)
-        except UndecodableError:
+        except UndecodableError as error:
+            if failures is not None:
+                # A new one, since the one that was raised keeps the message by its traceback.
+                failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:

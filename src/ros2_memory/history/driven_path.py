@@ -347,22 +347,20 @@ def pose_frame(view: View, topic: str) -> str:
 
 
 def _newest_frame(view: View, topic: str) -> str:
-    failure: UndecodableError | None = None
+    failures: list[UndecodableError] = []
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
     for found in islice(newest, _MOST_TRIED):
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError as error:
-            failure = failure or error
+        message = view.bags.decode(found, failures)
+        if message is None:
             continue
         pose = view.extractor.pose(message, found.type)
         if pose is None:
             raise InvalidArgumentsError(describe_lack(view, "position", found))
-        if failure is not None:
-            note_left_out(view, failure)
+        if failures:
+            note_left_out(view, failures[0])
         return pose.frame_id
-    if failure is not None:
-        raise failure
+    if failures:
+        raise failures[0]
     return ""
 
 

@@ -206,15 +206,12 @@ class PoseReader:
         return poses_of(self._decoded(rows)) if found is None else joined_poses(found)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
-        reader, extractor = self._view.memory.reader, self._view.extractor
+        extractor = self._view.extractor
         samples: list[tuple[Ns, Pose, float | None]] = []
         for found in messages_of(self._view, rows):
             type_name = found.type
-            try:
-                message = reader.decode(found.record)
-            except UndecodableError as error:
-                # A new one, since the one that was raised keeps the message by its traceback.
-                self._failures.append(UndecodableError(error.topic, error.type_name, error.reason))
+            message = self._view.bags.decode(found, self._failures)
+            if message is None:
                 continue
             pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
             if pose is None:

@@ -205,9 +205,8 @@ class Placer:
             numbers = rows.times // _SAID_NS
             first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
             for found in messages_of(self._view, rows.some(first)):
-                try:
-                    message = memory.reader.decode(found.record)
-                except UndecodableError:
+                message = self._view.bags.decode(found)
+                if message is None:
                     continue
                 frame = memory.extractor.frame(message).lstrip("/")
                 sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))
