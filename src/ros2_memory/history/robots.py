@@ -8,7 +8,6 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain, combinations, islice
 from pathlib import Path
@@ -69,16 +68,8 @@ _MAKERS: Final[Key[list[tuple[str, Sequence[BagFile]]]]] = Key()
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
-_DESCRIBED: Final[Key[_Described]] = Key()
-"""Of a memory."""
-
-
-@dataclass(slots=True)
-class _Described:
-    """When it was last looked whether robots are mixed, and what was found."""
-
-    at: Ns | None = None
-    sentences: tuple[str, ...] = ()
+_DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
+"""Of a memory: when it was last looked whether robots are mixed, and what was found."""
 
 
 class Mixed(NamedTuple):
@@ -169,10 +160,10 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
-    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, _Described)
-    if known.at is None or abs(now - known.at) > _RECENT_NS:
-        known.at, known.sentences = now, tuple(_described(memory, call))
-    return known.sentences
+    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
+    if not known or abs(now - known[0][0]) > _RECENT_NS:
+        known[:] = [(now, tuple(_described(memory, call)))]
+    return known[0][1]
 
 
 def _described(memory: Memory, call: Call) -> Iterator[str]:

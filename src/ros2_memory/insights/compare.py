@@ -95,13 +95,17 @@ def compare(
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
+    lengths = (
+        unix_from_ns(passed.between(*each.asked()))
+        for each, passed in zip(windows, elapsed, strict=True)
+    )
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),
-        lengths=Pair(*(_length(*each) for each in zip(windows, elapsed, strict=True))),
+        lengths=Pair(*lengths),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
@@ -271,10 +275,6 @@ def _silent(view: View, window: TimeWindow) -> Mapping[str, float]:
     for each in silences_in(view, window):
         silent[each.topic] += unix_from_ns(each.end - each.start)
     return silent
-
-
-def _length(window: TimeWindow, elapsed: Elapsed) -> float:
-    return unix_from_ns(elapsed.between(*window.asked()))
 
 
 def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:

@@ -93,7 +93,7 @@ class Drive:
         It is not known where no pose has a valid position, nor where the robot neither moved nor
         stood for most of the time: noise hides where it stood.
         """
-        stood = sum(self.elapsed.between(each.start, each.end) for each, _ in self.standstills)
+        stood = self.elapsed.among((each.start, each.end) for each, _ in self.standstills)
         known = self.known
         if known is None:
             return stood or None

@@ -45,7 +45,7 @@ from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
-from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.scope import times_in_region
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import Before, Event, Recap
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.robot_places import RobotPlaces
+    from ros2_memory.places.pose_frames import RobotPlaces
     from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import PastChange
 

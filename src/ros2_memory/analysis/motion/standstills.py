@@ -145,13 +145,9 @@ class Blocks:
         """Returns the number of blocks."""
         return self.numbers.size
 
-    def diagonals(self) -> Floats:
-        """Returns how far (m) the far corners of each box are apart."""
-        return _lengths(self.highs - self.lows)
-
     def are_still(self) -> Marks:
         """Returns whether drift and noise explain the boxes."""
-        found: Marks = self.diagonals() <= np.minimum(
+        found: Marks = _lengths(self.highs - self.lows) <= np.minimum(
             np.maximum(_STILL_M, 4.5 * self.noises), LARGEST_M
         )
         return found
