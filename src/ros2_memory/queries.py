@@ -625,20 +625,19 @@ def _going_back(
         view = View(view.memory, view.call, reach)
 
 
-def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:
-    """Returns what a search that found nothing did not read, and when its topics were silent."""
-    window = TimeWindow(MIN_NS, until)
-    return (
-        *not_covered(view, search.topics, window),
-        *describe_silences(view, search.topics, window),
-    )
-
-
 def _notes_on_never(
     view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
 ) -> tuple[str, ...]:
-    """Returns the notes on a search that found nothing; without any the reply is a plain null."""
-    notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+    """Returns the notes on a search that found nothing; without any the reply is a plain null.
+
+    They are on what was not read, and on when its topics were silent.
+    """
+    window = TimeWindow(MIN_NS, until)
+    notes = (
+        *not_covered(view, search.topics, window),
+        *describe_silences(view, search.topics, window),
+        *unasked_limit(condition, min_score),
+    )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 
@@ -736,12 +735,8 @@ def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
         )
 
 
-def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
-    """Returns a message as a reply shows it, with the notes on that message alone."""
-    return _decoded(view, found, fields)[1]
-
-
 def _decoded(view: View, found: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
+    """Returns a message, and as a reply shows it, with the notes on that message alone."""
     with view.call.stages.timed("extract"):
         message = decode(view, found)
         return message, view.extractor.shown(message, found.type, fields)
@@ -778,7 +773,7 @@ def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[st
     for each in picked:
         type_name = each.type
         try:
-            found.append(_Shown(each.time, type_name, _extracted(view, each, fields)))
+            found.append(_Shown(each.time, type_name, _decoded(view, each, fields)[1]))
         except NoDataError as error:
             found.append(_Shown(each.time, type_name, None, error.detail))
         del each

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS
-from ros2_memory.analysis.motion.robot_track import STRETCH_NS
+from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
@@ -149,8 +149,8 @@ def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) ->
 
 def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) -> bool:
     """Returns whether poses between two visits were never outside for as long as leaving takes."""
-    first = max(older.start, older.stop - STRETCH_NS)
-    last = min(newer.stop, newer.start + STRETCH_NS)
+    first = max(older.start, older.stop - TRACK_SLICE_NS)
+    last = min(newer.stop, newer.start + TRACK_SLICE_NS)
     inside = _inside(region, *tracks.poses(TimeWindow(first, last + 1))[:3])
     in_both = inside and inside[0] <= older.stop and inside[-1] >= newer.start
     apart = (later - earlier for earlier, later in pairwise(inside))

@@ -17,7 +17,7 @@ import numpy as np
 from ros2_memory.analysis.frames import TF_CACHE_NS, static_in
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
-    STRETCH_NS,
+    TRACK_SLICE_NS,
     RobotTrack,
     TrackPart,
     joined_track,
@@ -148,8 +148,8 @@ class RobotTracks:
 
     def _over(self, window: TimeWindow) -> JoinedTrack:
         view = self._view
-        # Whole stretches, so that no vertex depends on the window; and what may reach into it.
-        around = _aligned(window.widened(SILENCE_NS), STRETCH_NS)
+        # Whole slices, so that no vertex depends on the window; and what may reach into it.
+        around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
         found: list[TrackPart] = []
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
@@ -337,8 +337,8 @@ class RobotTracks:
         first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [(MIN_NS, first)]
-        stretches = (np.unique(rows.times // STRETCH_NS) * STRETCH_NS).tolist()
-        every = [(at, self._lending(recording, at)) for at in stretches]
+        slices = (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist()
+        every = [(at, self._lending(recording, at)) for at in slices]
         return [one for nth, one in enumerate(every) if not nth or one[1] != every[nth - 1][1]]
 
     def poses(self, window: TimeWindow) -> Placed:

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 VERSION: Final = 1
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
-STRETCH_NS: Final[Ns] = 60 * SLICE_NS
+SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _SIZE: Final = Struct("<I")
 _MANY: Final = 64
 """A bag that spans more stretches may have odd times."""
@@ -209,7 +209,7 @@ class Watching:
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        for around in self._stretches_in(window.widened(STRETCH_NS)):
+        for around in self._stretches_in(window.widened(SIGHTS_NS)):
             if around.parts is not None:
                 self._known(around)
 
@@ -403,7 +403,7 @@ class _Bags:
 
     def stretches(self) -> list[int]:
         """Returns the numbers of the stretches in which there may be messages, the newest first."""
-        first, last = self._starts // STRETCH_NS, self._ends // STRETCH_NS
+        first, last = self._starts // SIGHTS_NS, self._ends // SIGHTS_NS
         long = np.flatnonzero(last - first > 1)
         more = [_numbers_of(self._view, self._topics, self._bags[nth]) for nth in long.tolist()]
         every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
@@ -496,17 +496,17 @@ def _in_slices(rows: Rows, slices: Sequence[int]) -> Rows:
 
 def _window(number: int) -> TimeWindow:
     """Returns when a stretch is."""
-    begin = number * STRETCH_NS
-    return TimeWindow(max(begin, MIN_NS), min(begin + STRETCH_NS, MAX_NS))
+    begin = number * SIGHTS_NS
+    return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
 
 
 def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int]:
     """Returns the numbers of the stretches in which a bag may have messages of some topics."""
-    numbers = range(bag.start // STRETCH_NS, bag.end // STRETCH_NS + 1)
+    numbers = range(bag.start // SIGHTS_NS, bag.end // SIGHTS_NS + 1)
     if len(numbers) <= _MANY:
         return numbers
     # Its times are odd: centuries may lie between two messages.
     window = TimeWindow(bag.start, bag.end).widened(1)
-    every = [rows.times // STRETCH_NS for topic in topics for rows in scan(view, topic, window)]
+    every = [rows.times // SIGHTS_NS for topic in topics for rows in scan(view, topic, window)]
     found: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *every])).tolist()
     return found
