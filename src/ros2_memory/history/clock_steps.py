@@ -38,13 +38,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import Pause
-    from ros2_memory.storage.base import IntArray
 
 _MOST_SUSPECTS: Final = 32
 """The newest suspects are looked at; each costs some milliseconds."""
@@ -230,9 +231,9 @@ def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
     return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
 
 
-def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, IntArray]:
+def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np.int64]]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
-    found: dict[Path, list[IntArray]] = defaultdict(list)
+    found: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.columns

@@ -252,7 +252,8 @@ def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> list[Ns]
     """Returns the times of a visit's vertices that are inside."""
     first = int(np.searchsorted(track.times, one.start, side="left"))
     last = int(np.searchsorted(track.times, one.stop, side="right"))
-    return _inside(region, *(each[first:last] for each in (track.times, track.x, track.y)))
+    visit = slice(first, last)
+    return _inside(region, track.times[visit], track.x[visit], track.y[visit])
 
 
 def _poses_around(found: RegionVisits, at: Ns) -> tuple[Times, Floats, Floats]:

@@ -415,10 +415,10 @@ NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zero
 
 def _joined(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    times, x, y, heading, left_out = zip(*parts, strict=True)
-    order = np.argsort(np.concatenate(times), kind="stable")
-    columns = (np.concatenate(column)[order] for column in (times, x, y, heading))
-    return Placed(*columns, left_out=sum(left_out))
+    columns = [np.concatenate(each) for each in zip(*(part[:4] for part in parts), strict=True)]
+    order = np.argsort(columns[0], kind="stable")
+    times, x, y, heading = (column[order] for column in columns)
+    return Placed(times, x, y, heading, sum(part.left_out for part in parts))
 
 
 def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
