@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import cut, jumps
+from ros2_memory.analysis.motion.robot_track import jumps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -90,13 +90,19 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
 
     Nobody was between the ends of a jump.
     """
-    inside = cut(track, window)
-    ends = inside.ends | jumps(inside)
+    ends = track.ends | jumps(track)
+    after = np.arange(len(ends)) + ~ends
     alone = ends & np.append([True], ends[:-1])[: len(ends)]
-    first = np.flatnonzero(~ends | alone)
-    last = first + ~ends[first]
-    places = np.column_stack((inside.x, inside.y))
-    return _Steps(places[first], places[last], inside.times[first], inside.times[last])
+    real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
+    first, last = np.flatnonzero(real), after[real]
+    start = np.maximum(track.times[first], window.start)
+    stop = np.minimum(track.times[last], window.stop - 1)
+    lasted = np.maximum(track.times[last] - track.times[first], 1)
+    here = np.column_stack((track.x[first], track.y[first]))
+    there = np.column_stack((track.x[last], track.y[last]))
+    share = ((start - track.times[first]) / lasted)[:, None]
+    until = ((stop - track.times[first]) / lasted)[:, None]
+    return _Steps(here + share * (there - here), here + until * (there - here), start, stop)
 
 
 def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | None:
