@@ -44,7 +44,9 @@ class Counted(NamedTuple):
         np.maximum.at(self.last, pieces, last)
 
 
-def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) -> Counted:
+def count_messages(
+    view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
+) -> Counted:
     """Returns how many messages of a topic lie in each piece of a window.
 
     Messages that cannot be decoded count, too.
@@ -54,6 +56,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
         topic: its name.
         window: of log time.
         edges: where pieces begin (ns), ascending; what is before the first is piece 0.
+        proves: whether messages are read for their times, as indexes of bags may lie.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -61,7 +64,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
     if view.stream.may_be_relatched([topic]):
-        for rows in scan(view, topic, window, columns=False):
+        for rows in scan(view, topic, window, columns=proves):
             counted.add(*_one_by_one(rows.times, edges))
         return counted
     shared = open_scan(view, topic, window).shared
@@ -79,7 +82,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
             to_read.add(segment.bags[of[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     near_those = united(sorted(spans))
-    for rows in scan(view, topic, window, columns=False, shared=shared, within=near_those):
+    for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
             counted.add(*_one_by_one(rows.times[positions], edges))
     return counted
@@ -121,7 +124,7 @@ def pick(
         QueryTimeoutError: the call's time is over.
     """
     edges = np.unique(view.bounds(topic, window)[0])
-    counts = count_messages(view, topic, window, edges).messages
+    counts = count_messages(view, topic, window, edges, proves=True).messages
     ends = np.cumsum(counts)
     chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
 
@@ -140,7 +143,7 @@ def _at_positions(
     view: View, topic: str, window: TimeWindow, positions: Sequence[int]
 ) -> Iterator[StoredMessage]:
     """Yields the messages at some positions, which ascend, among all in a window."""
-    rows = scan(view, topic, window, columns=False)
+    rows = scan(view, topic, window)
     times = np.sort(np.concatenate([np.empty(0, np.int64), *(each.times for each in rows)]))
     there = [nth for nth in positions if nth < times.size]  # fewer, where a bag was deleted since
     for time, equal in groupby(there, key=lambda nth: int(times[nth])):
