@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Deadline, Ns
     from ros2_memory.history.detections import Detected
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
     from ros2_memory.results import BinColumn
 
 BY_LABEL: Final = "label"

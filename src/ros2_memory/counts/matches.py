@@ -34,8 +34,7 @@ from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
-from ros2_memory.places.scope import Scope
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import Scope, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -48,8 +47,7 @@ if TYPE_CHECKING:
     from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import WhileCondition
-    from ros2_memory.places.where import Where
+    from ros2_memory.places.where import Where, WhileCondition
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.held_values import Held
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
 
 _LOOKED_AT: Final = 50
 """Of the newest values of a topic so many are looked at for an empty text."""

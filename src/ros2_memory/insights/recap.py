@@ -46,8 +46,7 @@ from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import robot_places
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.results import Before, Event, Recap
 
 if TYPE_CHECKING:

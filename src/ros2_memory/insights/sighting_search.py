@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
     from ros2_memory.storage.base import IntArray
 
 

@@ -50,7 +50,7 @@ from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.places.pose_frames import pose_in, robot_at
-from ros2_memory.places.scope import Scope
+from ros2_memory.places.where import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     from ros2_memory.insights.goals import GoalRun
     from ros2_memory.insights.sighting_search import Run
     from ros2_memory.messages.detections import Detection
-    from ros2_memory.places.scope import WhileCondition
+    from ros2_memory.places.where import WhileCondition
 
 _Row = TypeVar("_Row", Sighting, Episode)
 _MOST_TRIED: Final = 5

@@ -27,8 +27,7 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import placed_waypoints
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.results import DrivenInside
 
 if TYPE_CHECKING:
