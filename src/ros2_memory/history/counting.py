@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.columns.scan import Scan
     from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -127,6 +128,7 @@ def pick(
     counts = count_messages(view, topic, window, edges, proves=True).messages
     ends = np.cumsum(counts)
     chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
+    opened = open_scan(view, topic, window)
 
     def read() -> Iterator[StoredMessage]:
         pieces = np.searchsorted(ends, chosen, side="right")
@@ -134,17 +136,22 @@ def pick(
         for piece in np.unique(pieces).tolist():
             part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
             nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
-            yield from _at_positions(view, topic, part, nth.tolist())
+            yield from _at_positions(view, topic, _times_in(opened, part), nth.tolist())
 
     return int(ends[-1]), read()
 
 
+def _times_in(opened: Scan, window: TimeWindow) -> IntArray:
+    """Returns the log times of the messages in a part of what a scan is of, in order."""
+    every = [np.empty(0, np.int64), *(rows.times for rows in opened.rows(among=window))]
+    times = np.concatenate(every)
+    return np.sort(times[(times >= window.start) & (times < window.stop)])
+
+
 def _at_positions(
-    view: View, topic: str, window: TimeWindow, positions: Sequence[int]
+    view: View, topic: str, times: IntArray, positions: Sequence[int]
 ) -> Iterator[StoredMessage]:
-    """Yields the messages at some positions, which ascend, among all in a window."""
-    rows = scan(view, topic, window)
-    times = np.sort(np.concatenate([np.empty(0, np.int64), *(each.times for each in rows)]))
+    """Yields the messages at some positions, which ascend, among all that have these times."""
     there = [nth for nth in positions if nth < times.size]  # fewer, where a bag was deleted since
     for time, equal in groupby(there, key=lambda nth: int(times[nth])):
         numbers = {nth - int(np.searchsorted(times, time)) for nth in equal}
