@@ -149,7 +149,10 @@ def _standstills_in(
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(
-        (_cut(each, start, end), each.end > end or each.end == last)
+        (
+            each._replace(start=max(each.start, start), end=min(each.end, end)),
+            each.end > end or each.end == last,
+        )
         for each in found
         if each.start < end and each.end > start
     )
@@ -161,13 +164,6 @@ def _standstills_in(
         and bisect_left(begins, each.time - SLOT_NS) == bisect_left(begins, each.time + _BRAKING_NS)
     )
     return standstills, drops
-
-
-def _cut(stood: Standstill, start: Ns, end: Ns) -> Standstill:
-    """Returns what of a standstill is in a time, both ends of which are inclusive."""
-    if start <= stood.start and stood.end <= end:
-        return stood
-    return stood._replace(start=max(stood.start, start), end=min(stood.end, end))
 
 
 def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[Stands]:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
@@ -111,7 +110,11 @@ def goals_asked(
     if types != {GOALS} or field not in {None, _STATUS}:
         return None
     on_status = replace(condition, field=_STATUS)
-    wanted = {number for number in _STATUS_WORDS if on_status.matches({_STATUS: _facts(number)})}
+    wanted = {
+        number
+        for number, word in _STATUS_WORDS.items()
+        if on_status.matches({_STATUS: [number, word, *([_FAILED] if word in FAILURES else [])]})
+    }
     if not wanted:
         raise InvalidArgumentsError(
             f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
@@ -124,11 +127,6 @@ def goals_asked(
     goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
     goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
     return [each for each in goals if scope.holds_at(each.last)]
-
-
-def _facts(status: int) -> JsonValue:
-    word = _STATUS_WORDS[status]
-    return [status, word, _FAILED] if word in FAILURES else [status, word]
 
 
 def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:

@@ -63,6 +63,9 @@ def memory_status(memory: Memory, call: Call) -> Status:
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     heard = _heard(snapshot) if live else latest
+    recorder = ANOTHER if any(each.growing for each in snapshot.active) else None
+    if heartbeat is not None:
+        recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
     gaps = view.gaps(TimeWindow.everything())
     stalls = {*gaps} & {(pause.start, pause.end) for pause in snapshot.suspects}
@@ -76,7 +79,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         earliest=snapshot.dating.earliest,
         latest=latest,
         heard=heard,
-        recorder=_recorder(snapshot, heartbeat, live=live),
+        recorder=recorder,
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
@@ -136,13 +139,6 @@ def _heard(snapshot: Snapshot) -> Ns | None:
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)
-
-
-def _recorder(snapshot: Snapshot, heartbeat: Heartbeat | None, *, live: bool) -> str | None:
-    """Returns the recorder's state; without one, whether another program records here."""
-    if heartbeat is not None:
-        return state_of(heartbeat, live=live)
-    return ANOTHER if any(each.growing for each in snapshot.active) else None
 
 
 def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
