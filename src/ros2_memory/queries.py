@@ -36,6 +36,7 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.history.context import READING_S
+from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
@@ -87,7 +88,7 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.clock_faults import FUTURE_NS
 from ros2_memory.index.listed_splits import describe_absent
-from ros2_memory.insights.field_extremes import extremes_of
+from ros2_memory.insights.fields import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
 from ros2_memory.insights.status import (
     bags_with_remarks,
@@ -157,7 +158,7 @@ def topic_range(
     """
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
-    total, picked = view.pick(name, window, max_samples)
+    total, picked = pick(view, name, window, max_samples)
     chosen = _each_shown(view, picked, fields)
     if not chosen:
         raise no_data_between(view, (name,), window)
@@ -203,9 +204,9 @@ def _position_in(
     view: View, found: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
 ) -> results.Position:
     """Returns the pose in a message, as that of a moment; see `position`."""
-    memory, name = view.memory, found.record.channel.topic
+    memory, name = view.memory, found.topic
     _note_held(view, found, at)
-    message, type_name = decode(view, found), found.record.channel.type
+    message, type_name = decode(view, found), found.type
     pose, geodetic = memory.extractor.pose(message, type_name), None
     if pose is None:
         geodetic = memory.extractor.geodetic(message, type_name)
@@ -234,11 +235,11 @@ def _position_in(
 def _note_reach(view: View, found: StoredMessage, pose: Pose) -> None:
     """Notes between which coordinates the robot was, in a second of which one pose stayed."""
     window = TimeWindow(found.time + 1, found.time + 2 * NS_PER_S)
-    newer = view.stream.first([found.record.channel.topic], window)
+    newer = view.stream.first([found.topic], window)
     message = None if newer is None else view.bags.decode(newer)
     if newer is None or message is None:
         return
-    after = view.memory.extractor.pose(message, newer.record.channel.type)
+    after = view.extractor.pose(message, newer.type)
     if after is not None and math.dist(after.position, pose.position) > _REACH_M:
         spans = zip("xy", pose.position[:2], after.position[:2], strict=True)
         ends = [f"{axis} {min(span):.2f} to {max(span):.2f}" for axis, *span in spans]
@@ -260,7 +261,7 @@ def _position_of_body(
     Raises:
         NoDataError: none places it at the moment that is asked, or within the tolerance before.
     """
-    limits, extractor = view.memory.limits, view.memory.extractor
+    limits, extractor = view.limits, view.extractor
     window, tolerance = _within(view, *asked)
     of_body = newest_of_body(view, body, window, frame_id)
     if of_body is None:
@@ -274,8 +275,8 @@ def _position_of_body(
     near = TimeWindow.around(found.time, ns_from_unix(limits.time_tolerance_s))
     fix = view.stream.newest(fixes[0], near) if len(fixes) == 1 else None
     if fix is not None and (message := view.bags.decode(fix)) is not None:
-        geodetic = extractor.geodetic(message, fix.record.channel.type)
-    topic, notes = found.record.channel.topic, view.notes.sentences()
+        geodetic = extractor.geodetic(message, fix.type)
+    topic, notes = found.topic, view.notes.sentences()
     return results.Position(topic, found.time, pose, _age(found, now), geodetic, notes=notes)
 
 
@@ -307,7 +308,7 @@ def velocity(
     _require_kind(view, name, "velocity")
     found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     _note_held(view, found, at)
-    twist = memory.extractor.twist(decode(view, found), found.record.channel.type)
+    twist = memory.extractor.twist(decode(view, found), found.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", found))
     return results.Velocity(name, found.time, twist, _age(found, now), notes=view.notes.sentences())
@@ -451,7 +452,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
         require_bags(view)
     notes = _notes_by_topic(view.snapshot)
     rows = []
-    for topic in view.snapshot.timeline.topics():
+    for topic in view.timeline.topics():
         reasons = undecodable_types(view, topic)
         for type_name, census in sorted(view.census(topic).items()):
             rows.append(
@@ -482,8 +483,7 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
-    for sentence in describe_absent(memory.absent_splits(snapshot)):
-        view.notes.add(sentence)
+    view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
     undecodable = undecodable_topics(view)
     steps = clock_steps(view)
     return results.DataTimeRange(
@@ -542,7 +542,7 @@ def trajectory_summary(
     """
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    path = driven_path(view, name, window, max(max_waypoints, _FEWEST_OF_A_LINE))
+    path, _ = driven_path(view, name, window)
     if path is None:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -553,7 +553,8 @@ def trajectory_summary(
     note_edges(view, window)
     elapsed = elapsed_in(view, window)
     unrecorded = unrecorded_length(view, name, path, elapsed)
-    driven = while_recorded(across_steps(path, elapsed), elapsed, path, unrecorded)
+    whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
+    driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path, unrecorded)
     drawn = _with_few_waypoints(driven, max_waypoints)
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
@@ -583,7 +584,7 @@ def _with_few_waypoints(path: Trajectory, at_most: int) -> Trajectory:
 
 def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
     """Returns what a search went through to reach its match, as far as there can be messages."""
-    stop = until if view.memory.limits.now == "latest" else min(until, now + 1)
+    stop = until if view.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(found.time, max(stop, found.time + 1))
 
 
@@ -625,20 +626,19 @@ def _going_back(
         view = View(view.memory, view.call, reach)
 
 
-def _never(view: View, search: ReverseSearch, until: Ns) -> tuple[str, ...]:
-    """Returns what a search that found nothing did not read, and when its topics were silent."""
-    window = TimeWindow(MIN_NS, until)
-    return (
-        *not_covered(view, search.topics, window),
-        *describe_silences(view, search.topics, window),
-    )
-
-
 def _notes_on_never(
     view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
 ) -> tuple[str, ...]:
-    """Returns the notes on a search that found nothing; without any the reply is a plain null."""
-    notes = (*_never(view, search, until), *unasked_limit(condition, min_score))
+    """Returns the notes on a search that found nothing; without any the reply is a plain null.
+
+    They are on what was not read, and on when its topics were silent.
+    """
+    window = TimeWindow(MIN_NS, until)
+    notes = (
+        *not_covered(view, search.topics, window),
+        *describe_silences(view, search.topics, window),
+        *unasked_limit(condition, min_score),
+    )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 
@@ -664,7 +664,7 @@ def _found_at(
     Raises:
         NoDataError: there is none within the tolerance.
     """
-    limits = view.memory.limits
+    limits = view.limits
     window, tolerance = _within(view, at, tolerance_s, rest_s)
     found = view.stream.newest(topic, window)
     if found is None and tolerance_s is None and is_pose:
@@ -695,7 +695,7 @@ def _within(
     view: View, at: Ns, tolerance_s: float | None, rest_s: float
 ) -> tuple[TimeWindow, Ns | None]:
     """Returns when a message is near enough before a moment, and the tolerance; None for any."""
-    limit = view.memory.limits.time_tolerance_s if tolerance_s is None else tolerance_s
+    limit = view.limits.time_tolerance_s if tolerance_s is None else tolerance_s
     tolerance: Ns | None = ns_argument("tolerance_s", limit)
     start = at - (tolerance or 0) - START_SLACK_NS
     if start <= MIN_NS:
@@ -710,7 +710,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
     Raises:
         InvalidArgumentsError: none of its types carries the `what` that is asked for, or another.
     """
-    extractor, types = view.memory.extractor, view.snapshot.timeline.types_of(topic)
+    extractor, types = view.extractor, view.timeline.types_of(topic)
     if any(
         not extractor.is_mapped(each) or extractor.kinds_of(each) & {what, *or_else}
         for each in types
@@ -725,7 +725,7 @@ def _held(
     view: View, value: results.TopicValue, found: StoredMessage, at: Ns
 ) -> results.TopicValue:
     """Returns a value with whether it is latched, and then how old it is."""
-    if not view.memory.limits.latching.holds(view.snapshot, found):
+    if not view.limits.latching.holds(view.snapshot, found):
         return value
     age = max(at - found.time, 0) if value.age is None else value.age
     return replace(value, latched=True, age=age)
@@ -733,23 +733,19 @@ def _held(
 
 def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
-    if view.memory.limits.latching.holds(view.snapshot, found):
-        topic = found.record.channel.topic
+    if view.limits.latching.holds(view.snapshot, found):
+        topic = found.topic
         view.notes.add(
             f"{topic} is latched: its value of {seconds(max(at - found.time, 0))} before is still "
             "valid"
         )
 
 
-def _extracted(view: View, found: StoredMessage, fields: Sequence[str]) -> Extracted:
-    """Returns a message as a reply shows it, with the notes on that message alone."""
-    return _decoded(view, found, fields)[1]
-
-
 def _decoded(view: View, found: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
+    """Returns a message, and as a reply shows it, with the notes on that message alone."""
     with view.call.stages.timed("extract"):
         message = decode(view, found)
-        return message, view.memory.extractor.shown(message, found.record.channel.type, fields)
+        return message, view.extractor.shown(message, found.type, fields)
 
 
 def _value(
@@ -763,7 +759,7 @@ def _value(
         channel.type,
         Sample(found.time, shown.value),
         _age(found, now),
-        frame_id=view.memory.extractor.frame(message),
+        frame_id=view.extractor.frame(message),
         notes=(*view.notes.sentences(), *shown.notes),
     )
 
@@ -781,9 +777,9 @@ def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[st
     """Returns messages as a reply shows them. None is in memory when the next one is read."""
     found: list[_Shown] = []
     for each in picked:
-        type_name = each.record.channel.type
+        type_name = each.type
         try:
-            found.append(_Shown(each.time, type_name, _extracted(view, each, fields)))
+            found.append(_Shown(each.time, type_name, _decoded(view, each, fields)[1]))
         except NoDataError as error:
             found.append(_Shown(each.time, type_name, None, error.detail))
         del each
@@ -807,8 +803,7 @@ def _samples(
             continue
         samples.append(Sample(time, shown.value))
         types[type_name] = None
-        for sentence in shown.notes:
-            view.notes.add(sentence)
+        view.notes.add(*shown.notes)
     if failures and not samples:
         undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
         raise with_notes(view, window, undecodable)
@@ -845,5 +840,4 @@ def _topics_of(bag: BagFile) -> frozenset[str]:
 def _note_odd_bags(view: View) -> None:
     """Notes what is wrong with the newest faulty bags, except crashes and wrong clocks."""
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(view.snapshot)]
-    for sentence in by_remark(odd, _MAX_ODD_BAGS):
-        view.notes.add(sentence)
+    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))

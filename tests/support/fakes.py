@@ -118,9 +118,6 @@ class FakeReader(BagReader):
             if record.channel.topic in topics and window.contains(record.log_time):
                 yield record
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[int]:
-        return [record.log_time for record in self.records(path, [topic], window)]
-
     def channels(self, path: Path) -> Sequence[Channel]:
         return list(self._readable(path).channels)
 

@@ -12,7 +12,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel, Record
 
 
@@ -20,7 +19,7 @@ class NotingReader(McapReader):
     """Notes which bags were asked for what, in order.
 
     Attributes:
-        asked: a bag and the topics of messages or log times; none for a summary or its channels.
+        asked: a bag and the topics of messages; none for a summary or its channels.
     """
 
     def __init__(self) -> None:
@@ -54,7 +53,3 @@ class NotingReader(McapReader):
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         self.asked.append((path, (topic,)))
         return super().newest(path, topic, window)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        self.asked.append((path, (topic,)))
-        return super().log_times(path, topic, window)

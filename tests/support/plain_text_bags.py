@@ -99,9 +99,6 @@ class PlainReader(BagReader):
     ) -> Iterator[Record]:
         raise NotImplementedError
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[int]:
-        raise NotImplementedError
-
     def undecodable(self, channel: Channel) -> str | None:
         raise NotImplementedError
 

@@ -13,10 +13,8 @@ from ros2_memory.core.errors import (
     NoDataError,
     NoDataReason,
 )
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
-from ros2_memory.history.view import AtTime, TimeRange, View
+from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
     McapLayout,
@@ -140,19 +138,6 @@ def test_many_latched_messages_of_a_simulated_clock_count_once_each(tmp_path: Pa
     )
     rows = queries.list_recorded_topics(memory_of(tmp_path), Call())
     assert [(row.topic, row.count) for row in rows] == [("/log", 40)]
-
-
-def test_bags_that_stand_apart_stay_apart_after_a_handover(tmp_path: Path) -> None:
-    for name, begin in (("a", 0), ("b", 58)):
-        for split in range(6):
-            start = T0 + (begin + split * 10) * S
-            write_mcap(
-                tmp_path / name / f"{name}_{split}.mcap",
-                [odom(start + n * S, n, 0.0) for n in range(10)],
-            )
-    view = View(memory_of(tmp_path), Call())
-    sizes = [len(each.bags) for each in groups_of(view.stream, "/odom", TimeWindow.everything())]
-    assert sizes == [1, 1, 1, 1, 1, 2, 1, 1, 1, 1, 1]
 
 
 def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:

@@ -10,17 +10,17 @@ such stamps, too, but only as long as its queues were.
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.odometry import TimedPosition
+    from ros2_memory.analysis.poses import Poses
     from ros2_memory.storage.base import IntArray
 
 SHORTEST_STEP_NS: Final[Ns] = 2 * NS_PER_S
@@ -114,29 +114,27 @@ def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | No
     return ClockStep(hole[0], by) if by >= SHORTEST_BY_STAMPS_NS else None
 
 
-def step_over(
-    hole: tuple[Ns, Ns], before: Sequence[TimedPosition], after: Sequence[TimedPosition]
-) -> ClockStep | None:
+def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | None:
     """Returns the step that a hole is; None where it may be a pause of the recording.
 
     Args:
         hole: the log times of the last message before it, and of the first one after.
-        before: the poses in the last `BESIDE_NS` before it, in order of time.
+        before: the poses in the last `BESIDE_NS` before it.
         after: those in the first `BESIDE_NS` after it.
     """
     speed_mps = min(_speed_mps(before), _speed_mps(after))
     if speed_mps < _DRIVING_MPS:
         return None
-    length = after[0].time - before[-1].time
-    moved_m = distance(before[-1].position, after[0].position)
+    length = int(after.times[0] - before.times[-1])
+    moved_m = math.dist(before.positions[-1], after.positions[0])
     if moved_m > _MOVED * speed_mps * unix_from_ns(length):
         return None
     by = length - ns_from_unix(moved_m / speed_mps)
     return ClockStep(hole[0], by) if by >= SHORTEST_STEP_NS else None
 
 
-def _speed_mps(poses: Sequence[TimedPosition]) -> float:
-    if len(poses) < 2 or poses[-1].time - poses[0].time < BESIDE_NS // 4:
+def _speed_mps(poses: Poses) -> float:
+    lasted = int(poses.times[-1] - poses.times[0]) if len(poses) else 0
+    if lasted < BESIDE_NS // 4:
         return 0.0
-    elapsed = unix_from_ns(poses[-1].time - poses[0].time)
-    return distance(poses[0].position, poses[-1].position) / elapsed
+    return math.dist(poses.positions[0], poses.positions[-1]) / unix_from_ns(lasted)

@@ -13,7 +13,8 @@ import json
 import math
 import re
 import struct
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -50,7 +51,7 @@ _SIDES: Final = {"above": True, "below": False}
 """Conditions on a number, and whether it is to be above the limit."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Contains:
     """Part of a string, or an element of a list.
 
@@ -61,33 +62,35 @@ class Contains:
 
     With `whole` it must stand there as whole words: `pot` is in "the pot", not in "potato". Words
     behind it that begin with a minus must not stand there: `knife -butter`.
-
-    Attributes:
-        equal: what an element is compared with.
-        folded: the needle as casefolded text; None where no text can contain it.
-        others: the casefolded words that must not be there.
-        boolean: the boolean that matches; None where none does.
     """
 
     needle: Scalar
     whole: bool = False
-    equal: Equals = field(init=False, repr=False)
-    folded: str | None = field(init=False, repr=False)
-    others: tuple[str, ...] = field(init=False, repr=False)
-    boolean: bool | None = field(init=False, repr=False)
 
-    def __post_init__(self) -> None:
-        meant = _meaning(self.needle)
+    @cached_property
+    def equal(self) -> Equals:
+        """What an element is compared with."""
+        return Equals(self.needle)
+
+    @cached_property
+    def others(self) -> tuple[str, ...]:
+        """The casefolded words that must not be there."""
+        words = (_text_of(self.needle) or "").casefold().split() if self.whole else []
+        return tuple(word[1:] for word in words if word[0] == "-" and len(word) > 1)
+
+    @cached_property
+    def folded(self) -> str | None:
+        """The needle as casefolded text; None where no text can contain it."""
         text = _text_of(self.needle)
-        folded = None if text is None else text.casefold()
-        words = folded.split() if self.whole and folded else []
-        others = tuple(word[1:] for word in words if word[0] == "-" and len(word) > 1)
-        if others:
-            folded = " ".join(word for word in words if word[0] != "-")
-        object.__setattr__(self, "equal", Equals(self.needle))
-        object.__setattr__(self, "folded", folded)
-        object.__setattr__(self, "others", others)
-        object.__setattr__(self, "boolean", meant if isinstance(meant, bool) else None)
+        if text is None or not self.others:
+            return None if text is None else text.casefold()
+        return " ".join(word for word in text.casefold().split() if word[0] != "-")
+
+    @cached_property
+    def boolean(self) -> bool | None:
+        """The boolean that matches; None where none does."""
+        meant = _meaning(self.needle)
+        return meant if isinstance(meant, bool) else None
 
     @property
     def is_number(self) -> bool:
@@ -134,33 +137,33 @@ def _has_words(text: str, words: str) -> bool:
     return re.search(rf"(?<!\w){re.escape(words)}(?!\w)", text) is not None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
     1 and 0 equal true and false. A number equals itself and its float32 rounding, which is what a
     float32 field stores of it. Strings are compared without regard to case; one that spells a
     boolean or a number equals that too, since planners put values in quotes.
-
-    Attributes:
-        folded: the casefolded text that is equal; None where no text is.
-        boolean: the boolean that is equal; None where none is.
-        numbers: the numbers that are equal.
     """
 
     value: Scalar
-    folded: str | None = field(init=False, repr=False, compare=False)
-    boolean: bool | None = field(init=False, repr=False, compare=False)
-    numbers: tuple[int | float, ...] = field(init=False, repr=False, compare=False)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def folded(self) -> str | None:
+        """The casefolded text that is equal; None where no text is."""
+        return self.value.casefold() if isinstance(self.value, str) else None
+
+    @cached_property
+    def boolean(self) -> bool | None:
+        """The boolean that is equal; None where none is."""
         meant = _meaning(self.value)
-        boolean = bool(meant) if meant is not None and meant in (0, 1) else None
-        numbers = () if meant is None else (meant, _float32(meant))
-        folded = self.value.casefold() if isinstance(self.value, str) else None
-        object.__setattr__(self, "folded", folded)
-        object.__setattr__(self, "boolean", boolean)
-        object.__setattr__(self, "numbers", numbers)
+        return bool(meant) if meant is not None and meant in (0, 1) else None
+
+    @cached_property
+    def numbers(self) -> tuple[int | float, ...]:
+        """The numbers that are equal."""
+        meant = _meaning(self.value)
+        return () if meant is None else (meant, _float32(meant))
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any leaf at any depth is equal."""
@@ -190,13 +193,10 @@ class Beyond:
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any number at any depth is on that side."""
         return any(
-            self._is_beyond(leaf)
+            leaf > self.limit if self.above else leaf < self.limit
             for leaf in leaves(value)
             if isinstance(leaf, int | float) and not isinstance(leaf, bool)
         )
-
-    def _is_beyond(self, number: float) -> bool:
-        return number > self.limit if self.above else number < self.limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,12 +260,10 @@ class Condition:
     def _passes(self, value: JsonValue) -> bool:
         if self.field is None:
             return self.test.matches(value)
-        return any(self._meets(target) for target in at_field(value, self.field))
-
-    def _meets(self, target: JsonValue) -> bool:
-        if isinstance(self.test, Contains) and self.test.has_element(target):
+        targets, test = at_field(value, self.field), self.test
+        if isinstance(test, Contains) and any(map(test.has_element, targets)):
             return True
-        return self.test.matches(target)
+        return any(map(test.matches, targets))
 
     @property
     def can_be_refused(self) -> bool:
@@ -525,19 +523,19 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
     An empty list or a null in the value may be anything in another message, so nothing is refused
     for what would be below it.
     """
+    targets = [value]
     if condition.field is not None:
         if is_unknown_below(value, condition.field):
             return None
         targets = at_field(value, condition.field)
-        if targets:
-            return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
-        known = ", ".join(_paths(value)) or "none"
-        return f"the values have no field {condition.field!r}; their fields are: {known}"
-    if isinstance(condition.test, NearPosition):
+        if not targets:
+            known = ", ".join(_paths(value)) or "none"
+            return f"the values have no field {condition.field!r}; their fields are: {known}"
+    elif isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
         return _refusal_for_position(value)
-    return _refusal_for_number(condition, [value]) or _refusal_for_text(condition, [value])
+    return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
 
 
 def _refusal_for_position(value: JsonValue) -> str:

@@ -325,23 +325,6 @@ class Stated(NamedTuple):
         """Returns what some of the messages that can be decoded state."""
         return self._replace(times=self.times[rows], facts=self.facts.at(rows))
 
-    def unchanging(self, first: Ns, last: Ns) -> Stated | None:
-        """Returns the same by two messages, without looking at times, where all state the same.
-
-        None where some message states something else than the first.
-        """
-        facts = self.facts
-        is_told_twice = len({word[:2] for word in facts.words}) < len(facts.words)
-        if is_told_twice or facts.of_kinds(STATES).rows.size < facts.rows.size:
-            return None
-        order = np.argsort(facts.codes, kind="stable")
-        is_first = np.diff(facts.codes[order], prepend=-1) != 0
-        changes = (np.diff(facts.values[order], prepend=0.0) != 0) & ~is_first
-        if changes.any() or facts.rows[order][is_first].any():
-            return None
-        times = np.array([first, last], np.int64)
-        return self._replace(times=times, facts=facts.at(np.zeros(1, np.int64)))
-
 
 def stated_by(times: Sequence[Ns], states: Sequence[State | None]) -> Stated:
     """Returns what messages state, one by one; None is one that cannot be decoded."""

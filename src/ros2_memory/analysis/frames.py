@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import row_maxima
+from ros2_memory.core.arrays import row_maxima, stacked
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import multiply, rotate, slerp
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
@@ -116,27 +116,6 @@ class Edge:
             np.array([each.transform.rotation for each in transforms], np.float64),
         )
 
-    @classmethod
-    def joined(cls, parts: Sequence[Edge]) -> Edge:
-        """Returns the transforms of some parts, of which there is at least one, in their order."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls(
-            np.concatenate([each.stamps for each in parts]),
-            np.concatenate([each.log_times for each in parts]),
-            np.concatenate([each.translation for each in parts]),
-            np.concatenate([each.rotation for each in parts]),
-        )
-
-    def rows(self, index: Times | slice[int, int, None]) -> Edge:
-        """Returns some of them."""
-        return Edge(
-            self.stamps[index],
-            self.log_times[index],
-            self.translation[index],
-            self.rotation[index],
-        )
-
 
 Edges: TypeAlias = "Mapping[tuple[str, str], Edge]"
 """Transforms by parent and child, whose names have no leading slash."""
@@ -162,7 +141,7 @@ def joined_edges(parts: Sequence[Edges]) -> Edges:
     for part in parts:
         for pair, edge in part.items():
             found[pair].append(edge)
-    return {pair: Edge.joined(some) for pair, some in found.items()}
+    return {pair: stacked(some) for pair, some in found.items()}
 
 
 class _History:
@@ -186,7 +165,7 @@ class _History:
         names = [*moving, *(each.parent.lstrip("/") for each in static)]
         counts = [*(len(edge.stamps) for edge in moving.values()), *(1 for _ in static)]
         self.parents = list(dict.fromkeys(names))
-        every = Edge.joined([*moving.values(), *([Edge.of(static)] if static else [])])
+        every = stacked([*moving.values(), *([Edge.of(static)] if static else [])])
         count = len(every.stamps) - len(static)
         times = (every.stamps if clock == "stamp" else every.log_times)[:count]
         order = np.lexsort((every.log_times[:count], times))

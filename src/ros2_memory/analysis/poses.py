@@ -57,7 +57,7 @@ class Poses:
         """Returns the number of poses."""
         return self.times.size
 
-    def rows(self, which: IntArray) -> Poses:
+    def rows(self, which: IntArray | slice[int, int, None]) -> Poses:
         """Returns some of them, in the order given."""
         return Poses(
             self.times[which],
@@ -72,13 +72,7 @@ class Poses:
         first, end = np.searchsorted(self.times, (start, stop)).tolist()
         if end - first == len(self):
             return self
-        return Poses(
-            self.times[first:end],
-            self.positions[first:end],
-            self.turns[first:end],
-            Frames(self.frames.codes[first:end], self.frames.words),
-            self.speeds[first:end],
-        )
+        return self.rows(slice(first, end))
 
 
 NO_POSES: Final = Poses(

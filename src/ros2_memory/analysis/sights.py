@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from ros2_memory.core.arrays import Groups, distinct_rows
+from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -219,7 +219,8 @@ class Sights:
         return self.tables[6]
 
 
-class _Detections(NamedTuple):
+@dataclass(frozen=True, slots=True, eq=False)
+class _Detections:
     """Detections in whole millimetres, ascending by message; what is not placed has zeros."""
 
     message: Ints
@@ -230,20 +231,6 @@ class _Detections(NamedTuple):
     z: Ints
     score: Floats
     is_placed: Flags
-
-    def at(self, among: Ints | Flags) -> _Detections:
-        """Returns some of them."""
-        message, slices, label, x, y, z, score, is_placed = self
-        return _Detections(
-            message[among],
-            slices[among],
-            label[among],
-            x[among],
-            y[among],
-            z[among],
-            score[among],
-            is_placed[among],
-        )
 
 
 def sights_of(topic: str, seen: Seen) -> Sights:
@@ -256,7 +243,7 @@ def sights_of(topic: str, seen: Seen) -> Sights:
     near = near[np.argsort(group[near], kind="stable")]
     cluster = np.full(len(found.message), -1, np.int64)
     cluster[near] = _clusters(group[near], found.message[near], found.x[near], found.y[near])
-    lost, kept = found.at(cluster < 0), found.at(cluster >= 0)
+    lost, kept = rows_of(found, cluster < 0), rows_of(found, cluster >= 0)
     _, spot = distinct_rows((group[cluster >= 0], cluster[cluster >= 0]))
     scored = ~np.isnan(kept.score)
     which, other = _beside(kept)
@@ -320,7 +307,7 @@ def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]
         rows, nth = distinct_rows((found.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
         before = np.repeat(begins, np.diff(begins, append=len(rows)))
-        found = found.at((np.arange(len(rows)) - before < _MAX_LABELS)[nth])
+        found = rows_of(found, (np.arange(len(rows)) - before < _MAX_LABELS)[nth])
     return found, tuple(names)
 
 

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-    from ros2_memory.core.timebase import Ns
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)
@@ -163,17 +162,6 @@ class BagDirReader(BagReader):
         if self._rule(found, [topic], window) is not None:
             return super().newest(found, topic, window)
         return self._reader.newest(found, topic, window)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of the messages that count in this recording.
-
-        Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
-        """
-        found = self._located(path)
-        if self._rule(found, [topic], window) is not None:
-            return [record.log_time for record in self.records(found, [topic], window)]
-        return self._reader.log_times(found, topic, window)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that the file declares."""

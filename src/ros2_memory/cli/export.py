@@ -87,7 +87,7 @@ def export(
     earlier = _latched_before(view, topics, window.start) if with_latched else []
     within = view.stream.messages(topics, window)
     first = [*islice(within, 1)]
-    if latched is None and not first and not view.snapshot.timeline.overlapping(window):
+    if latched is None and not first and not view.timeline.overlapping(window):
         earlier = []  # alone they would look like an answer
     if earlier:
         copied = counted(len(earlier), "latched message is", "latched messages are")
@@ -120,7 +120,7 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
     Raises:
         NoDataError: no topic matches.
     """
-    names = view.snapshot.timeline.topics()
+    names = view.timeline.topics()
     chosen = {name for glob in globs or ("*",) for name in match_topics(names, glob)}
     if not chosen:
         asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
@@ -135,7 +135,7 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     broadcaster publishes only its own.
     """
     before, snapshot = TimeWindow(MIN_NS, start), view.snapshot
-    latching = view.memory.limits.latching
+    latching = view.limits.latching
     valid: dict[tuple[str, str], StoredMessage] = {}
     for topic in topics:
         if not latching.may_hold(snapshot, topic):
@@ -166,7 +166,7 @@ def profile_of(
 ) -> str:
     """Returns the MCAP profile of all bags that hold the messages; empty if they differ."""
     chosen = frozenset(topics)
-    within = view.snapshot.timeline.overlapping(window)
+    within = view.timeline.overlapping(window)
     bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
     bags.update(stored.bag.path for stored in earlier)
     profiles: set[str] = set()
@@ -270,7 +270,7 @@ def _with_progress(
     messages: Iterator[StoredMessage], view: View, window: TimeWindow
 ) -> Iterator[StoredMessage]:
     """Yields the messages, and shows a progress bar along the window."""
-    bags = view.snapshot.timeline.overlapping(window)
+    bags = view.timeline.overlapping(window)
     first = max(window.start, min((bag.start for bag in bags), default=0))
     last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
     with progress_bar() as bar:

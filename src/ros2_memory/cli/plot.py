@@ -27,6 +27,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.driven_path import robot_body
 from ros2_memory.history.no_data import (
@@ -235,7 +236,7 @@ def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags
     with spinner("looking what was recorded when"):
         found = asked.recap()
         rows = [*event_rows(asked, found), *topic_rows(asked)]
-    left_out = len(asked.view.snapshot.timeline.topics()) - _MOST_TOPICS
+    left_out = len(asked.view.timeline.topics()) - _MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
     size = (11.0, 1.3 + 0.27 * len(rows))
     with drawing.picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
@@ -403,7 +404,7 @@ def signals_of(
         NoDataError: there is no message in this time, or none can be decoded.
     """
     view, extractor = asked.view, asked.memory.extractor
-    total, picked = view.pick(topic, asked.window, _MOST_SAMPLES)
+    total, picked = pick(view, topic, asked.window, _MOST_SAMPLES)
     messages = [(stored, view.bags.decode(stored)) for stored in picked]
     readable = [(stored, message) for stored, message in messages if message is not None]
     if not readable:
@@ -425,10 +426,7 @@ def signals_of(
     times = np.array([stored.time for stored, _ in readable])
     signals: list[Signal] = []
     for name in fields:
-        found = [
-            extractor.exact_at(message, stored.record.channel.type, name)
-            for stored, message in readable
-        ]
+        found = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
         values = [float(one) if isinstance(one, bool | int | float) else math.nan for one in found]
         if all(map(math.isnan, values)):
             raise InvalidArgumentsError(f"{name} of {topic} holds no number")
@@ -490,7 +488,7 @@ def _until(event: Event) -> Ns:
 
 def topic_rows(asked: Asked) -> Iterator[TimelineRow]:
     """Yields when each topic was recorded, of the topics with the most messages, by name."""
-    timeline = asked.view.snapshot.timeline
+    timeline = asked.view.timeline
     messages = {
         topic: sum(totals.messages for totals in timeline.totals(topic).values())
         for topic in timeline.topics()

@@ -154,12 +154,6 @@ class _Reads:
 
         return map(noted, self._reader.batches(path, topics, window, **more))
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """As above."""
-        times = self._reader.log_times(path, topic, window)
-        _widen(self._call(), topic, times)
-        return times
-
     def _call(self) -> dict[str, tuple[Ns, Ns]]:
         self._calls.append({})
         return self._calls[-1]
@@ -174,7 +168,7 @@ def _widen(call: dict[str, tuple[Ns, Ns]], topic: str, times: Sequence[Ns]) -> N
 def _parts(view: View) -> list[tuple[Path, TimeWindow]]:
     """Returns the recordings, each from when to when there is no gap."""
     reach: dict[Path, tuple[Ns, Ns]] = {}
-    for bag in view.snapshot.timeline.recorded:
+    for bag in view.timeline.recorded:
         start, stop = reach.get(bag.recording, (MAX_NS, MIN_NS))
         reach[bag.recording] = min(start, bag.start), max(stop, bag.end + 1)
     gaps = [(before + 1, after) for before, after in view.snapshot.gaps]
@@ -194,7 +188,7 @@ def _more_and_more(
     first and the last messages of each part say when "now" is, and what was recorded.
     """
     ends = [(at, at + 1) for _, window in parts for at in (window.start, window.stop - 1)]
-    every = view.snapshot.timeline.topics()
+    every = view.timeline.topics()
     between = {topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()}
     ever = [(MIN_NS, MAX_NS)]
     for found in (read, between, dict.fromkeys(read, ever), dict.fromkeys(every, ever)):
@@ -217,7 +211,7 @@ def _write(
     for nth, (recording, window) in enumerate(whole if path.suffix == ".mcap" else parts):
         file = path
         if recording is not None:
-            folder = path / recording.relative_to(view.memory.index.bag_dir)
+            folder = path / recording.relative_to(view.bag_dir)
             folder.mkdir(parents=True, exist_ok=True)
             file = folder / f"{recording.name}_{nth}.mcap"
         found = (
@@ -242,7 +236,7 @@ def _messages(
             if any(start < window.stop and window.start < stop for start, stop in some)
         ]
         for stored in view.stream.messages(topics, window) if topics else ():
-            some = spans[stored.record.channel.topic]
+            some = spans[stored.topic]
             nth = bisect_right(some, (stored.time, MAX_NS)) - 1
             if nth >= 0 and stored.time < some[nth][1]:
                 yield stored

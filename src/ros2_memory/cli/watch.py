@@ -187,7 +187,8 @@ def _rates(memory: Memory, snapshot: Snapshot, latest: Ns) -> Iterator[TopicRate
         for bag in dict.fromkeys(bag for bag, *_ in timeline.extents(topic, window)):
             # Of a bag that was deleted, or is not complete yet, the next observation sees more.
             with suppress(BagError):
-                count += len(memory.reader.log_times(bag.path, topic, window))
+                batches = memory.reader.batches(bag.path, [topic], window, bare=[topic])
+                count += sum(batch.log_times.size for batch in batches)
         last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)

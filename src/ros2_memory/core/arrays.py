@@ -1,9 +1,10 @@
-"""Groups of rows of arrays."""
+"""Rows of arrays, and groups of them."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,9 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from _typeshed import DataclassInstance
+
+T = TypeVar("T", bound="DataclassInstance")
 Ints: TypeAlias = NDArray[np.int64]
 
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
@@ -35,6 +39,21 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
     for column in rows.T[1:]:
         np.maximum(greatest, column, out=greatest)
     return greatest
+
+
+def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
+    """Returns some rows of a table, which is a dataclass with a column in each field."""
+    names = [each.name for each in fields(table)]
+    return replace(table, **{name: getattr(table, name)[which] for name in names})
+
+
+def stacked(tables: Sequence[T]) -> T:
+    """Returns the rows of such tables, of which there is one at least, one after the other."""
+    if len(tables) == 1:
+        return tables[0]
+    names = [each.name for each in fields(tables[0])]
+    columns = {name: np.concatenate([getattr(one, name) for one in tables]) for name in names}
+    return replace(tables[0], **columns)
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:

@@ -109,8 +109,8 @@ class BinnedWindow:
 
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
-        pause = round(2 * NS_PER_S * self.view.memory.limits.split_duration_s)
-        parts = self.view.snapshot.timeline.segments_in(self.counted)
+        pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
+        parts = self.view.timeline.segments_in(self.counted)
         spans = np.concatenate(
             [np.empty((2, 0), np.int64), *(part.bounds_in(topics, self.counted) for part in parts)],
             axis=1,
@@ -215,8 +215,7 @@ class BinnedWindow:
             return
         self._since = since
         self.counted = self.counted.intersect(TimeWindow(since, MAX_NS))
-        self.view.notes.complete = False
-        self.view.notes.add(
+        self.view.notes.add_lack(
             f"only what is after {unix_text(since)} is counted: "
             f"{self.view.bags.filling_progress() or 'out of time; '}"
             "ask about a shorter window"

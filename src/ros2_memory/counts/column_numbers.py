@@ -216,7 +216,7 @@ class PieceNumbers:
             return None
         key = (table.definition, table.channel.type, self._fields[field])
         if key not in self._columns:
-            extractor = self._view.memory.extractor
+            extractor = self._view.extractor
             self._columns[key] = column_of(table, self._fields[field], extractor)
         path, outline = self._columns[key], table.outline()
         totals = None if path is None or outline is None else outline.totals(path)
@@ -231,7 +231,7 @@ class PieceNumbers:
         """Adds the numbers of a table from a log time on."""
         if self._add_totals(rows, since):
             return
-        table, extractor = rows.table, self._view.memory.extractor
+        table, extractor = rows.table, self._view.extractor
         found = [numbers(table, field, extractor) for field in self._fields]
         held = [some for some in found if some is not None]
         if len(held) == len(found):
@@ -304,7 +304,7 @@ class PieceNumbers:
             # A new one, since the one that was raised keeps the message by its traceback.
             self.failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None
-        at = partial(self._view.memory.extractor.exact_at, message, record.channel.type)
+        at = partial(self._view.extractor.exact_at, message, record.channel.type)
         return [[*numbers_in(at(field))] for field in self._fields]
 
     def _settled(self, field: int, sign: int, extreme: Extreme) -> Extreme:
@@ -327,7 +327,7 @@ class PieceNumbers:
 
     def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
         """Returns an extreme by the bags that may hold it; None where these cannot be read."""
-        extractor, path = self._view.memory.extractor, self._fields[field]
+        extractor, path = self._view.extractor, self._fields[field]
         best = (math.inf, MAX_NS)
         waiting: list[tuple[Ns, int, Rows]] = []
         for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Deadline, Ns
     from ros2_memory.history.detections import Detected
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
     from ros2_memory.results import BinColumn
 
 BY_LABEL: Final = "label"
@@ -165,8 +165,7 @@ class _Seen:
                 raise
             self._take(parts)
             self.since = reached
-            self._view.notes.complete = False
-            self._view.notes.add(
+            self._view.notes.add_lack(
                 f"not all before {unix_text(reached)} is counted: "
                 f"{self._view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
             )
@@ -209,8 +208,7 @@ def _blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Block]:
         if found.log_times.size:
             yield _Block(topic, found)
     if left_out:
-        view.notes.complete = False
-        view.notes.add(f"messages of {topic} that could not be decoded: {left_out}")
+        view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
 
 
 def _rows(

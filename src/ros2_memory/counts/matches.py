@@ -20,7 +20,6 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import IntervalPart, joined
 from ros2_memory.analysis.topic_events import joined_events
-from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import listed
 from ros2_memory.counts.bins import BinnedWindow
@@ -35,8 +34,7 @@ from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
-from ros2_memory.places.scope import Scope
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import Scope, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -49,8 +47,7 @@ if TYPE_CHECKING:
     from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import WhileCondition
-    from ros2_memory.places.where import Where
+    from ros2_memory.places.where import Where, WhileCondition
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}
@@ -152,40 +149,33 @@ def _by_events(
     None where events do not show it.
     """
     view = binned.view
-    if not any(map(has_events, view.snapshot.timeline.types_of(topic))):
+    if not any(map(has_events, view.timeline.types_of(topic))):
         return None, None
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None and (condition.field is not None or not isinstance(value, str)):
         return None, None
-    parts, since = _events(view, topic, binned.counted, condition if wanted is None else None)
+    parts, since = _events(view, topic, binned.counted)
     _note_limits(view, topic, parts)
     if wanted is not None:
         return _flag_held(parts, condition, _gaps_of(binned, topic), wanted=wanted), since
     return _label_held(parts, condition), since
 
 
-def _events(
-    view: View, topic: str, window: TimeWindow, label: Condition | None
-) -> tuple[list[TopicEvents], Ns | None]:
+def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvents], Ns | None]:
     """Returns the events of a topic in order, and since when they are known, if not all are.
-
-    Of a label that is given; where it cannot be, others need not be among them.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
     reading = view.call.partial_after(READING_S)
     parts: list[TopicEvents] = []
-    may_match = None
-    if label is not None:
-        may_match = ColumnCondition(label, view.memory.extractor).may_match
 
     def reached(_: Ns) -> None:
         if reading.expired() and parts:
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        parts.extend(events_back(view, topic, window, may_match=may_match, reached=reached))
+        parts.extend(events_back(view, topic, window, reached=reached))
     except QueryTimeoutError:
         if not parts:
             raise
@@ -199,8 +189,7 @@ def _note_limits(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:
         view.notes.add(f"{topic} changes too often to count all: {left_out} more")
     undecodable = sum(part.undecodable for part in parts)
     if undecodable:
-        view.notes.complete = False
-        view.notes.add(f"messages of {topic} that could not be decoded: {undecodable}")
+        view.notes.add_lack(f"messages of {topic} that could not be decoded: {undecodable}")
 
 
 def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueIntervals | None:

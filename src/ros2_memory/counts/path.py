@@ -16,8 +16,7 @@ from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 from ros2_memory.places.driven_inside import totals_inside
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, times_in_region
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

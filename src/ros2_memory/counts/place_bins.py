@@ -14,8 +14,8 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.time_bins import TimeBins
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.history.driven_path import resolve_path_topic
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.where import places_setting
@@ -45,14 +45,14 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
     """
     topic = resolve_path_topic(view)
     asked_frame = None if where is None else where.frame_id
-    placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
-    named = view.memory.limits.places if where is None else where.places(placement.frame_id)
+    placement = map_placement(view, topic, asked_frame)
+    named = view.limits.places if where is None else where.places(placement.frame_id)
     places = places_in(view, named, placement, window)
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"by place needs named places in {frames}, and there is none in "
-            f"{places_setting(view.memory.limits)}"
+            f"{places_setting(view.limits)}"
         )
     track = track_in(view, placement.frame_id, window)
     inside = [

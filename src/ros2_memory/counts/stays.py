@@ -10,10 +10,10 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
 from ros2_memory.history.coverage import unknown_times
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times, places_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.visits import asked_place
@@ -67,7 +67,7 @@ def count_visits(
     mixed = note_robots(view, topic, asked)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, pose_frame(view, topic), topic, asked_frame)
+    placement = map_placement(view, topic, asked_frame)
     if place is not None:
         place = replace(place, frame_id=asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,), place)

@@ -78,8 +78,7 @@ def count_values(
         if not held:
             raise
         start = values.reached
-        view.notes.complete = False
-        view.notes.add(f"{error}: only what is after {unix_text(start)} is counted")
+        view.notes.add_lack(f"{error}: only what is after {unix_text(start)} is counted")
     if not held:
         raise no_data_between(view, (topic,), asked)
     tallies = _tallied(view, held, asked, (start, stop), condition)

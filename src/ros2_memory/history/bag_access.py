@@ -117,16 +117,6 @@ class BagAccess:
         if any(aside.until is not None for aside in self.snapshot.active):
             self.call.used_active = True
 
-    def log_times(self, bag: BagFile, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of one bag's messages; none, with a note, where it is damaged."""
-        self.check_deadline()
-        with self.call.stages.timed("read"):
-            try:
-                return self.memory.reader.log_times(bag.path, topic, _indexed_part(bag, window))
-            except BagError as error:
-                self._note_unreadable(bag, error, window)
-                return ()
-
     def channels(self, bag: BagFile) -> Sequence[Channel]:
         """Returns the channels one bag declares; none, with a note, where it is damaged."""
         self.check_deadline()
@@ -136,11 +126,19 @@ class BagAccess:
             self._note_unreadable(bag, error, TimeWindow.everything())
             return ()
 
-    def decode(self, found: StoredMessage) -> object | None:
-        """Returns the decoded message; None where its type or its bytes are not understood."""
+    def decode(
+        self, found: StoredMessage, failures: list[UndecodableError] | None = None
+    ) -> object | None:
+        """Returns the decoded message; None where its type or its bytes are not understood.
+
+        Why is added to `failures`.
+        """
         try:
             return self.memory.reader.decode(found.record)
-        except UndecodableError:
+        except UndecodableError as error:
+            if failures is not None:
+                # A new one, since the one that was raised keeps the message by its traceback.
+                failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
@@ -19,7 +19,8 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import GAP_PERIODS, TimedPosition, is_place
+from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
+from ros2_memory.analysis.poses import NO_POSES, joined_poses
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -37,13 +38,14 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from numpy.typing import NDArray
+
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
+    from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import Pause
-    from ros2_memory.storage.base import IntArray
 
 _MOST_SUSPECTS: Final = 32
 """The newest suspects are looked at; each costs some milliseconds."""
@@ -101,18 +103,16 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
 
 
 def _note_timeout(view: View) -> None:
-    view.notes.complete = False
-    view.notes.add(
+    view.notes.add_lack(
         "out of time before it was known whether the clock was set: durations are by the clock"
     )
 
 
-def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
+def across_steps(found: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
     """Returns the trajectory of a path on which a step of the clock is no gap, and takes no time.
 
     A step is a gap among poses that are often enough for it; see `odometry`.
     """
-    found = path.trajectory
     duration_s = found.totals.duration_s
     skipped = elapsed.skipped_between(path.first, path.last)
     if not skipped or found.poses < 2:
@@ -132,7 +132,7 @@ def across_steps(path: DrivenPath, elapsed: Elapsed) -> Trajectory:
 
 
 def while_recorded(
-    found: Trajectory, elapsed: Elapsed, path: DrivenPath, unrecorded: Ns
+    found: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
 ) -> Trajectory:
     """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
 
@@ -175,8 +175,8 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
 def _step_in(view: View, pause: Pause) -> ClockStep | None:
     """Returns the step that a pause is, which is looked at once if its bags are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
-    bags = view.snapshot.timeline.overlapping(around)
-    topic = view.pose_topic if view.pose_topic in view.snapshot.timeline.topics() else None
+    bags = view.timeline.overlapping(around)
+    topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
     key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
@@ -198,7 +198,7 @@ def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep 
         return step
     before = TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)
     after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
-    bags = [view.snapshot.timeline.overlapping(window) for window in (before, after)]
+    bags = [view.timeline.overlapping(window) for window in (before, after)]
     # A recording that ended before the hole tells nothing about one that began after it.
     through = set.intersection(*({bag.recording for bag in each} for each in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
@@ -209,7 +209,7 @@ def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
     """Returns the step that a hole is by the header stamps of topics on both sides of it."""
     around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
-    for bag in view.snapshot.timeline.overlapping(around):
+    for bag in view.timeline.overlapping(around):
         counts.update({known.topic: known.count for known in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
@@ -231,37 +231,27 @@ def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
     return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
 
 
-def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, tuple[IntArray, IntArray]]:
+def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np.int64]]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
-    found: dict[Path, tuple[IntArray, IntArray]] = {}
+    found: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.columns
 
     for rows in scan(view, topic, window, may_match=may_match):
         column = rows.table.columns.get(_STAMP)
-        if column is None or isinstance(column, Texts):
-            continue
-        stamps = np.asarray(column, np.int64)
-        stamps = stamps if rows.index is None else stamps[rows.index]
-        inside = (rows.times >= window.start) & (rows.times < window.stop)
-        times, stamps = rows.times[inside], stamps[inside]
-        known = found.get(rows.recording, (times[:0], stamps[:0]))
-        found[rows.recording] = (
-            np.concatenate([known[0], times]),
-            np.concatenate([known[1], stamps]),
-        )
-    return found
+        if column is not None and not isinstance(column, Texts):
+            stamps = np.asarray(column, np.int64)
+            stamps = stamps if rows.index is None else stamps[rows.index]
+            found[rows.recording].append(np.stack((rows.times, stamps)))
+    return {path: np.concatenate(parts, axis=1) for path, parts in found.items()}
 
 
-def _poses(
-    view: View, topic: str, window: TimeWindow, recordings: Collection[Path]
-) -> list[TimedPosition]:
-    found: list[TimedPosition] = []
+def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:
+    """Returns the poses of some recordings in a window that are at a place."""
+    found = pose_rows(view, topic, window, [], among=recordings.__contains__)
     try:
-        for block in pose_rows(view, topic, window, [], among=recordings.__contains__):
-            rows = zip(block.poses.times.tolist(), block.poses.positions.tolist(), strict=True)
-            found += [TimedPosition(time, (x, y, z)) for time, (x, y, z) in rows]
+        poses = joined_poses([each.poses for each in found])
     except InvalidArgumentsError:
-        return []
-    return [pose for pose in found if is_place(pose.position)]
+        return NO_POSES
+    return poses.rows(np.flatnonzero(are_places(poses.positions)))

@@ -396,16 +396,22 @@ class Notes:
         self._notes: dict[NoteKey, Note] = {}
         self._remarks: dict[str, tuple[str, ...]] = {}
 
-    def add(self, note: str | Note) -> None:
-        """Adds a sentence, or a note that shares one with others of its kind."""
-        if isinstance(note, str):
-            self._order.setdefault(note)
-            return
-        self.added += 1
-        self._order.setdefault(note.kind)
-        known = self._notes.get((note.kind, note.file))
-        if known is None or known.until < note.until:
-            self._notes[note.kind, note.file] = note
+    def add(self, *notes: str | Note) -> None:
+        """Adds sentences, or notes that share one with others of their kind."""
+        for note in notes:
+            if isinstance(note, str):
+                self._order.setdefault(note)
+                continue
+            self.added += 1
+            self._order.setdefault(note.kind)
+            known = self._notes.get((note.kind, note.file))
+            if known is None or known.until < note.until:
+                self._notes[note.kind, note.file] = note
+
+    def add_lack(self, note: str | Note) -> None:
+        """Adds a note on what bears on the answer and could not be read."""
+        self.complete = False
+        self.add(note)
 
     @contextmanager
     def isolated(self) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""How many messages of a topic there are in pieces of a window, each counted once.
+"""How many messages of a topic there are in pieces of a window, each counted once; some of them.
 
 The index knows that of every bag in which no piece ends, where no other recording may hold copies.
 Of the rest the times of messages are looked at, and where recordings overlap those that count.
@@ -6,20 +6,26 @@ Of the rest the times of messages are looked at, and where recordings overlap th
 
 from __future__ import annotations
 
+from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.history.scan import holding_copies, scan
+from ros2_memory.history.scan import open_scan, scan
+from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from numpy.typing import NDArray
 
-    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.columns.scan import Scan
     from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import TopicColumn
     from ros2_memory.storage.base import IntArray
@@ -39,7 +45,9 @@ class Counted(NamedTuple):
         np.maximum.at(self.last, pieces, last)
 
 
-def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) -> Counted:
+def count_messages(
+    view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
+) -> Counted:
     """Returns how many messages of a topic lie in each piece of a window.
 
     Messages that cannot be decoded count, too.
@@ -49,6 +57,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
         topic: its name.
         window: of log time.
         edges: where pieces begin (ns), ascending; what is before the first is piece 0.
+        proves: whether messages are read for their times, as indexes of bags may lie.
 
     Raises:
         QueryTimeoutError: the call's time is over.
@@ -56,13 +65,13 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
     if view.stream.may_be_relatched([topic]):
-        for rows in scan(view, topic, window, columns=False):
+        for rows in scan(view, topic, window, columns=proves):
             counted.add(*_one_by_one(rows.times, edges))
         return counted
-    shared = holding_copies(view, topic, window)
+    shared = open_scan(view, topic, window).shared
     to_read: set[str] = set()
     spans: list[tuple[Ns, Ns]] = []
-    for segment in view.snapshot.timeline.segments_in(window):
+    for segment in view.timeline.segments_in(window):
         column = segment.column(topic)
         if column is None:
             continue
@@ -74,7 +83,7 @@ def count_messages(view: View, topic: str, window: TimeWindow, edges: IntArray) 
             to_read.add(segment.bags[of[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     near_those = united(sorted(spans))
-    for rows in scan(view, topic, window, columns=False, shared=shared, within=near_those):
+    for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
             counted.add(*_one_by_one(rows.times[positions], edges))
     return counted
@@ -103,3 +112,48 @@ def _overlap(firsts: IntArray, lasts: IntArray, spans: Spans) -> NDArray[np.bool
 
 def _one_by_one(times: IntArray, edges: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     return np.searchsorted(edges, times, side="right"), np.ones_like(times), times, times
+
+
+def pick(
+    view: View, topic: str, window: TimeWindow, at_most: int
+) -> tuple[int, Iterator[StoredMessage]]:
+    """Returns how many messages of a topic a window holds, and `at_most` of them, evenly spaced.
+
+    The first and the last are always among them. Each is read when it is its turn.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    edges = np.unique(view.bounds(topic, window)[0])
+    counts = count_messages(view, topic, window, edges, proves=True).messages
+    ends = np.cumsum(counts)
+    chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
+    opened = open_scan(view, topic, window)
+
+    def read() -> Iterator[StoredMessage]:
+        pieces = np.searchsorted(ends, chosen, side="right")
+        bounds = [MIN_NS, *edges.tolist(), MAX_NS]
+        for piece in np.unique(pieces).tolist():
+            part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
+            nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
+            yield from _at_positions(view, topic, _times_in(opened, part), nth.tolist())
+
+    return int(ends[-1]), read()
+
+
+def _times_in(opened: Scan, window: TimeWindow) -> IntArray:
+    """Returns the log times of the messages in a part of what a scan is of, in order."""
+    every = [np.empty(0, np.int64), *(rows.times for rows in opened.rows(among=window))]
+    times = np.concatenate(every)
+    return np.sort(times[(times >= window.start) & (times < window.stop)])
+
+
+def _at_positions(
+    view: View, topic: str, times: IntArray, positions: Sequence[int]
+) -> Iterator[StoredMessage]:
+    """Yields the messages at some positions, which ascend, among all that have these times."""
+    there = [nth for nth in positions if nth < times.size]  # fewer, where a bag was deleted since
+    for time, equal in groupby(there, key=lambda nth: int(times[nth])):
+        numbers = {nth - int(np.searchsorted(times, time)) for nth in equal}
+        at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
+        yield from (found for nth, found in enumerate(at_once) if nth in numbers)

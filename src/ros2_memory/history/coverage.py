@@ -88,25 +88,21 @@ def note_unread(
     absent = _absent(view) if nothing or search else ()
     odd = [
         bag
-        for bag in view.snapshot.timeline.faulty(window)
+        for bag in view.timeline.faulty(window)
         # There is no note about bags that a crash left open.
         if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
     ]
-    for sentence in describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ():
-        view.notes.add(sentence)
+    view.notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ())
     if nothing or search:
-        for sentence in describe_thinned(view.snapshot, window):
-            view.notes.add(sentence)
-    bag_dir = view.memory.index.bag_dir
+        view.notes.add(*describe_thinned(view.snapshot, window))
+    bag_dir = view.bag_dir
     if (bag_dir / OWN_FOLDER).is_dir():
-        for sentence in (
-            *describe_deleted(view.snapshot, bag_dir, window),
+        view.notes.add(
+            *describe_deleted(view, window),
             *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
-        ):
-            view.notes.add(sentence)
-    for sentence in unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd):
-        view.notes.add(sentence)
+        )
+    view.notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
     # Where there are more kinds of remarks than are named, not every bag's remark is in a sentence.
     if len({bag.summary.remarks for bag in odd}) <= MAX_NAMED:
         view.notes.add_remarks(odd)
@@ -153,7 +149,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
 
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
     """
-    bag_dir, touched = view.memory.index.bag_dir, view.gaps(window)
+    bag_dir, touched = view.bag_dir, view.gaps(window)
     if not touched:
         return
     known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
@@ -188,20 +184,20 @@ def _unrecorded(
     return [(start, end) for start, end in parts if end - start > snapshot.shortest_gap]
 
 
-def deleted_between(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+def deleted_between(view: View, window: TimeWindow) -> Spans:
     """Returns the parts of a window that were recorded, and that retention deleted since.
 
     Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
     """
     return [
         (max(start, window.start), min(stop, window.stop))
-        for start, stop in _deleted_near(snapshot, bag_dir, window)
+        for start, stop in _deleted_near(view, window)
     ]
 
 
-def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Spans:
+def _deleted_near(view: View, window: TimeWindow) -> Spans:
     """Returns the same, as far as it reaches out of the window."""
-    gone = deleted_spans(bag_dir)
+    snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
         return []
     found: Spans = []
@@ -220,13 +216,13 @@ def _deleted_near(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Span
 
 def deleted_length(view: View, window: TimeWindow) -> Ns:
     """Returns for how long something was recorded in a window that retention deleted since."""
-    parts = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    parts = deleted_between(view, window)
     return sum(stop - start for start, stop in parts)
 
 
-def describe_deleted(snapshot: Snapshot, bag_dir: Path, window: TimeWindow) -> Iterator[str]:
+def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
-    spans = [_span_text(*each) for each in _deleted_near(snapshot, bag_dir, window)]
+    spans = [_span_text(*each) for each in _deleted_near(view, window)]
     if spans:
         named = listed(spans[-MAX_NAMED:], len(spans))
         yield f"recorded, and deleted since: {named}"
@@ -294,10 +290,10 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     does not count: or else no search of a robot that records would be complete.
     """
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    whole = all(map(is_whole, view.snapshot.timeline.faulty(window)))
-    excluded = excluded_between(view.memory.index.bag_dir, window.start, window.stop)
-    deleted = any(was_cut(view.memory.index.bag_dir, each, window) for each in topics)
-    deleted |= bool(deleted_between(view.snapshot, view.memory.index.bag_dir, window))
+    whole = all(map(is_whole, view.timeline.faulty(window)))
+    excluded = excluded_between(view.bag_dir, window.start, window.stop)
+    deleted = any(was_cut(view.bag_dir, each, window) for each in topics)
+    deleted |= bool(deleted_between(view, window))
     deleted |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not deleted:
         return ()
@@ -495,7 +491,7 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     whole = end - start
     window = f"between {unix_text(start)} and {unix_text(end)}"
     asked_for = TimeWindow(start, end)
-    deleted = deleted_between(view.snapshot, memory.index.bag_dir, asked_for)
+    deleted = deleted_between(view, asked_for)
     if gap_around(view, asked) is not None:
         view.notes.add(why_nothing(window, deleted=bool(deleted)))
     elif gaps or max(outside) > _EDGE_NS:

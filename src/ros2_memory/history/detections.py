@@ -10,7 +10,6 @@ from ros2_memory.analysis.frames import AGREEMENT_NS
 from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.arrays import merged_times
-from ros2_memory.core.errors import UndecodableError
 from ros2_memory.history.scan import messages_of
 from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import detections_of
@@ -66,7 +65,7 @@ class DetectionRows:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._columns = DetectionColumns(view.memory.extractor)
+        self._columns = DetectionColumns(view.extractor)
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns in which parts some message may hold a detection, by their zones."""
@@ -92,16 +91,14 @@ class DetectionRows:
 
     def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
         """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
-        extractor = self._view.memory.extractor
-        try:
-            message = self._view.memory.reader.decode(found.record)
-        except UndecodableError:
+        extractor, message = self._view.extractor, self._view.bags.decode(found)
+        if message is None:
             return []
         frame = extractor.frame(message)
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
         detections = [
             one if one.frame_id else one._replace(frame_id=frame)
-            for one in detections_of(extractor.exact(message, found.record.channel.type))
+            for one in detections_of(extractor.exact(message, found.type))
         ]
         return [(found.time, found.time if stamp is None else stamp, detections)]
 

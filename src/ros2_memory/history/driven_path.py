@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
+from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import (
-    MAX_WAYPOINTS,
     SLICE_NS,
     joined_slices,
     path_slice,
 )
+from ros2_memory.analysis.poses import Poses, joined_poses
+from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -35,8 +38,9 @@ from ros2_memory.history.no_data import (
     undecodable,
     with_notes,
 )
-from ros2_memory.history.poses import PoseRows, poses_of, slices_back, slices_of_poses
+from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
 from ros2_memory.history.robots import beside_path
+from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
 from ros2_memory.history.transforms import (
     decoded_transforms,
     edges,
@@ -48,13 +52,13 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.columns.fragments import Kind, Sized
+    from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.poses import PoseSlice
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
@@ -70,62 +74,38 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-@dataclass(frozen=True, slots=True)
-class DrivenPath:
-    """A path, its frames in order of appearance, and the times of its first and last message.
+class FoundWay(NamedTuple):
+    """The path of a window, None where there is no message.
 
     From `since` (log time, ns) on, where older bags were not read.
     """
-
-    trajectory: Trajectory
-    frames: tuple[str, ...]
-    first: Ns
-    last: Ns
-    since: Ns | None = None
-
-
-class FoundWay(NamedTuple):
-    """The path of a window; from `since` (log time, ns) on, where older bags were not read."""
 
     way: PathSlice | None
     since: Ns | None = None
 
 
-def driven_path(
-    view: View, topic: str, window: TimeWindow, max_waypoints: int = MAX_WAYPOINTS
-) -> DrivenPath | None:
-    """Returns the path in a window by the poses of one topic; None where there is no message.
+def driven_path(view: View, topic: str, window: TimeWindow) -> FoundWay:
+    """Does as `way_in`; a note says how far back it is known where not all was read."""
+    found = way_in(view, topic, window)
+    if found.since is not None:
+        view.notes.add_lack(
+            f"the path is known back to {unix_text(found.since)}: out of time before older bags "
+            "were read"
+        )
+    return found
 
-    It is drawn with `max_waypoints` (2 or more) at most, or not at all for 0. Notes say what cannot
-    be decoded, and how far back it is known where the time was over before all was read.
+
+def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
+    """Returns the path in a window by the poses of one topic.
+
+    Messages that cannot be decoded are left out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
         NoDataError: no message can be decoded.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    way, since = way_in(view, topic, window)
-    note_known_since(view, since)
-    if way is None:
-        return None
-    return DrivenPath(way.trajectory(max_waypoints), way.frames, way.first, way.last, since)
-
-
-def note_known_since(view: View, since: Ns | None) -> None:
-    """Notes since when a path is known, where older bags were not read."""
-    if since is not None:
-        view.notes.complete = False
-        view.notes.add(
-            f"the path is known back to {unix_text(since)}: out of time before older bags were read"
-        )
-
-
-def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
-    """Returns the path in a window by the poses of one topic; raises as `driven_path`.
-
-    Messages that cannot be decoded are left out, with a note.
-    """
-    fastest = view.memory.limits.max_plausible_speed_mps
+    fastest = view.limits.max_plausible_speed_mps
     failures: list[UndecodableError] = []
     found, since = _slices_in(view, topic, window, failures)
     if failures and not found:
@@ -172,7 +152,7 @@ def slices_of_path(
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
-    fastest = view.memory.limits.max_plausible_speed_mps
+    fastest = view.limits.max_plausible_speed_mps
 
     def make(some: PoseSlice) -> PathSlice:
         return path_slice(some.poses, fastest)
@@ -194,26 +174,121 @@ def slices_by_poses(
     settings: str = "",
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the robot's poses in slices, the newest first; see `slices_of_poses`.
+    """Yields what is made of the robot's poses in slices of the clock, the newest first.
 
-    Of a topic of transforms they are those of the robot's body. Where two recordings have poses of
-    their own, or one has a time twice, they are those that come first.
+    Each with a time (log time, ns) that no pose of it is earlier than. Of a topic of transforms
+    they are the poses of the robot's body. Where two recordings have poses of their own, or one has
+    a time twice, they are those that come first.
+
+    Args:
+        view: of the call.
+        topic: of the poses.
+        window: of log time.
+        kind: what is made; it is stored, and joined by stretches of the clock.
+        make: makes it.
+        failures: as for `pose_rows`.
+        beside: poses so far before and after a slice (ns) are with it, too.
+        settings: what it depends on besides the poses.
+        reached: as for `scan`.
 
     Raises:
-        InvalidArgumentsError: a message carries no position.
+        InvalidArgumentsError: while it is iterated, messages carry no position.
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    if topic not in view.memory.limits.tf_topics:
-        twice = () if view.call.stored else beside_path(view, topic, window)
-        yield from slices_of_poses(
-            view, topic, window, kind, make, failures=failures,
-            length=SLICE_NS, beside=beside, settings=settings, reached=reached, twice=twice,
-        )  # fmt: skip
-        return
-    poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-    if len(poses):
-        every = PoseRows((int(poses.times[0]), int(poses.times[-1])), lambda: poses)
-        for some in slices_back([every], SLICE_NS, beside):
+    if topic in view.limits.tf_topics:
+        poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
+        span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
+        every = [PoseRows(span, lambda: poses)] if len(poses) else []
+        for some in slices_back(every, beside):
             yield some.start, make(some)
+        return
+    twice = () if view.call.stored else beside_path(view, topic, window)
+    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    reader = PoseReader(view, failures, twice)
+
+    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
+        around = stretch.window.widened(beside)
+        rows = opened.rows(newest_first=True, among=around)
+        every = map(reader.block, blocks(rows, newest_first=True))
+        needs_all = stretch.parts is not None or not view.call.stored
+        found = (block for block in every if block.parts or needs_all)
+        for some in slices_back(found, beside):
+            if stretch.window.overlaps(some.start, some.stop - 1):
+                made = partial(make, some)
+                yield some.start, remembered(view, kind, some.key(settings), made, reader.trouble)
+
+    def key_of(stretch: Stretch) -> FragmentKey | None:
+        around = stretch.window.widened(beside)
+        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
+        if not near:
+            return stretch.key(settings)
+        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
+        left_out = repr(
+            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
+        )
+        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
+
+    yield from joined_back(
+        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
+    )
+
+
+class PoseSlice:
+    """The poses in a slice of the clock, and those beside it.
+
+    Attributes:
+        start: log time (ns) where it begins.
+        stop: where it ends.
+    """
+
+    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
+        self.start, self.stop = start, stop
+        self._beside = beside
+        self._blocks = blocks
+
+    @property
+    def poses(self) -> Poses:
+        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
+        start, stop = self.start - self._beside, self.stop + self._beside
+        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
+
+    def key(self, settings: str) -> FragmentKey | None:
+        """Returns what the poses are told apart by; None where not all are of whole parts."""
+        parts: list[int] = []
+        for block in self._blocks:
+            if block.parts is None:
+                return None
+            parts += block.parts
+        return FragmentKey(self.start, settings, tuple(parts))
+
+
+def slices_back(found: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+    """Yields the slices of the clock in which there may be poses, the newest first.
+
+    Args:
+        found: poses, the newest first.
+        beside: poses so far before and after a slice (ns) are with it, too.
+    """
+    held: list[PoseRows] = []
+    waiting: set[int] = set()
+
+    def done(oldest: Ns) -> Iterator[PoseSlice]:
+        """Yields the slices that reach no poses older than the oldest that is held."""
+        for number in sorted(waiting, reverse=True):
+            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+            if start - beside < oldest:
+                return
+            waiting.discard(number)
+            near = [each for each in held if each.last >= start - beside]
+            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
+
+    for block in found:
+        newest = max(waiting, default=block.last // SLICE_NS)
+        held = [each for each in held if each.first < (newest + 1) * SLICE_NS + beside]
+        held.append(block)
+        waiting.update(block.slices(SLICE_NS))
+        yield from done(block.first)
+    yield from done(MIN_NS)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
@@ -252,8 +327,9 @@ def length_notes(path: Trajectory) -> Iterator[str]:
 
 def note_left_out(view: View, error: UndecodableError) -> None:
     """Notes that there are poses which cannot be decoded, and why."""
-    view.notes.complete = False
-    view.notes.add(f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}")
+    view.notes.add_lack(
+        f"poses of {error.topic} left out, since they cannot be decoded: {error.reason}"
+    )
 
 
 def pose_frame(view: View, topic: str) -> str:
@@ -265,28 +341,26 @@ def pose_frame(view: View, topic: str) -> str:
     """
     known = view.memo.of(_POSE_FRAMES, dict)
     if topic not in known:
-        body = robot_body(view) if topic in view.memory.limits.tf_topics else None
+        body = robot_body(view) if topic in view.limits.tf_topics else None
         known[topic] = _newest_frame(view, topic) if body is None else body.parent
     return known[topic]
 
 
 def _newest_frame(view: View, topic: str) -> str:
-    failure: UndecodableError | None = None
+    failures: list[UndecodableError] = []
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
     for found in islice(newest, _MOST_TRIED):
-        try:
-            message = view.memory.reader.decode(found.record)
-        except UndecodableError as error:
-            failure = failure or error
+        message = view.bags.decode(found, failures)
+        if message is None:
             continue
-        pose = view.memory.extractor.pose(message, found.record.channel.type)
+        pose = view.extractor.pose(message, found.type)
         if pose is None:
             raise InvalidArgumentsError(describe_lack(view, "position", found))
-        if failure is not None:
-            note_left_out(view, failure)
+        if failures:
+            note_left_out(view, failures[0])
         return pose.frame_id
-    if failure is not None:
-        raise failure
+    if failures:
+        raise failures[0]
     return ""
 
 
@@ -311,7 +385,7 @@ def robot_body(view: View) -> Body | None:
         return None
     above = {child: _above(child, parents) for child in moving}
     body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
-    map_frame = view.memory.limits.map_frame
+    map_frame = view.limits.map_frame
     root = map_frame if map_frame in above[body] else above[body][-1]
     return Body(root, body, tuple(sorted({each for each in moving if each != body})))
 
@@ -372,7 +446,7 @@ def newest_of_body(
     if own and not sessions.recordings_of(own, tuple(topics)):
         own = None
     for found in view.stream.messages(topics, window, newest_first=True):
-        for each in decoded_transforms(view, found):
+        for each in decoded_transforms(view, [found]):
             if each.child.lstrip("/") != body.child or (own and not sessions.has(own, found)):
                 continue
             clock = frames_of(view, (), [each], parent).clock
@@ -384,13 +458,11 @@ def newest_of_body(
     return None
 
 
-def poses_of_body(
-    view: View, window: TimeWindow, frame_id: str | None = None
-) -> list[tuple[Ns, Pose]]:
+def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     """Returns the poses of the robot's body by transforms, in order; none without such a body.
 
-    In the map or the root of its frames, or in `frame_id`. At most twenty a second: all are looked
-    up for each question.
+    In the map or the root of its frames. At most twenty a second: all are looked up for each
+    question.
 
     Raises:
         InvalidArgumentsError: there are too many bags for that.
@@ -406,9 +478,9 @@ def poses_of_body(
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions, parent = sessions_of(view), frame_id or body.parent
+    sessions, parent = sessions_of(view), body.parent
     for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
-        moving = moving_in(view, window, session)
+        moving = moving_in(view, window.widened(TF_CACHE_NS), session)
         frames = frames_of(view, static_transforms(view, session), moving, parent)
         own = [each for each in moving if each.child.lstrip("/") == body.child]
         own = [each for each in own if window.contains(each.log_time)]

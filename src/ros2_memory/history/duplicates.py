@@ -9,20 +9,18 @@ is a duplicate, however alike two messages are.
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Final, NamedTuple
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.core.spans import COPY_HORIZON_NS, lies_inside, overlap_spans
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Record
-
-_LONGEST_ROW_NS: Final[Ns] = 3 * COPY_HORIZON_NS
-"""Bounds memory for a topic whose messages are all alike, their publish times too."""
 
 
 class StoredMessage(NamedTuple):
@@ -35,6 +33,16 @@ class StoredMessage(NamedTuple):
     def time(self) -> Ns:
         """Log time."""
         return self.record.log_time
+
+    @property
+    def topic(self) -> str:
+        """The name of its topic."""
+        return self.record.channel.topic
+
+    @property
+    def type(self) -> str:
+        """The name of its type."""
+        return self.record.channel.type
 
 
 class BagSpan(NamedTuple):
@@ -99,59 +107,30 @@ def deduplicate_backward(
 ) -> Iterator[StoredMessage]:
     """Yields a descending stream without the duplicates that `deduplicate_forward` leaves out.
 
-    A message is held until no earlier duplicate can come. Where duplicates follow each other for
-    longer than `_LONGEST_ROW_NS`, with never a pause of `COPY_HORIZON_NS`, other ones may be left
-    out.
+    Messages in the spans are held for a slice of time and the one before it, in which all earlier
+    duplicates are. Where messages that are all alike, their publish times too, follow each other
+    for longer than the horizon, other ones may be left out.
     """
-    held: deque[tuple[StoredMessage, _Row | None]] = deque()
-    rows: dict[Copy, _Row] = {}
-    for each in found:
-        while held and (held[0][1] is None or held[0][1].is_over(each.time)):
-            yield from _released(*held.popleft(), rows)
-        if not lies_inside(spans, each.time):
-            held.append((each, None))
-            continue
-        key = copy_key(each.record)
-        row = rows.get(key)
-        if row is None or row.is_over(each.time):
-            row = rows[key] = _Row(key)
-        row.messages.append(each)
-        held.append((each, row))
-    for each, row in held:
-        yield from _released(each, row, rows)
+
+    def slice_of(each: StoredMessage) -> int | None:
+        return each.time // COPY_HORIZON_NS if lies_inside(spans, each.time) else None
+
+    newer: list[StoredMessage] = []
+    for number, some in groupby(found, key=slice_of):
+        if number is None:
+            yield from _kept(newer, [], spans)
+            newer = []
+            yield from some
+        else:
+            older = [*some]
+            yield from _kept(newer, older, spans)
+            newer = older
+    yield from _kept(newer, [], spans)
 
 
-class _Row:
-    """Duplicates that follow each other without a long pause, newest first."""
-
-    def __init__(self, key: Copy) -> None:
-        self.key = key
-        self.messages: list[StoredMessage] = []
-        self._kept: set[int] | None = None
-
-    def is_over(self, now: Ns) -> bool:
-        """Whether no message at a moment or before it can belong to the row."""
-        if self._kept is not None:
-            return True
-        first, last = self.messages[-1].time, self.messages[0].time
-        return now < max(first - COPY_HORIZON_NS, last - _LONGEST_ROW_NS)
-
-    def keeps(self, found: StoredMessage) -> bool:
-        """Whether one of its messages counts; call it when the row is over."""
-        if len(self.messages) == 1:
-            return True
-        if self._kept is None:
-            everywhere = [(MIN_NS, MAX_NS)]
-            self._kept = {
-                id(each) for each in deduplicate_forward(reversed(self.messages), everywhere)
-            }
-        return id(found) in self._kept
-
-
-def _released(
-    each: StoredMessage, row: _Row | None, rows: dict[Copy, _Row]
+def _kept(
+    own: Sequence[StoredMessage], older: Sequence[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
-    if row is None or row.keeps(each):
-        yield each
-    if row is not None and rows.get(row.key) is row:
-        del rows[row.key]
+    """Returns which messages of a slice count, given those of the one before it; newest first."""
+    kept = {id(each) for each in deduplicate_forward(reversed([*own, *older]), spans)}
+    return (each for each in own if id(each) in kept)

@@ -105,11 +105,11 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            found = Held(self._word(message, newest.record.channel.type), 0, 0, ended=True).value
+            found = Held(self._word(message, newest.type), 0, 0, ended=True).value
             if isinstance(found, list | dict | None):
                 of = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(
-                    f"{asked}: {of}{topic} ({newest.record.channel.type}) is no text, number or "
+                    f"{asked}: {of}{topic} ({newest.type}) is no text, number or "
                     "boolean, which holds until the next one: ask about a topic that has one, such "
                     "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
                 )
@@ -214,7 +214,7 @@ class HeldValues:
 
     def _said(self, rows: Rows) -> tuple[IntArray, Texts] | None:
         """Returns the log times of some rows, and what each says; None where columns lack it."""
-        texts = words_of(rows.table, self._field, self._view.memory.extractor)
+        texts = words_of(rows.table, self._field, self._view.extractor)
         if texts is None:
             return None
         return rows.times, texts if rows.index is None else texts.rows(rows.index)
@@ -229,11 +229,11 @@ class HeldValues:
             self._check(found.time)
             message = self._view.bags.decode(found)
             if message is not None:
-                word = self._word(message, found.record.channel.type)
+                word = self._word(message, found.type)
                 yield _Run(word, found.time, found.time)
 
     def _word(self, message: object, type_name: str) -> str:
-        extractor = self._view.memory.extractor
+        extractor = self._view.extractor
         if self._field is None:
             return json.dumps(extractor.exact(message, type_name))
         return json.dumps(extractor.exact_at(message, type_name, self._field))
@@ -269,12 +269,12 @@ def _ends_of_clocks(view: View) -> Iterator[Ns]:
 
 def is_text(view: View, topic: str) -> bool:
     """Returns whether all messages of a topic are plain texts."""
-    return set(view.snapshot.timeline.types_of(topic)) == {TEXT}
+    return set(view.timeline.types_of(topic)) == {TEXT}
 
 
 def holds_on(view: View, topics: Iterable[str]) -> bool:
     """Returns whether the newest messages of topics hold on: they are latched, or seldom."""
-    latching, timeline = view.memory.limits.latching, view.snapshot.timeline
+    latching, timeline = view.limits.latching, view.timeline
     return all(
         latching.is_latched(view.snapshot, topic)
         or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.duplicates import (
     BagSpan,
     Copy,
@@ -40,16 +40,10 @@ if TYPE_CHECKING:
 
 
 class MergedStream:
-    """Reads all bags of one call together.
-
-    Attributes:
-        originals_since: log time from which on bags were searched for originals of messages that
-            were received late; `MAX_NS` where there was none.
-    """
+    """Reads all bags of one call together."""
 
     def __init__(self, bags: BagAccess) -> None:
         self.bags = bags
-        self.originals_since: Ns = MAX_NS
         self._timeline = bags.snapshot.timeline
         self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
         self._searched: dict[str, Spans] = {}
@@ -167,7 +161,7 @@ class MergedStream:
 
     def find_first_copy(self, found: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        topic, window = found.record.channel.topic, _since_published(found)
+        topic, window = found.topic, _since_published(found)
         if found.record.may_be_relatched and self.may_be_relatched([topic]):
             bags = self.overlapping_bags([topic], window)
             copies = self.merged(bags, [topic], window, newest_first=False)
@@ -178,7 +172,6 @@ class MergedStream:
         record = found.record
         if not record.may_be_relatched:
             return False
-        self.originals_since = min(self.originals_since, _since_published(found).start)
         self._find_first_copies(found)
         first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
         return found.time > first[0] and found.bag.recording != first[1]
@@ -189,7 +182,7 @@ class MergedStream:
         Late messages come many at once. So the search covers the rest of the late one's bag, and as
         much again before its window: a few searches serve them all.
         """
-        topic, window = late.record.channel.topic, _since_published(late)
+        topic, window = late.topic, _since_published(late)
         searched = self._searched.setdefault(topic, [])
         if not without([(window.start, window.stop)], searched):
             return

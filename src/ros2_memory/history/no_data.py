@@ -69,7 +69,7 @@ def resolve_topic(view: View, name: str) -> str:
     Raises:
         NoDataError: `topic_not_recorded` with the nearest names, or `empty_memory`.
     """
-    topics = view.snapshot.timeline.topics()
+    topics = view.timeline.topics()
     for candidate in (name, f"/{name}", name.removeprefix("/")):
         if candidate in topics:
             return candidate
@@ -83,8 +83,8 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     there is more than one, or somebody chose `data.pose_topic`; goals and clicked points do not
     count.
     """
-    configured = view.memory.limits.pose_topic
-    is_recorded = configured in view.snapshot.timeline.topics()
+    configured = view.limits.pose_topic
+    is_recorded = configured in view.timeline.topics()
     if configured != _DEFAULT_POSES or is_recorded:
         return None
     found = topics_of_robot(view, what)
@@ -101,9 +101,9 @@ def topics_of_robot(view: View, what: str) -> list[str]:
 
 def has_poses(view: View) -> bool:
     """Whether a topic has the robot's poses; `View.has_poses` remembers it."""
-    extractor = view.memory.extractor
+    extractor = view.extractor
     # Asked first, and cheap: of other topics it takes longer to know.
-    for type_name in view.snapshot.timeline.types_of(view.memory.limits.pose_topic):
+    for type_name in view.timeline.types_of(view.limits.pose_topic):
         if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
             return True
     return bool(topics_of_robot(view, "position") or topics_that_show_poses(view))
@@ -131,7 +131,7 @@ def resolve_pose_topic(
     """
     if name is not None:
         return resolve_topic(view, name)
-    configured = view.memory.limits.pose_topic
+    configured = view.limits.pose_topic
     only = only_pose_topic(view, what, degrees=degrees)
     if only is not None:
         view.notes.add(
@@ -193,7 +193,7 @@ def topics_that_show_poses(view: View) -> list[str]:
 
     Each with its type behind it, of at most `MOST_TRIED` topics: for an error alone.
     """
-    extractor, timeline = view.memory.extractor, view.snapshot.timeline
+    extractor, timeline = view.extractor, view.timeline
     unmapped = [
         topic
         for topic in timeline.topics()
@@ -206,7 +206,7 @@ def topics_that_show_poses(view: View) -> list[str]:
             newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
             if newest is None:
                 continue
-            type_name = newest.record.channel.type
+            type_name = newest.type
             pose = extractor.pose(decode(view, newest), type_name)
             if pose is not None and pose.orientation is not None:
                 shown.append(f"{topic} ({type_name})")
@@ -215,8 +215,8 @@ def topics_that_show_poses(view: View) -> list[str]:
 
 def transform_topics(view: View) -> list[str]:
     """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
-    recorded = view.snapshot.timeline.topics()
-    return [topic for topic in view.memory.limits.tf_topics if topic in recorded]
+    recorded = view.timeline.topics()
+    return [topic for topic in view.limits.tf_topics if topic in recorded]
 
 
 def topics_with(view: View, what: str) -> list[str]:
@@ -224,7 +224,7 @@ def topics_with(view: View, what: str) -> list[str]:
 
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
-    kinds_of, types = view.memory.extractor.kinds_of, view.snapshot.timeline.types
+    kinds_of, types = view.extractor.kinds_of, view.timeline.types
     carriers = {each for each in set(chain(*types.values())) if what in kinds_of(each)}
     return [
         f"{topic} ({type_name})"
@@ -242,7 +242,7 @@ def matching_topics(view: View, pattern: str) -> tuple[str, ...]:
     """
     if not any(mark in pattern for mark in "*?["):
         return (resolve_topic(view, pattern),)
-    matched = tuple(match_topics(view.snapshot.timeline.topics(), pattern))
+    matched = tuple(match_topics(view.timeline.topics(), pattern))
     if not matched:
         raise not_recorded(view, pattern)
     return matched
@@ -263,7 +263,7 @@ def require_bags(view: View) -> None:
             f"nothing of the first split is on disk yet; ask again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the first split is still being written; ask again when it closes, in "
-            f"{view.memory.limits.closed_after_s:g} s or less",
+            f"{view.limits.closed_after_s:g} s or less",
         )
     why = [snapshot.problem or "the bag directory contains no bag with messages"]
     if snapshot.damaged:
@@ -335,10 +335,14 @@ def no_data_at(
         detail += why
     if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
         reason = NoDataReason.DELETED
-    detail += _advice(view, reason)
-    if _is_to_come(view, at):
-        detail.append(_to_come(view, at))
-    elif older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
+    to_come = _to_come(view, at)
+    detail += [*_advice(view, reason), *to_come]
+    if (
+        not to_come
+        and older
+        and tolerance is not None
+        and at - older.time <= max(_NEAR_NS, 2 * tolerance)
+    ):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
         detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
@@ -363,17 +367,12 @@ def _within_recording(
     if is_thinned(older.bag.file) and not view.gaps(TimeWindow(older.time + 1, newer.time)):
         why = "of that time only some messages stayed: retention deleted the others"
         return NoDataReason.DELETED, [why]
-    period = _usual_period(view, older)
+    pace = view.timeline.pace(older.topic, older.bag.recording).topic
+    period = (pace.last - pace.first) // max(pace.messages - 1, 1)
     if newer.time - older.time <= 2 * period:
         every = f"the topic has a message every {seconds(period)}"
         return NoDataReason.BETWEEN_MESSAGES, [every]
     return NoDataReason.GAP, []
-
-
-def _usual_period(view: View, found: StoredMessage) -> Ns:
-    """Returns the mean time between the messages of a topic in the recording of one of them."""
-    pace = view.snapshot.timeline.pace(found.record.channel.topic, found.bag.recording).topic
-    return (pace.last - pace.first) // max(pace.messages - 1, 1)
 
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
@@ -394,9 +393,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     reason = between(view, window) if is_between else beyond(view, newest)
     if _have_expired(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
-    detail += _advice(view, reason)
-    if _is_to_come(view, start):
-        detail.append(_to_come(view, start))
+    detail += [*_advice(view, reason), *_to_come(view, start)]
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -422,16 +419,14 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         when = f"after {unix_text(start)}"
     else:
         when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, asked)
+    deleted = deleted_between(view, asked)
     detail = [why_nothing(when, deleted=bool(deleted))]
     if first is not None and last is not None:
         detail.append(f"there is a gap from {unix_text(first)} to {unix_text(last)}")
         reason = between(view, asked)
     else:
         reason = beyond(view, start)
-    detail += _advice(view, reason)
-    if _is_to_come(view, start):
-        detail.append(_to_come(view, start))
+    detail += [*_advice(view, reason), *_to_come(view, start)]
     raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
 
 
@@ -464,7 +459,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     """
     if _have_expired(view, topics, window):
         return []
-    timeline, whole = view.snapshot.timeline, view.snapshot.metadata_folders
+    timeline, whole = view.timeline, view.snapshot.metadata_folders
     names: dict[str, None] = {}
     held: set[str] = set()
     for bag in timeline.overlapping(window):
@@ -491,9 +486,7 @@ def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
 
     def carried(topic: str) -> set[str]:
         return {
-            kind
-            for each in view.snapshot.timeline.types_of(topic)
-            for kind in view.memory.extractor.kinds_of(each)
+            kind for each in view.timeline.types_of(topic) for kind in view.extractor.kinds_of(each)
         }
 
     wanted = {kind for topic in topics for kind in carried(topic)}
@@ -509,26 +502,24 @@ def between(view: View, window: TimeWindow) -> NoDataReason:
     """
     if being_written(view.snapshot, window):
         return NoDataReason.NOT_CLOSED_YET
-    deleted = deleted_between(view.snapshot, view.memory.index.bag_dir, window)
+    deleted = deleted_between(view, window)
     return NoDataReason.DELETED if deleted else NoDataReason.GAP
 
 
 def beyond(view: View, at: Ns) -> NoDataReason:
     """Returns why a moment with no message on one of its sides has no answer."""
     latest = view.snapshot.latest
-    if latest is not None and at > latest and view.snapshot.active and not _is_to_come(view, at):
+    if latest is not None and at > latest and view.snapshot.active and not _to_come(view, at):
         return NoDataReason.NOT_CLOSED_YET
     return NoDataReason.OUTSIDE_RANGE
 
 
-def _is_to_come(view: View, at: Ns) -> bool:
-    """Whether a moment is later than now by more than two clocks differ: nothing waits for it."""
-    return at > view.memory.clock.now() + _CLOCKS_DIFFER_NS
-
-
-def _to_come(view: View, at: Ns) -> str:
+def _to_come(view: View, at: Ns) -> list[str]:
+    """Returns a sentence for a moment that is later than now by more than two clocks differ."""
     now = view.memory.clock.now()
-    return f"the time asked is {seconds(at - now)} in the future: it is {unix_text(now)} now"
+    if at <= now + _CLOCKS_DIFFER_NS:
+        return []
+    return [f"the time asked is {seconds(at - now)} in the future: it is {unix_text(now)} now"]
 
 
 def undecodable(error: UndecodableError) -> NoDataError:
@@ -556,15 +547,11 @@ def describe_lack(view: View, what: str, found: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
     channel = found.record.channel
     has = f"carries no {what}"
-    if "geodetic" in view.memory.extractor.kinds_of(channel.type):
+    if "geodetic" in view.extractor.kinds_of(channel.type):
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
-    if (
-        not topics
-        and what == "velocity"
-        and "position" in view.memory.extractor.kinds_of(channel.type)
-    ):
+    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(channel.type):
         return (
             f"topic: {channel.topic} is a {channel.type}, which {has}, and no topic recorded does; "
             "trajectory_summary returns speeds from its poses"
@@ -590,6 +577,6 @@ def _advice(view: View, reason: NoDataReason) -> list[str]:
             f"ask about an earlier moment, or again in {ON_DISK_S} s"
             if _active_answers(view)
             else "the split being written is not read until it closes: ask about an earlier "
-            f"moment, or again in {view.memory.limits.closed_after_s:g} s"
+            f"moment, or again in {view.limits.closed_after_s:g} s"
         )
     return advice

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import math
 from functools import cached_property, partial
-from hashlib import sha256
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses, joined_poses
-from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
-from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
     blocks,
-    decoded_rows,
-    joined_back,
     messages_of,
-    open_scan,
+    of_columns,
     scan,
 )
 
@@ -33,8 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.fragments import Fragments, Kind, Sized
-    from ros2_memory.columns.scan import Stretch
+    from ros2_memory.columns.fragments import Sized
     from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import Beside
@@ -55,13 +48,11 @@ class PoseRows:
         span: log times (ns) that none of them is earlier or later than.
         load: returns the poses.
         parts: the numbers of the parts of which all rows are here; None if there are others, too.
-        trouble: differs from before where something could not be read since.
 
     Attributes:
         first: a log time (ns) that none of the poses is earlier than.
         last: one that none is later than.
         parts: see above.
-        trouble: see above.
     """
 
     def __init__(
@@ -69,11 +60,9 @@ class PoseRows:
         span: tuple[Ns, Ns],
         load: Callable[[], Poses],
         parts: tuple[int, ...] | None = None,
-        trouble: Callable[[], Hashable] = lambda: None,
     ) -> None:
         self.first, self.last = span
         self.parts = parts
-        self.trouble = trouble
         self._load = load
 
     def slices(self, length: Ns) -> Iterable[int]:
@@ -114,143 +103,6 @@ def pose_rows(
     counting = (rows for rows in scan(view, topic, window) if among(rows.recording))
     for together in blocks(counting, newest_first=False):
         yield reader.block(together)
-
-
-def slices_of_poses(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    kind: Kind[T],
-    make: Callable[[PoseSlice], T],
-    *,
-    failures: list[UndecodableError],
-    length: Ns,
-    beside: Ns = 0,
-    settings: str = "",
-    reached: Callable[[Ns], None] = lambda _: None,
-    twice: Sequence[Beside] = (),
-) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the poses of a topic in slices of the clock, the newest first.
-
-    Each with a time (log time, ns) that no pose of it is earlier than.
-
-    Args:
-        view: of the call.
-        topic: of the poses.
-        window: of log time.
-        kind: what is made; it is stored, and joined by stretches of the clock.
-        make: makes it.
-        failures: as for `pose_rows`.
-        length: of a slice (ns); they are counted from the epoch.
-        beside: poses so far before and after a slice (ns) are with it, too.
-        settings: what it depends on besides the poses.
-        reached: as for `scan`.
-        twice: recordings that are beside each other: the poses are those of the first.
-
-    Raises:
-        InvalidArgumentsError: while it is iterated, messages carry no position.
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
-    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
-    reader = PoseReader(view, failures, twice)
-    known = view.memory.columns.fragments(kind)
-
-    def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
-        around = stretch.window.widened(beside)
-        rows = opened.rows(newest_first=True, among=around)
-        every = map(reader.block, blocks(rows, newest_first=True))
-        needs_all = stretch.parts is not None or not view.call.stored
-        found = (block for block in every if block.parts or needs_all)
-        for some in slices_back(found, length, beside):
-            if stretch.window.overlaps(some.start, some.stop - 1):
-                yield some.start, some.remembered(known, make, settings)
-
-    def key_of(stretch: Stretch) -> FragmentKey | None:
-        around = stretch.window.widened(beside)
-        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
-        if not near:
-            return stretch.key(settings)
-        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
-        left_out = repr(
-            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
-        )
-        return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
-
-    yield from joined_back(
-        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
-    )
-
-
-class PoseSlice:
-    """The poses in a slice of the clock, and those beside it.
-
-    Attributes:
-        start: log time (ns) where it begins.
-        stop: where it ends.
-    """
-
-    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
-        self.start, self.stop = start, stop
-        self._beside = beside
-        self._blocks = blocks
-
-    @property
-    def poses(self) -> Poses:
-        """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
-        start, stop = self.start - self._beside, self.stop + self._beside
-        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
-
-    def remembered(
-        self, known: Fragments[T] | None, make: Callable[[PoseSlice], T], settings: str = ""
-    ) -> T:
-        """Returns what is made of it, and remembers that where it follows from whole parts alone.
-
-        Raises:
-            InvalidArgumentsError: messages carry no position.
-        """
-        parts: list[int] = []
-        for block in self._blocks:
-            if known is None or block.parts is None:
-                return make(self)
-            parts += block.parts
-        key = FragmentKey(self.start, settings, tuple(parts))
-        found = None if known is None else known.get(key)
-        if found is None:
-            before = [block.trouble() for block in self._blocks]
-            found = make(self)
-            if known is not None and before == [block.trouble() for block in self._blocks]:
-                known.put(key, found)
-        return found
-
-
-def slices_back(blocks: Iterable[PoseRows], length: Ns, beside: Ns = 0) -> Iterator[PoseSlice]:
-    """Yields the slices of the clock in which there may be poses, the newest first.
-
-    Args:
-        blocks: from `pose_rows`, the newest first.
-        length: of a slice (ns); they are counted from the epoch.
-        beside: poses so far before and after a slice (ns) are with it, too.
-    """
-    held: list[PoseRows] = []
-    waiting: set[int] = set()
-
-    def done(oldest: Ns) -> Iterator[PoseSlice]:
-        """Yields the slices that reach no poses older than the oldest that is held."""
-        for number in sorted(waiting, reverse=True):
-            start, stop = number * length, (number + 1) * length
-            if start - beside < oldest:
-                return
-            waiting.discard(number)
-            near = [each for each in held if each.last >= start - beside]
-            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
-
-    for block in blocks:
-        newest = max(waiting, default=block.last // length)
-        held = [each for each in held if each.first < (newest + 1) * length + beside]
-        held.append(block)
-        waiting.update(block.slices(length))
-        yield from done(block.first)
-    yield from done(MIN_NS)
 
 
 def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
@@ -297,7 +149,7 @@ class PoseReader:
         self._view = view
         self._failures = failures
         self._beside = beside
-        self._columns = PoseColumns(view.memory.extractor)
+        self._columns = PoseColumns(view.extractor)
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the poses of rows that overlap in time, in the order of `blocks`."""
@@ -306,7 +158,7 @@ class PoseReader:
         numbers = tuple(part for part in known if part is not None)
         is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
         parts = numbers if is_whole else None
-        return PoseRows(span, partial(self._joined, rows), parts, self.trouble)
+        return PoseRows(span, partial(self._joined, rows), parts)
 
     def trouble(self) -> Hashable:
         """Returns what differs from before where something could not be read since."""
@@ -343,39 +195,23 @@ class PoseReader:
             InvalidArgumentsError: messages carry no position.
         """
         try:
-            found = self._columns.of(rows.table, rows.times, rows.index)
-            if found is None and isinstance(rows.table, StoredTable):
-                found = self._of_bags(rows)
+            found = of_columns(
+                self._view, rows, lambda each: self._columns.of(each.table, each.times, each.index)
+            )
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        return poses_of(self._decoded(rows)) if found is None else found
-
-    def _of_bags(self, rows: Rows) -> Poses | None:
-        """Returns the poses of a topic of which no columns are stored, as it is beyond its share.
-
-        None where the columns of its messages are not enough for them.
-        """
-        found: list[Poses] = []
-        for each in decoded_rows(self._view, rows):
-            poses = self._columns.of(each.table, each.times, each.index)
-            if poses is None:
-                return None
-            found.append(poses)
-        return joined_poses(found)
+        return poses_of(self._decoded(rows)) if found is None else joined_poses(found)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
-        reader, extractor = self._view.memory.reader, self._view.memory.extractor
+        extractor = self._view.extractor
         samples: list[tuple[Ns, Pose, float | None]] = []
         for found in messages_of(self._view, rows):
-            type_name = found.record.channel.type
-            try:
-                message = reader.decode(found.record)
-            except UndecodableError as error:
-                # A new one, since the one that was raised keeps the message by its traceback.
-                self._failures.append(UndecodableError(error.topic, error.type_name, error.reason))
+            type_name = found.type
+            message = self._view.bags.decode(found, self._failures)
+            if message is None:
                 continue
             pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
             if pose is None:

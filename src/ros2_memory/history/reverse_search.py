@@ -6,9 +6,12 @@ there that decides which ones count.
 
 from __future__ import annotations
 
+import heapq
 import re
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+
+import numpy as np
 
 from ros2_memory.analysis.conditions import (
     Equals,
@@ -17,6 +20,7 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
     refusal_for,
 )
+from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import (
     BagError,
     InvalidArgumentsError,
@@ -25,24 +29,26 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
-from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.candidates import CandidateRows
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
+from ros2_memory.history.scan import scan
 from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, unknown_name_hint
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import Schema
+    from ros2_memory.storage.base import IntArray, Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
 _CONSTANT: Final = re.compile(
@@ -55,6 +61,9 @@ _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
+_TOGETHER_NS: Final[Ns] = NS_PER_S
+"""Messages that may match and are no farther apart are read at once."""
+_MOST_TOGETHER: Final = 256
 
 
 def condition_of(
@@ -79,7 +88,7 @@ def condition_of(
     memory = view.memory
     limits = memory.limits
     least = limits.min_score if min_score is None else min_score
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
     if field and len(types) == 1:
         (type_name,) = types
@@ -99,7 +108,7 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     Else the value. A field is a number where the definition has one of its name.
     """
     word = value.strip() if isinstance(value, str) else ""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     topic = next((each for each in timeline.topics() if type_name in timeline.types_of(each)), None)
     if not _CONSTANT_NAME.fullmatch(word) or topic is None:
         return value
@@ -143,7 +152,7 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
 
     They are in the map where transforms lead there.
     """
-    target = view.memory.limits.map_frame
+    target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
     frames = {each for topic in topics[:_MOST_FRAMES] for each in _frames_of(view, topic)}
@@ -179,7 +188,7 @@ def _frames_of(view: View, topic: str) -> list[str]:
     message = None if found is None else view.bags.decode(found)
     if found is None or message is None:
         return []
-    extractor, type_name = view.memory.extractor, found.record.channel.type
+    extractor, type_name = view.extractor, found.type
     own = extractor.frame(message)
     seen = detections_of(extractor.exact(message, type_name), own)
     frames = {each.frame_id for each in seen if each.place is not None}
@@ -208,6 +217,122 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
         f"{view.bags.filling_progress()}to continue from there, ask again with before={back_to}",
         searched_back_to=searched_to,
     )
+
+
+class Candidate(NamedTuple):
+    """A time at which messages may match, and the topics that these are of."""
+
+    window: TimeWindow
+    topics: tuple[str, ...]
+
+
+class CandidateRows:
+    """Finds the times of messages that may meet a condition, before a moment.
+
+    Attributes:
+        condition: what is searched for.
+        ruled_out: whether a message was left out, because its columns do not meet the condition.
+        has_looked: whether any message was looked at.
+    """
+
+    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
+        self.condition = condition
+        self.ruled_out = False
+        self.has_looked = False
+        newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
+        self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
+        self._ready: list[tuple[Ns, int]] = []
+        self._view = view
+        self._topics = topics
+        self._until = until
+        self._test = ColumnCondition(condition, view.extractor)
+
+    def windows(self) -> Iterator[Candidate]:
+        """Yields the times at which a match can lie, newest first; they do not overlap."""
+        group: list[tuple[Ns, str]] = []
+        most = 1
+        for time, topic in self._times():
+            if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
+                yield _together(group)
+                # The first that may match mostly does; where many do not, more are read at once.
+                most, group = min(2 * most, _MOST_TOGETHER), []
+            group.append((time, topic))
+        if group:
+            yield _together(group)
+
+    @property
+    def reached(self) -> Ns:
+        """The log time from which on all has been looked at, and what may match was yielded."""
+        waiting = [-time + 1 for time, _ in self._ready]
+        return max([*self._left.values(), *waiting], default=MIN_NS)
+
+    def _times(self) -> Iterator[tuple[Ns, str]]:
+        """Yields the log times of messages that may match, newest first, each once."""
+        sources = [iter(self._of_topic(topic)) for topic in self._topics]
+        # What each topic may still yield is no newer than its next table.
+        waiting = [
+            (-last, nth, times)
+            for nth, source in enumerate(sources)
+            if (found := next(source, None)) is not None
+            for last, times in [found]
+        ]
+        heapq.heapify(waiting)
+        ready = self._ready
+        before: tuple[Ns, int] | None = None
+        while waiting or ready:
+            while waiting and (not ready or waiting[0][0] <= ready[0][0]):
+                _, nth, times = heapq.heappop(waiting)
+                for time in times.tolist():
+                    heapq.heappush(ready, (-time, nth))
+                if (found := next(sources[nth], None)) is not None:
+                    heapq.heappush(waiting, (-found[0], nth, found[1]))
+            if ready:
+                time, nth = heapq.heappop(ready)
+                if (time, nth) != before:
+                    yield -time, self._topics[nth]
+                before = time, nth
+
+    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, IntArray]]:
+        """Yields for each table of a topic its last log time, and when messages may match."""
+
+        def reached(last: Ns) -> None:
+            self._left[topic] = min(last + 1, self._until)
+
+        window = TimeWindow(MIN_NS, self._until)
+        for rows in scan(
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._may_match,
+            may_be_empty=True,
+            reached=reached,
+        ):
+            yield rows.last, self._candidates(rows)
+        self._left[topic] = MIN_NS
+
+    def _may_match(self, parts: PartZones) -> bool | Mask:
+        found = self._test.may_match(parts)
+        self.has_looked = True
+        self.ruled_out |= not np.all(found)
+        return found
+
+    def _candidates(self, rows: Rows) -> IntArray:
+        self.has_looked = True
+        truth = self._test.truth(rows.table)
+        if truth.is_none:
+            self.ruled_out = True
+            return np.empty(0, np.int64)
+        may = truth.met | truth.unsure
+        if rows.index is not None:
+            may = may[rows.index]
+        self.ruled_out |= not may.all()
+        return rows.times[may]
+
+
+def _together(group: Sequence[tuple[Ns, str]]) -> Candidate:
+    topics = tuple(sorted({topic for _, topic in group}))
+    return Candidate(TimeWindow(group[-1][0], group[0][0] + 1), topics)
 
 
 class Searched(Protocol):
@@ -298,7 +423,7 @@ class ReverseSearch:
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
         found = self._view.stream.newest(topic, TimeWindow.everything())
-        value = None if found is None else self._value(found)
+        value = None if found is None else self._view.value(found)
         field = self.condition.field
         if found is None or value is None:
             return None
@@ -307,7 +432,7 @@ class ReverseSearch:
             older = self._view.stream.messages(
                 [topic], TimeWindow(MIN_NS, found.time), newest_first=True
             )
-            values = map(self._value, islice(older, _MOST_EMPTY))
+            values = map(self._view.value, islice(older, _MOST_EMPTY))
             value = next((each for each in values if not is_unknown_below(each, field)), value)
         schema = found.record.channel.schema
         refusal = refusal_for(self.condition, value)
@@ -317,11 +442,6 @@ class ReverseSearch:
         field = (self.condition.field or "").rpartition(".")[2]
         constants = _constants_named(schema, field, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
-
-    def _value(self, found: StoredMessage) -> JsonValue:
-        message = self._view.bags.decode(found)
-        type_name = found.record.channel.schema.name
-        return None if message is None else self._view.memory.extractor.exact(message, type_name)
 
     def matches(self, found: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""

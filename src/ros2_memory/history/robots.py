@@ -8,7 +8,6 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain, combinations, islice
 from pathlib import Path
@@ -69,16 +68,8 @@ _MAKERS: Final[Key[list[tuple[str, Sequence[BagFile]]]]] = Key()
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
-_DESCRIBED: Final[Key[_Described]] = Key()
-"""Of a memory."""
-
-
-@dataclass(slots=True)
-class _Described:
-    """When it was last looked whether robots are mixed, and what was found."""
-
-    at: Ns | None = None
-    sentences: tuple[str, ...] = ()
+_DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
+"""Of a memory: when it was last looked whether robots are mixed, and what was found."""
 
 
 class Mixed(NamedTuple):
@@ -146,7 +137,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     view = View(memory, call)
     known = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    makers = view.snapshot.timeline.memo.of(_MAKERS, partial(_of_different_makers, view))
+    makers = view.timeline.memo.of(_MAKERS, partial(_of_different_makers, view))
     for path, bags in makers:
         try:
             parents = known[path] if path in known else _static_parents(view, bags)
@@ -169,10 +160,10 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
-    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, _Described)
-    if known.at is None or abs(now - known.at) > _RECENT_NS:
-        known.at, known.sentences = now, tuple(_described(memory, call))
-    return known.sentences
+    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
+    if not known or abs(now - known[0][0]) > _RECENT_NS:
+        known[:] = [(now, tuple(_described(memory, call)))]
+    return known[0][1]
 
 
 def _described(memory: Memory, call: Call) -> Iterator[str]:
@@ -199,8 +190,8 @@ def _differing_topic(
         [bag for bag in recordings.get(str(path), ()) if both.overlaps(bag.start, bag.end)]
         for path in (pair.first, pair.second)
     )
-    shared = _topics_of(one) & _topics_of(other) - view.snapshot.timeline.transient_local
-    limits = view.memory.limits
+    shared = _topics_of(one) & _topics_of(other) - view.timeline.transient_local
+    limits = view.limits
     first = [each for each in (view.pose_topic, *limits.tf_topics) if each in shared]
     for topic in islice([*first, *sorted(shared.difference(first))], _MAX_COMPARED):
         if _differ_in(view, topic, (_spans(one, topic), _spans(other, topic)), both):
@@ -218,8 +209,8 @@ def _spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
 
 def _of_different_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     """Returns the newest recordings with static transforms, of this program's one in a folder."""
-    topics = view.memory.limits.tf_static_topics
-    root = f"{view.memory.index.bag_dir}/"
+    topics = view.limits.tf_static_topics
+    root = f"{view.bag_dir}/"
     newest: dict[str, tuple[str, Sequence[BagFile]]] = {}
     for path, bags in recordings_of(view.snapshot).items():
         folder, _, name = path.rpartition("/")
@@ -237,13 +228,13 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     """Returns the parent of each static frame of a recording, as it was stated last."""
     parents: dict[str, str] = {}
     window = TimeWindow.everything()
-    for topic in view.memory.limits.tf_static_topics:
+    for topic in view.limits.tf_static_topics:
         spans = _spans(bags, topic)
         merged = view.stream.merged(spans, [topic], window, newest_first=False) if spans else ()
         for each in islice(merged, _MAX_STATIC):
             message = view.bags.decode(each)
             if message is not None:
-                edges = view.memory.extractor.transforms(message, each.time, static=True)
+                edges = view.extractor.transforms(message, each.time, static=True)
                 parents.update({edge.child: edge.parent for edge in edges})
     return parents
 
@@ -282,7 +273,7 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     found = recordings_beside(view, topic, window)
     names = _names([each for each in found if not each.by_clock])
     # Transforms are of all recordings at once, so a path by them is not that of one there.
-    if topic in view.memory.limits.tf_topics:
+    if topic in view.limits.tf_topics:
         names = _names(found)
     if names:
         raise NoDataError(
@@ -291,18 +282,19 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
-    for each in found:
-        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
-        view.notes.add(
-            f"{each.first.name} and {each.other.name} have different messages on {topic} from "
-            f"{start} to {stop}, as after a clock was set back, or from two robots: the path there "
-            f"is that of {each.first.name}"
+    for each in [*found, *_beside_themselves(view, window)]:
+        name, start, stop = (
+            each.first.name,
+            unix_text(each.span.start),
+            unix_text(each.span.stop - 1),
         )
-    for each in _beside_themselves(view, window):
-        start, stop = unix_text(each.span.start), unix_text(each.span.stop - 1)
         view.notes.add(
-            f"{each.first.name} has the time from {start} to {stop} twice, as the clock was set "
-            "back meanwhile: the path there is that from before"
+            f"{name} has the time from {start} to {stop} twice, as the clock was set back "
+            "meanwhile: the path there is that from before"
+            if each.first == each.other
+            else f"{name} and {each.other.name} have different messages on {topic} from {start} to "
+            f"{stop}, as after a clock was set back, or from two robots: the path there is that of "
+            f"{name}"
         )
 
 
@@ -336,7 +328,7 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     None for latched topics, which each recording receives again, or where the time for the answer
     is over before it is known, or a lake does not hold the messages.
     """
-    if topic in view.snapshot.timeline.transient_local:
+    if topic in view.timeline.transient_local:
         return []
     found: list[Beside] = []
     apart: set[Path] = set()
@@ -365,8 +357,8 @@ def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spa
 
 def note_robots_near(view: View, found: StoredMessage) -> None:
     """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
-    topic = found.record.channel.topic
-    if len(view.snapshot.timeline.recordings(topic)) > 1:
+    topic = found.topic
+    if len(view.timeline.recordings(topic)) > 1:
         near = TimeWindow.around(found.time, _NEAR_NS)
         if any(_overlapping_pairs(view, topic, near)):
             note_robots(view, topic, TimeWindow.around(found.time, _SLOW_NS))
@@ -376,7 +368,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[B
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
-    spans = [(*span, path) for path, span in view.snapshot.timeline.recordings(topic).items()]
+    spans = [(*span, path) for path, span in view.timeline.recordings(topic).items()]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
         open_spans = [each for each in open_spans if each[1] >= first]
         for since, until, other in open_spans:
@@ -397,7 +389,7 @@ def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
             continue
         series, number = after
         twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        splits = [(split_of(bag.file), bag) for bag in view.snapshot.timeline.overlapping(twice)]
+        splits = [(split_of(bag.file), bag) for bag in view.timeline.overlapping(twice)]
         own = [(split[1], bag) for split, bag in splits if split is not None and split[0] == series]
         begin = min((bag.start for nth, bag in own if nth < number), default=twice.stop)
         span = TimeWindow(min(max(begin, twice.start), twice.stop), twice.stop)
@@ -418,7 +410,7 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
     """Whether two recordings hold messages in a window, and the other none of the one's."""
-    known, key = view.snapshot.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
+    known, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in known:
         return known[key]
     if sessions_of(view).are_joined(*pair):

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
+V = TypeVar("V")
 
 
 def scan(
@@ -44,20 +44,25 @@ def scan(
         return rows
 
     rows = open_scan(view, topic, window, **how).rows(newest_first=newest_first)
-    return map(noted, rows) if view.snapshot.timeline.thinned else rows
+    return map(noted, rows) if view.timeline.thinned else rows
 
 
-class How(TypedDict, total=False):
+class Wanted(TypedDict, total=False):
+    """What of a topic a scan is of; each is as in `Asked`."""
+
+    shared: Sequence[tuple[Ns, Ns]]
+    may_match: Callable[[PartZones], bool | Mask]
+    may_not_match: bool
+    may_be_empty: bool
+    within: Sequence[tuple[Ns, Ns]]
+    stored: bool
+
+
+class How(Wanted, total=False):
     """What `open_scan` may be told."""
 
     columns: bool
     copies: bool
-    shared: Sequence[tuple[Ns, Ns]] | None
-    may_match: Callable[[PartZones], bool | Mask] | None
-    may_not_match: bool
-    may_be_empty: bool
-    within: Sequence[tuple[Ns, Ns]] | None
-    stored: bool
     reached: Callable[[Ns], None]
 
 
@@ -68,22 +73,15 @@ def open_scan(
     *,
     columns: bool = True,
     copies: bool = False,
-    shared: Sequence[tuple[Ns, Ns]] | None = None,
-    may_match: Callable[[PartZones], bool | Mask] | None = None,
-    may_not_match: bool = False,
-    may_be_empty: bool = False,
-    within: Sequence[tuple[Ns, Ns]] | None = None,
-    stored: bool = False,
     reached: Callable[[Ns], None] = lambda _: None,
+    **wanted: Unpack[Wanted],
 ) -> Scan:
     """Returns the scan of a topic in a window.
 
     What cannot be read is noted. `reached` is called before each table with a log time that what
     is left does not lie behind (with `newest_first`: is not later than). Without `columns` only the
     times of rows are asked for: then messages that cannot be decoded have rows, too. With `copies`
-    a message counts in each recording that holds it. `shared` are the spans in which recordings
-    may hold copies, where the caller knows them. With `stored` bags that are not stored have no
-    rows. `may_match`, `may_not_match`, `may_be_empty` and `within` are as in `Asked`.
+    a message counts in each recording that holds it.
     """
 
     def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
@@ -93,22 +91,9 @@ def open_scan(
         reached(at)
         view.bags.check_deadline()
 
-    if shared is None:
-        shared = () if copies else view.snapshot.timeline.shared_times
-    asked = Asked(
-        topic,
-        window,
-        view.snapshot.timeline,
-        decode,
-        shared=shared,
-        may_match=may_match,
-        may_not_match=may_not_match,
-        may_be_empty=may_be_empty,
-        within=within,
-        stored=stored,
-        relatches=not copies and view.stream.may_be_relatched([topic]),
-        check=check,
-    )
+    wanted.setdefault("shared", () if copies else view.timeline.shared_times)
+    relatches = not copies and view.stream.may_be_relatched([topic])
+    asked = Asked(topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted)
     return Scan(view.memory.columns, asked)
 
 
@@ -162,14 +147,26 @@ def joined_back(
             yield stretch.window.start, one
 
 
-def holding_copies(view: View, topic: str, window: TimeWindow) -> Spans:
-    """Returns the half-open spans in which recordings may hold copies of a topic's messages.
+def remembered(
+    view: View,
+    kind: Kind[T],
+    key: FragmentKey | None,
+    make: Callable[[], T],
+    trouble: Callable[[], Hashable] = lambda: None,
+) -> T:
+    """Returns what follows from whole parts: what is known of it, else made now.
 
-    As far as the times at which they were published are known.
+    That is remembered unless something could not be read; see `joined_back`. A key of None stands
+    for what may still change.
     """
-    timeline = view.snapshot.timeline
-    asked = Asked(topic, window, timeline, lambda *_: (), shared=timeline.shared_times)
-    return Scan(view.memory.columns, asked).shared
+    known = view.memory.columns.fragments(kind)
+    found = None if key is None else known.get(key)
+    if found is None:
+        before = trouble(), view.notes.added
+        found = make()
+        if key is not None and before == (trouble(), view.notes.added):
+            known.put(key, found)
+    return found
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
@@ -196,29 +193,6 @@ def _in_order(together: list[Rows]) -> list[Rows]:
     return sorted(together, key=lambda rows: rows.order) if len(together) > 1 else together
 
 
-def copies(view: View, topic: str) -> Iterator[Rows]:
-    """Yields the rows of a topic that do not count, as another recording has them, too.
-
-    Raises:
-        QueryTimeoutError: while it is iterated, when the deadline has passed.
-    """
-    window = TimeWindow.everything()
-
-    def decode(bag: BagFile, topic: str, hashed: bool) -> Iterable[Table]:
-        return view.bags.tables(bag, topic, window, hashed=hashed, columns=False, around=True)
-
-    asked = Asked(
-        topic,
-        window,
-        view.snapshot.timeline,
-        decode,
-        shared=view.snapshot.timeline.shared_times,
-        relatches=view.stream.may_be_relatched([topic]),
-        check=lambda _: view.bags.check_deadline(),
-    )
-    return Scan(view.memory.columns, asked).copies()
-
-
 def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
     """Yields some rows as their bags have them."""
     for bag, positions in rows.bag_rows():
@@ -231,6 +205,19 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
                 yield Rows.of(unit, index)
 
 
+def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list[V] | None:
+    """Returns what is read of the columns of some rows: of those in the store, else in their bags.
+
+    A topic beyond its share has none in the store. None where only the messages have it.
+    """
+    found = read(rows)
+    if found is not None:
+        return [found]
+    every = [read(each) for each in decoded_rows(view, rows)]
+    known = [each for each in every if each is not None]
+    return known if every and len(known) == len(every) else None
+
+
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
     """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
     times, channel = rows.times, rows.table.channel
@@ -239,6 +226,6 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
         left = Counter(wanted.tolist())
         for found in view.bags.read(bag, [channel.topic], window):
-            if left[found.time] and found.record.channel.type == channel.type:
+            if left[found.time] and found.type == channel.type:
                 left[found.time] -= 1
                 yield found

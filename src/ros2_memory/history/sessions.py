@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, FrameEdge, StampedTransform
+    from ros2_memory.core.model import FrameEdge, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
@@ -77,13 +77,13 @@ class Sessions:
     def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
         self._view = view
         self._children = children
-        self._names = HardLinks(view.memory.index.bag_dir)
-        self._root = str(view.memory.index.bag_dir).rstrip("/")
+        self._names = HardLinks(view.bag_dir)
+        self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._recorded = view.snapshot.timeline.memo.of(_RECORDED, self._find_recorded)
+        self._recorded = view.timeline.memo.of(_RECORDED, self._find_recorded)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
-        self.linked = view.snapshot.timeline.memo.of(_LINKED, set)
+        self.linked = view.timeline.memo.of(_LINKED, set)
         self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
@@ -106,11 +106,11 @@ class Sessions:
         every = (by_folder.get(folder, {}) for folder in sorted(session))
         return {path: span for found in every for path, span in found.items()}
 
-    def _recordings_with(self, topics: tuple[str, ...]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
+    def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
         """Returns the recordings that hold some topics, by where they were recorded."""
         found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
         for topic in topics:
-            for path, span in self._view.snapshot.timeline.recordings(topic).items():
+            for path, span in self._view.timeline.recordings(topic).items():
                 there = found.setdefault(self.folder(path), {})
                 first, last = there.get(path, span)
                 there[path] = min(first, span[0]), max(last, span[1])
@@ -130,13 +130,13 @@ class Sessions:
         """Whether a session holds moving and static transforms: then it borrows none."""
         return len(self._kinds(session)) == len(self._recorded.kinds)
 
-    def is_carried(self, bag: BagFile) -> bool:
-        """Whether a bag holds carried messages, which are of several sessions."""
-        return self.holds_carried(bag.recording)
-
     def holds_carried(self, recording: Path) -> bool:
         """Whether a recording is of carried messages."""
         return self.folder(recording) == self._carried
+
+    def may_hold(self, session: Session, recording: Path) -> bool:
+        """Whether messages of a recording may be of a session."""
+        return self.holds_carried(recording) or self.folder(recording) in session
 
     def of(self, recording: Path) -> Session:
         """Returns the session of a recording."""
@@ -224,7 +224,7 @@ class Sessions:
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Returns the folders of the recordings that went on at a moment."""
-        bags = self._view.snapshot.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
+        bags = self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
     def _of(self, folder: str) -> Session:
@@ -233,34 +233,28 @@ class Sessions:
         return self._recorded.joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
-        spans: dict[str, tuple[Ns, Ns]] = {}
-        for topic in topics:
-            for recording, (first, last) in self._view.snapshot.timeline.recordings(topic).items():
-                folder = self.folder(recording)
-                known = spans.get(folder, (first, last))
-                spans[folder] = min(first, known[0]), max(last, known[1])
-        return spans
+        """Returns the log times of the first and the last message of some topics, by folder."""
+        ends = {
+            folder: zip(*held.values(), strict=True)
+            for folder, held in self._recordings_with(topics).items()
+        }
+        return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
 
     def _find_recorded(self) -> _Recorded:
-        limits, pose_topic = self._view.memory.limits, self._view.pose_topic
+        limits, pose_topic = self._view.limits, self._view.pose_topic
         topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
-        recordings = map(self._view.snapshot.timeline.recordings, topics)
+        recordings = map(self._view.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
-        chains = _joined(paths) if len(paths) > 1 else {}
+        chains = components(
+            (folder, f"{folder.rpartition('/')[0]}/{name}")
+            for folder, path in (paths.items() if len(paths) > 1 else ())
+            for name in _neighbours(path)
+        )
         return _Recorded(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
             [*self._spans_of((pose_topic,)).items()],
             {folder: frozenset(each | {self._carried}) for folder, each in chains.items()},
         )
-
-
-def _joined(paths: Mapping[str, Path]) -> dict[str, set[str]]:
-    """Returns, by folder, all folders that are joined with it by handovers, itself included."""
-    return components(
-        (folder, f"{folder.rpartition('/')[0]}/{name}")
-        for folder, path in paths.items()
-        for name in _neighbours(path)
-    )
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:

@@ -19,7 +19,9 @@ from ros2_memory.analysis.frames import (
     connected_with,
     edges_of,
     is_edge,
+    joined_edges,
     static_at,
+    static_in,
 )
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.store import relative
@@ -27,10 +29,12 @@ from ros2_memory.columns.transforms import (
     STATICS,
     Pair,
     Statics,
+    edges_in,
     pairs_in,
     stamped_between,
     static_times,
 )
+from ros2_memory.core.arrays import rows_of
 from ros2_memory.core.errors import (
     NoDataError,
     NoDataReason,
@@ -56,13 +60,21 @@ from ros2_memory.history.no_data import (
     not_recorded,
     seconds,
 )
-from ros2_memory.history.scan import decoded_rows, joined_back, messages_of, open_scan, scan
+from ros2_memory.history.scan import (
+    joined_back,
+    messages_of,
+    of_columns,
+    open_scan,
+    remembered,
+    scan,
+)
 from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.frames import Edges
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
@@ -123,7 +135,7 @@ def transform_at(
         NoDataError: no transform is recorded, a frame is unknown, the frames are not connected,
             or no transform brackets the moment on one of the edges between them.
     """
-    limits = view.memory.limits
+    limits = view.limits
     if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), sessions_of(view)
@@ -182,7 +194,7 @@ def _transform_in(
     view: View, among: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
     """Does as `transform_at`, by the transforms of one session."""
-    limits, (parent, child) = view.memory.limits, frames
+    limits, (parent, child) = view.limits, frames
     static = static_at(static_transforms(view, among), at)
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
@@ -191,7 +203,7 @@ def _transform_in(
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
-        moving = list(_transforms(view, limits.tf_topics, window, among))
+        moving = moving_in(view, window, among)
         try:
             return look_up(moving)._replace(reach=half_width)
         except NoDataError as error:
@@ -208,9 +220,13 @@ def _transform_in(
 
 
 def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
-    """Returns the moving transforms of a session that a lookup at any moment of a window needs."""
-    topics = view.memory.limits.tf_topics
-    return list(_transforms(view, topics, window.widened(TF_CACHE_NS), among))
+    """Returns the moving transforms that a session received in a window, in log-time order."""
+    sessions, topics = sessions_of(view), _recorded(view, view.limits.tf_topics)
+    bags = _bags_of(view, topics, window, among)
+    merged = view.stream.merged(bags, topics, window, newest_first=False)
+    tracked = view.bags.track_sources(merged)
+    own = (found for found in tracked if sessions.has(among, found))
+    return [*decoded_transforms(view, own)]
 
 
 def frames_of(
@@ -220,7 +236,7 @@ def frames_of(
     target: str,
 ) -> Frames:
     """Returns frames in a target frame by some transforms, of which none holds on."""
-    clock = view.memory.limits.tf_clock
+    clock = view.limits.tf_clock
     return Frames(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
 
@@ -233,11 +249,11 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    sessions, timeline, scanner = sessions_of(view), view.snapshot.timeline, view.memory.columns
+    sessions, timeline, scanner = sessions_of(view), view.timeline, view.memory.columns
     known = sessions.statics.get(among)
     if known is not None:
         return known
-    topics = _recorded(view, view.memory.limits.tf_static_topics)
+    topics = _recorded(view, view.limits.tf_static_topics)
     key = (among, topics)
     kept = scanner.statics.get(key)
     if kept is not None and kept[0] is timeline:
@@ -261,9 +277,9 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
 
 def _find_all_statics(view: View, topics: Sequence[str]) -> None:
     """Finds the static transforms of all sessions that are stored, unless some are carried."""
-    sessions, root = sessions_of(view), view.memory.index.bag_dir
-    coverage = view.memory.columns.coverage(view.snapshot.timeline)
-    recordings = [path for topic in topics for path in view.snapshot.timeline.recordings(topic)]
+    sessions, root = sessions_of(view), view.bag_dir
+    coverage = view.memory.columns.coverage(view.timeline)
+    recordings = [path for topic in topics for path in view.timeline.recordings(topic)]
     if coverage is None or any(map(sessions.holds_carried, recordings)):
         return
     found: dict[Session, list[StampedTransform]] = {}
@@ -279,7 +295,7 @@ def _find_all_statics(view: View, topics: Sequence[str]) -> None:
 
 def make_statics(view: View, window: TimeWindow) -> None:
     """Makes the static transforms of the parts in a window."""
-    for topic in _recorded(view, view.memory.limits.tf_static_topics):
+    for topic in _recorded(view, view.limits.tf_static_topics):
         deque(_statics_back(view, topic, window), maxlen=0)
 
 
@@ -301,9 +317,7 @@ def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransfo
     sessions = sessions_of(view)
     for rows in scan(view, topic, _span_of(view, topic, among), copies=True):
         if sessions.holds_carried(rows.recording):
-            for found in messages_of(view, rows):
-                if sessions.has(among, found):
-                    yield from decoded_transforms(view, found)
+            yield from decoded_transforms(view, _messages_in(view, rows, among))
         elif sessions.folder(rows.recording) in among:
             yield from _changes_in(view, rows).transforms
 
@@ -317,26 +331,18 @@ def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
 
 def _changes_in(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
-    scanner, part = view.memory.columns, rows.part
-    recording = relative(str(rows.recording), str(view.memory.index.bag_dir))
-    if part is None:
-        return Statics(recording, tuple(_decoded(view, rows)))
-    known, key = scanner.fragments(STATICS), FragmentKey(rows.first, "", (part,))
-    made = known.get(key)
-    if made is None:
-        noted = view.notes.added
+
+    def make() -> Statics:
         times = static_times(rows.table, rows.times, rows.index)
-        new = None if times is None else np.flatnonzero(np.isin(rows.times, times))
-        received = _decoded(view, rows if new is None else rows.some(new))
-        made = Statics(recording, tuple(_changes(sorted(received, key=lambda one: one.log_time))))
-        if view.notes.added == noted:
-            known.put(key, made)
-    return made
+        some = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
+        received = sorted(
+            decoded_transforms(view, messages_of(view, some)), key=lambda one: one.log_time
+        )
+        return Statics(relative(str(rows.recording), str(view.bag_dir)), tuple(_changes(received)))
 
-
-def _decoded(view: View, rows: Rows) -> Iterator[StampedTransform]:
-    for found in messages_of(view, rows):
-        yield from decoded_transforms(view, found)
+    part = rows.part
+    key = None if part is None else FragmentKey(rows.first, "", (part,))
+    return remembered(view, STATICS, key, make)
 
 
 def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
@@ -355,7 +361,7 @@ def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
 def sessions_of(view: View) -> Sessions:
     """Returns the sessions of a view, made once."""
     if view.sessions is None:
-        limits = view.memory.limits
+        limits = view.limits
         topics = (*limits.tf_topics, *limits.tf_static_topics)
         view.sessions = Sessions(
             view, lambda among: {child for _, child in _pairs(view, topics, among=among)}
@@ -373,7 +379,7 @@ def newest_in_session(
     newest = view.stream.newest(topic, window)
     sessions = sessions_of(view)
     own = sessions.of(recording)
-    if not any(sessions.folder(each) in own for each in view.snapshot.timeline.recordings(topic)):
+    if not any(sessions.folder(each) in own for each in view.timeline.recordings(topic)):
         return newest
     bags = _bags_of(view, (topic,), window, own)
     if newest is not None and newest.bag in {each.bag for each in bags}:
@@ -387,7 +393,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     A pair that was published in both directions appears once, as moving. A pair with an unnamed
     frame is invalid in tf2, and is left out with a note.
     """
-    limits, sessions = view.memory.limits, sessions_of(view)
+    limits, sessions = view.limits, sessions_of(view)
     if sessions.edges is not None:
         return sessions.edges
     pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
@@ -419,9 +425,7 @@ def _pairs_in(
         window = window.intersect(_span_of(view, topic, among))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
         if among is not None and sessions_of(view).holds_carried(rows.recording):
-            sessions = sessions_of(view)
-            found = (each for each in messages_of(view, rows) if sessions.has(among, each))
-            yield _pairs_of(view, found)
+            yield _pairs_of(view, _messages_in(view, rows, among))
         elif among is None or sessions_of(view).folder(rows.recording) in among:
             part = rows.part
             known = None if part is None else scanner.pairs.get(part)
@@ -432,23 +436,15 @@ def _pairs_in(
 
 
 def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
-    """Returns the pairs in some rows: by their columns, by those of their bags, by their messages.
-
-    A topic beyond its share has none in the store.
-    """
-    pairs = pairs_in(rows.table, rows.index)
-    if pairs is not None:
-        return pairs
-    every = [pairs_in(decoded.table, decoded.index) for decoded in decoded_rows(view, rows)]
-    known = [each for each in every if each is not None]
-    if every and len(known) == len(every):
-        return frozenset[Pair]().union(*known)
-    return _pairs_of(view, messages_of(view, rows))
+    """Returns the pairs in some rows: by columns, else by their messages."""
+    known = of_columns(view, rows, lambda each: pairs_in(each.table, each.index))
+    if known is None:
+        return _pairs_of(view, messages_of(view, rows))
+    return frozenset[Pair]().union(*known)
 
 
 def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
-    read = (one for each in messages for one in decoded_transforms(view, each))
-    return frozenset((one.parent, one.child) for one in read)
+    return frozenset((one.parent, one.child) for one in decoded_transforms(view, messages))
 
 
 def _explained(
@@ -464,7 +460,7 @@ def _explained(
 
     A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
     """
-    topics = _recorded(view, view.memory.limits.tf_topics)
+    topics = _recorded(view, view.limits.tf_topics)
     near = TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
@@ -512,7 +508,7 @@ def connects(
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
     """
-    limits, known = view.memory.limits, sessions_of(view).linked
+    limits, known = view.limits, sessions_of(view).linked
     if (frames, among) in known:
         return True
     pairs: set[Pair] = set()
@@ -570,56 +566,18 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
         zones = parts.zone(_STAMPS)
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
-    for topic in _recorded(view, view.memory.limits.tf_topics):
+    for topic in _recorded(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
-            is_mixed = sessions.holds_carried(rows.recording)
-            if not is_mixed and sessions.folder(rows.recording) not in among:
-                continue
-            near = stamped_between(rows.table, rows.index, earliest, latest)
-            for found in messages_of(view, rows if near is None else rows.some(near)):
-                if not is_mixed or sessions.has(among, found):
-                    yield from decoded_transforms(view, found)
+            if sessions.may_hold(among, rows.recording):
+                near = stamped_between(rows.table, rows.index, earliest, latest)
+                some = rows if near is None else rows.some(near)
+                yield from decoded_transforms(view, _messages_in(view, some, among))
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
-    known = set(view.snapshot.timeline.topics())
+    known = set(view.timeline.topics())
     return tuple(topic for topic in topics if topic in known)
-
-
-def _transforms(
-    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
-) -> Iterator[StampedTransform]:
-    """Yields the transforms in a window, in order; with duplicates, where it is of one session."""
-    for each in _messages(view, topics, window, among):
-        yield from decoded_transforms(view, each)
-
-
-def _messages(
-    view: View, topics: Iterable[str], window: TimeWindow, among: Session | None
-) -> Iterator[StoredMessage]:
-    recorded = _recorded(view, topics)
-    if not recorded:
-        return iter(())
-    if among is None:
-        return view.stream.messages(recorded, window)
-    # A message that was relatched belongs to the recording that received it, too.
-    return _merged(view, recorded, _bags_of(view, recorded, window, among), window, among)
-
-
-def _merged(
-    view: View,
-    topics: Sequence[str],
-    bags: Sequence[BagSpan],
-    window: TimeWindow,
-    among: Session,
-) -> Iterator[StoredMessage]:
-    """Yields the messages of topics in some bags that are of a session."""
-    sessions = sessions_of(view)
-    merged = view.stream.merged(bags, topics, window, newest_first=False)
-    several = any(sessions.is_carried(span.bag) for span in bags)
-    tracked = view.bags.track_sources(merged)
-    return (each for each in tracked if not several or sessions.has(among, each))
 
 
 def _bags_of(
@@ -634,14 +592,64 @@ def _bags_of(
     return [each for each in bags if each.bag.recording in chosen]
 
 
-def decoded_transforms(view: View, found: StoredMessage) -> tuple[StampedTransform, ...]:
-    """Returns the transforms of a message; none, with a note, where it cannot be decoded."""
-    is_static = found.record.channel.topic in view.memory.limits.tf_static_topics
-    with view.call.stages.timed("extract"):
-        try:
-            message = view.memory.reader.decode(found.record)
-            return view.memory.extractor.transforms(message, found.time, static=is_static)
-        except UndecodableError as error:
-            view.notes.complete = False
-            view.notes.add(Note(_UNDECODED, error.topic, error.reason))
-            return ()
+def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:
+    """Yields the transforms of messages; a note names the topics that cannot be decoded."""
+    for found in messages:
+        is_static = found.topic in view.limits.tf_static_topics
+        with view.call.stages.timed("extract"):
+            try:
+                message = view.memory.reader.decode(found.record)
+                some = view.extractor.transforms(message, found.time, static=is_static)
+            except UndecodableError as error:
+                view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
+                continue
+        yield from some
+
+
+def _messages_in(view: View, rows: Rows, among: Session) -> Iterator[StoredMessage]:
+    """Returns the messages of some rows that are of a session."""
+    has = sessions_of(view).has
+    return (found for found in messages_of(view, rows) if has(among, found))
+
+
+def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
+    """Returns the transforms of a session in some rows, by their columns, else by their messages.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    sessions = sessions_of(view)
+    if not sessions.may_hold(among, rows.recording):
+        return {}
+    if sessions.holds_carried(rows.recording):
+        return edges_of(decoded_transforms(view, _messages_in(view, rows, among)))
+    known = of_columns(view, rows, lambda each: edges_in(each.table, each.times, each.index))
+    if known is not None and len(known) == 1:
+        return known[0]
+    if known is not None:
+        # As those of bags come in the order of their log times.
+        return {
+            pair: rows_of(edge, np.argsort(edge.log_times, kind="stable"))
+            for pair, edge in joined_edges(known).items()
+        }
+    return edges_of(decoded_transforms(view, messages_of(view, rows)))
+
+
+def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
+    """Returns the frames of a session in a window, looked up in a target frame.
+
+    They are the same however the history is cut: moving transforms are read from so far around the
+    window that others change nothing in it, and static ones hold from when they were received.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    limits = view.limits
+    around = window.widened(TF_CACHE_NS)
+    moving = [
+        edges_of_rows(view, rows, among)
+        for topic in limits.tf_topics
+        for rows in scan(view, topic, around, copies=True)
+    ]
+    static = static_in(static_transforms(view, among), window)
+    return Frames(static, joined_edges(moving), target, limits.tf_clock)

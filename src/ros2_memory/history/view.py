@@ -7,10 +7,8 @@ Unix seconds or of a duration. "Ago" counts from the wall clock or, for replayed
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -29,20 +27,18 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
 )
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
-from ros2_memory.history.scan import copies, scan
-from ros2_memory.messages.to_json import evenly
+from ros2_memory.history.scan import open_scan, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
-    from ros2_memory.history.bag_groups import Group
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions
     from ros2_memory.storage.base import IntArray
 
@@ -67,8 +63,12 @@ class View:
     far, it is scanned again.
 
     Attributes:
+        limits: the settings of the memory.
+        extractor: reads its decoded messages.
+        bag_dir: where its bags are.
         bags: each bag by itself.
         stream: all bags as one stream.
+        timeline: the bags in the order of time.
         memo: what was found out in this call.
         sessions: which recordings belong together, once that is asked (see `transforms`).
     """
@@ -79,6 +79,9 @@ class View:
         self.bags = BagAccess(memory, call, reach)
         self.stream = MergedStream(self.bags)
         self.snapshot = self.bags.snapshot
+        self.timeline = self.snapshot.timeline
+        self.limits, self.extractor = memory.limits, memory.extractor
+        self.bag_dir = memory.index.bag_dir
         self.notes = self.bags.notes
         self.memo = Memo()
         self.sessions: Sessions | None = None
@@ -89,16 +92,28 @@ class View:
 
         See `only_pose_topic`; it need not be recorded.
         """
-        return only_pose_topic(self) or self.memory.limits.pose_topic
+        return only_pose_topic(self) or self.limits.pose_topic
 
     @cached_property
     def has_poses(self) -> bool:
         """Whether a topic has the robot's poses; else transforms may place it."""
         return has_poses(self)
 
+    def value(self, found: StoredMessage) -> JsonValue:
+        """Returns all that a message has; None where it cannot be decoded."""
+        message = self.bags.decode(found)
+        return None if message is None else self.extractor.exact(message, found.type)
+
+    def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
+        """Returns the first and the last log time of a topic in each bag of a window, or near."""
+        none = np.empty(0, np.int64)
+        every = [each.bounds(topic) for each in self.timeline.segments_in(window)]
+        firsts, lasts = zip((none, none), *every, strict=True)
+        return np.concatenate(firsts), np.concatenate(lasts)
+
     def note_thinned(self, window: TimeWindow) -> None:
         """Records that what was read lies in a window, where that is partly in thinned days."""
-        for day in self.snapshot.timeline.thinned:
+        for day in self.timeline.thinned:
             if window.overlaps(day.start, day.end):
                 self.call.note_thinned(max(window.start, day.start), min(window.stop - 1, day.end))
 
@@ -108,86 +123,13 @@ class View:
         touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
         return without_steps(self, touched) if touched else touched
 
-    def pick(
-        self, topic: str, window: TimeWindow, at_most: int
-    ) -> tuple[int, Iterator[StoredMessage]]:
-        """Returns how many messages the window holds, and `at_most` of them, evenly spaced.
-
-        The first and the last are always among them. Reads payloads of the chosen ones only,
-        except where recordings overlap or latched messages may have been received again; each when
-        it is its turn.
-        """
-        groups = groups_of(self.stream, topic, window)
-        merged = {group: self._times_in(topic, group) for group in groups if group.has_duplicates}
-        sizes = [
-            merged[group].size if group in merged else self.count_in(topic, group)
-            for group in groups
-        ]
-        indices = evenly(sum(sizes), at_most)
-
-        def chosen() -> Iterator[StoredMessage]:
-            begin = 0
-            for group, size in zip(groups, sizes, strict=True):
-                inside = indices[bisect_left(indices, begin) : bisect_left(indices, begin + size)]
-                wanted = [index - begin for index in inside]
-                if group in merged:
-                    yield from self._fetch(topic, merged[group], wanted)
-                else:
-                    yield from group.fetch(wanted)
-                begin += size
-
-        return sum(sizes), chosen()
-
-    def _fetch(
-        self, topic: str, times: IntArray, indices: Sequence[int]
-    ) -> Iterator[StoredMessage]:
-        """Yields the messages at some indices (ascending) of all that have these times."""
-        for time, positions in groupby(indices, key=lambda index: int(times[index])):
-            numbers = {index - int(np.searchsorted(times, time)) for index in positions}
-            at_once = self.stream.messages([topic], TimeWindow(time, time + 1))
-            yield from (found for nth, found in enumerate(at_once) if nth in numbers)
-
-    def _times_in(self, topic: str, group: Group) -> IntArray:
-        """Returns the log times of the messages of a group, in order, each message once."""
-        files = {span.bag.file for span in group.bags}
-        part = group.window.intersect(TimeWindow(group.first, group.last + 1))
-        parts = [np.empty(0, np.int64)]
-        for rows in scan(self, topic, part, columns=False):
-            # Splits that follow each other in another group may share a time with this one.
-            parts += [rows.times[some] for bag, some in rows.bag_rows() if bag.file in files]
-        return np.sort(np.concatenate(parts))
-
-    def count_in(self, topic: str, group: Group) -> int:
-        """Returns how many messages of the window a group of the topic's bags holds."""
-        if group.has_duplicates:
-            return self._times_in(topic, group).size
-        if len(group.bags) == 1 or group.may_be_relatched or not group.is_whole:
-            return group.count()
-        return _stated(topic, group.bags)
-
-    def apart(self, topic: str, group: Group) -> Sequence[Group]:
-        """Returns a group for each bag of one whose bags follow each other and hold no copy.
-
-        So recordings that begin when another ends are not read together; else the group itself.
-        """
-        bags = group.bags
-        if (
-            len(bags) == 1
-            or group.may_be_relatched
-            or not group.is_whole
-            or any(before.last >= after.first for before, after in pairwise(bags))
-            or self.count_in(topic, group) < _stated(topic, bags)
-        ):
-            return [group]
-        return [group.of(each) for each in bags]
-
     def census(self, topic: str) -> dict[str, Census]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
 
         From the summaries of bags; messages are read only where recordings overlap. What is counted
         without a doubt stays in memory until a bag comes or goes.
         """
-        counted = self.snapshot.timeline.memo.of(_CENSUSES, dict)
+        counted = self.timeline.memo.of(_CENSUSES, dict)
         if topic in counted:
             return counted[topic]
         before = self.notes.added
@@ -199,10 +141,9 @@ class View:
 
     def _census(self, topic: str) -> dict[str, Census]:
         counted = {
-            type_name: Census(*stated)
-            for type_name, stated in self.snapshot.timeline.totals(topic).items()
+            type_name: Census(*stated) for type_name, stated in self.timeline.totals(topic).items()
         }
-        for rows in copies(self, topic):
+        for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
             type_name = rows.table.channel.type
             known = counted[type_name]
             last = known.last if rows.span[1] < known.last else self._last_of(topic, type_name)
@@ -218,11 +159,6 @@ class View:
             if rows.table.channel.type == type_name:
                 newest = max(newest, rows.span[1])
         return newest
-
-
-def _stated(topic: str, bags: Sequence[BagSpan]) -> int:
-    """Returns how many messages of a topic bags hold, duplicates too."""
-    return sum(known.count for each in bags for known in each.bag.summary.of(topic))
 
 
 @dataclass(frozen=True, slots=True)

@@ -159,11 +159,6 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
-    def is_closed(self) -> bool:
-        """Whether every bag is whole, and written to no more."""
-        return all(bag.state is BagState.CLOSED for bag in self.bags)
-
-    @cached_property
     def _folder_rows(self) -> tuple[list[str], NDArray[np.uint16]]:
         """The folders of the bags, and the number of each bag's among them."""
         known: dict[str, int] = {}

@@ -1,14 +1,27 @@
-"""A question about several moments at once: each is answered as if it were asked alone."""
+"""One question about several moments, or the same local hours of each day.
+
+Each is answered as if it were asked alone.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import datetime, time, timedelta
 from functools import wraps
-from typing import TYPE_CHECKING, Concatenate, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
-from ros2_memory.core.errors import NoDataError
-from ros2_memory.history.view import AtTime, ns_argument
-from ros2_memory.results import AtEach, MomentAnswer, NothingAt
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NoDataError,
+    NoDataReason,
+    QueryTimeoutError,
+)
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted
+from ros2_memory.core.timebase import ns_from_unix, unix_from_ns
+from ros2_memory.history.coverage import recorded_reach
+from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
+from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,10 +30,15 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.results import OneAnswer
     from ros2_memory.retention.foreign import Foreign
 
 P = ParamSpec("P")
 A = TypeVar("A", bound=MomentAnswer)
+
+
+MOST_WINDOWS: Final = 31
+"""Days whose hours one call asks about."""
 
 
 def at_each(
@@ -81,3 +99,75 @@ class OneSnapshot:
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """As above."""
         return self._index.foreign(snapshot)
+
+
+def in_each(
+    memory: Memory,
+    call: Call,
+    span: TimeRange,
+    between: tuple[time, time],
+    ask: Callable[[Memory, TimeRange], OneAnswer],
+) -> InEach:
+    """Returns the answers for some local hours of each day of a window, in order.
+
+    The second time may be on the next day. The window ends where the recording does. All answers
+    are of one snapshot of the index.
+
+    Raises:
+        InvalidArgumentsError: the window has too many days, or is around a moment.
+        NoDataError: nothing is recorded in these hours.
+        QueryTimeoutError: the call's time runs out before any answer.
+    """
+    if span.around_s is not None:
+        raise InvalidArgumentsError("between cannot be combined with around: one moment is asked")
+    wall = memory.clock.now()
+    snapshot = memory.index.snapshot(min(search_window(span, wall).stop, wall))
+    whole = search_window(span, memory.now(wall, snapshot.latest, call))
+    first, last = recorded_reach(snapshot, whole) or (0, -1)
+    windows = hours_of_days(whole.intersect(TimeWindow(first, last + 1)), *between)
+    fixed = replace(memory, index=OneSnapshot(memory.index, snapshot))
+    found: list[InWindow] = []
+    notes: tuple[str, ...] = ()
+    for window in windows:
+        answer: OneAnswer
+        try:
+            answer = ask(fixed, TimeRange.over(window))
+        except NoDataError as error:
+            answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
+        except QueryTimeoutError:
+            if not found:
+                raise
+            left = counted(len(windows) - len(found), "day is", "days are")
+            notes = (f"out of time: the last {left} left out; ask about a shorter window",)
+            break
+        found.append(InWindow(window.start, window.stop, answer))
+    if all(isinstance(each.answer, NothingAt) for each in found):
+        detail = "nothing is recorded between these hours in this window"
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)
+    return InEach(tuple(found), notes=notes)
+
+
+def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWindow]:
+    """Returns what lies between two local times of day in a window, in order.
+
+    Raises:
+        InvalidArgumentsError: it has too many days.
+    """
+    if window.empty:
+        return []
+    first, last = (
+        datetime.fromtimestamp(unix_from_ns(at)).astimezone().date()
+        for at in (window.start, window.stop - 1)
+    )
+    if (last - first).days >= MOST_WINDOWS:
+        raise InvalidArgumentsError(
+            f"between takes at most {MOST_WINDOWS} days: ask about a shorter window, or by hour"
+        )
+    over = timedelta(days=ends <= begins)
+    # The hours of the day before may go on after midnight.
+    days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
+    spans = [
+        TimeWindow(*(ns_from_unix(datetime.combine(*at).timestamp()) for at in ends_of_day))
+        for ends_of_day in (((day, begins), (day + over, ends)) for day in days)
+    ]
+    return [part for span in spans if not (part := window.intersect(span)).empty]

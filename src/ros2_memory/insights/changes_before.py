@@ -142,7 +142,7 @@ def is_routine(change: PastChange) -> bool:
 
 def topics_with_changes(view: View) -> list[str]:
     """Returns the topics whose events show changes: those with events, and the commands."""
-    timeline, commands = view.snapshot.timeline, _commands(view)
+    timeline, commands = view.timeline, _commands(view)
     return [
         topic
         for topic in timeline.topics()
@@ -160,7 +160,7 @@ def changes_in(
         window: of the changes.
         known: the events in the window of topics that were asked before.
     """
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     joined: dict[str, TopicEvents] = {}
     looked_at: list[str] = []
     commands = _commands(view)
@@ -190,7 +190,7 @@ def changes_in(
 
 def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
     """Returns whether a topic was recorded around a window."""
-    return any(view.snapshot.timeline.extents(topic, window.widened(_AROUND_NS)))
+    return any(view.timeline.extents(topic, window.widened(_AROUND_NS)))
 
 
 def _commands(view: View) -> set[str]:
@@ -198,7 +198,7 @@ def _commands(view: View) -> set[str]:
 
     Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
     """
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     found = [
         topic
         for topic in timeline.topics()
@@ -351,7 +351,7 @@ def before(
     found = changes.before(at, length, slack=SLACK_NS)
     later = changes_in(view, TimeWindow(window.stop, min(at + _AFTER_NS + 1, MAX_NS)), {})
     robot, speed_mps = _robot(view, at, frame_id)
-    if not view.snapshot.timeline.overlapping(window):
+    if not view.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
     elif not changes.looked_at:
         view.notes.add("no topic that would show a change is recorded at this time")
@@ -367,7 +367,7 @@ def before(
         found[:_MOST_CHANGES],
         len(found[_MOST_CHANGES:]),
         changes.looked_at,
-        sum(_is_recorded(view, each, window) for each in view.snapshot.timeline.topics()),
+        sum(_is_recorded(view, each, window) for each in view.timeline.topics()),
         robot,
         speed_mps,
         (*changes.state, *_charges(view, at)),
@@ -389,7 +389,7 @@ def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float
         return None, None
     if found is None:
         return None, None
-    twist = view.memory.extractor.twist(view.bags.decode(found), found.record.channel.type)
+    twist = view.extractor.twist(view.bags.decode(found), found.type)
     speed_mps = None if twist is None else math.hypot(*twist.linear)
     if pose is None:
         return None, speed_mps
@@ -400,13 +400,11 @@ def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float
 
 def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
     """Yields how full each battery was at a time."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     for topic in timeline.topics():
         if BATTERY not in timeline.types_of(topic):
             continue
         found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
-        message = None if found is None else view.bags.decode(found)
-        if message is not None:
-            part = charge_of(view.memory.extractor.exact(message, BATTERY))
-            if part is not None:
-                yield topic, f"{part:.0%}"
+        part = None if found is None else charge_of(view.value(found))
+        if part is not None:
+            yield topic, f"{part:.0%}"

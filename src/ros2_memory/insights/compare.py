@@ -6,22 +6,23 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import has_errors
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, UndecodableError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
-from ros2_memory.history.driven_path import length_notes, pose_frame, resolve_path_topic
+from ros2_memory.history.driven_path import length_notes, resolve_path_topic
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import known_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
     from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.pose_frames import MapPlacement
     from ros2_memory.places.two_paths import FarPoint
     from ros2_memory.places.where import Where
 
@@ -73,7 +74,11 @@ def compare(
         QueryTimeoutError: the call's time is over.
     """
     region = None if where is None else parse_where(memory.limits, where)
-    asked, other = TimeWindow.from_unix(start_s, end_s), _other(with_start_s, with_end_s)
+    asked = TimeWindow.from_unix(start_s, end_s)
+    try:
+        other = TimeWindow.from_unix(with_start_s, with_end_s)
+    except InvalidArgumentsError as error:
+        raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
     for window in (asked, other):
@@ -83,19 +88,24 @@ def compare(
     frame, things = _things(view, windows, region)
     drives = [drive_in(view, each) for each in windows]
     ways = [_way(view, drive, each) for drive, each in zip(drives, windows, strict=True)]
-    placement = _placement(view)
+    placement = known_placement(view)
     elapsed = [each.elapsed for each in drives]
     places = _places(view, placement, windows, region, elapsed)
     apart = _paths_apart(view, placement, drives, windows, region)
     errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
+    lengths = (
+        unix_from_ns(passed.between(*each.asked()))
+        for each, passed in zip(windows, elapsed, strict=True)
+    )
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
-    _note_lengths(view, recorded)
+    if differ(recorded[0], recorded[1], 10.0):
+        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),
-        lengths=Pair(*(_length(*each) for each in zip(windows, elapsed, strict=True))),
+        lengths=Pair(*lengths),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
@@ -110,18 +120,11 @@ def compare(
     )
 
 
-def _other(start_s: float, end_s: float) -> TimeWindow:
-    try:
-        return TimeWindow.from_unix(start_s, end_s)
-    except InvalidArgumentsError as error:
-        raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
-
-
 def _things(
     view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
 ) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
-    limits = view.memory.limits
+    limits = view.limits
     known = known_things(view, limits.min_score, limits.labels)
     note_other_frames(view, known, where)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
@@ -138,8 +141,7 @@ def _things(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    for note in vague_notes(known, windows):
-        view.notes.add(note)
+    view.notes.add(*vague_notes(known, windows))
     places = places_asked(limits, where, known.frames)
     return frame, ThingsBetween(known, first, second, where, places).compared()
 
@@ -149,8 +151,7 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
     known = drive.known
     if known is None:
         return dict.fromkeys(_LEAST)
-    for note in length_notes(known):
-        view.notes.add(note)
+    view.notes.add(*length_notes(known))
     start, end = window.asked()
     stood = drive.stood(end - start)
     return {
@@ -159,14 +160,6 @@ def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None
         "stood_s": None if stood is None else unix_from_ns(stood),
         "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
-
-
-def _placement(view: View) -> MapPlacement | None:
-    try:
-        topic = resolve_path_topic(view)
-        return map_placement(view, pose_frame(view, topic), topic)
-    except (InvalidArgumentsError, NoDataError, UndecodableError):
-        return None
 
 
 class _WaysApart(NamedTuple):
@@ -197,7 +190,7 @@ def _paths_apart(
         )
         return _WaysApart()
     region = None if where is None else where.region
-    places = places_asked(view.memory.limits, where, (frame,))
+    places = places_asked(view.limits, where, (frame,))
     tracks = [track_in(view, frame, each) for each in windows]
     stands = [
         [
@@ -232,7 +225,7 @@ def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
     topic, sessions = resolve_path_topic(view), sessions_of(view)
     found = {
         sessions.of(recording)
-        for recording, span in view.snapshot.timeline.recordings(topic).items()
+        for recording, span in view.timeline.recordings(topic).items()
         if any(each.overlaps(*span) for each in windows)
     }
     return len(found) < 2
@@ -246,7 +239,7 @@ def _places(
     elapsed: Sequence[Elapsed],
 ) -> list[dict[str, float | None]]:
     """Returns the minutes in each named place, or in a region, of each window."""
-    places = view.memory.limits.places
+    places = view.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
     found: list[dict[str, float | None]] = []
@@ -268,26 +261,21 @@ def _places(
     return found
 
 
-def _errors(view: View, window: TimeWindow) -> dict[str, float | None]:
+def _errors(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported."""
-    counts: dict[str, float | None] = {}
+    counts: dict[str, float] = defaultdict(float)
     for found in found_events(view, window, has_errors).values():
         for error in () if found is None else found.errors:
-            text = Quoted(error.text)
-            counts[text] = (counts.get(text) or 0.0) + error.reports
+            counts[Quoted(error.text)] += error.reports
     return counts
 
 
-def _silent(view: View, window: TimeWindow) -> dict[str, float | None]:
+def _silent(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns for how many seconds each topic was silent while the robot was on."""
-    silent: dict[str, float | None] = {}
+    silent: dict[str, float] = defaultdict(float)
     for each in silences_in(view, window):
-        silent[each.topic] = (silent.get(each.topic) or 0.0) + unix_from_ns(each.end - each.start)
+        silent[each.topic] += unix_from_ns(each.end - each.start)
     return silent
-
-
-def _length(window: TimeWindow, elapsed: Elapsed) -> float:
-    return unix_from_ns(elapsed.between(*window.asked()))
 
 
 def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
@@ -305,11 +293,6 @@ def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
         if begin < last and first < stop
     )
     return unix_from_ns(max(0, elapsed.between(first, last) - gaps))
-
-
-def _note_lengths(view: View, recorded: list[float]) -> None:
-    if differ(recorded[0], recorded[1], 10.0):
-        view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
 
 
 def _differing(

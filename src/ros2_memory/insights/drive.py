@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import Elapsed
@@ -48,10 +48,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
     from ros2_memory.analysis.motion.standstills import Stands, Standstill
-    from ros2_memory.analysis.motion.trajectory import Trajectory
+    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.driven_path import DrivenPath
-    from ros2_memory.history.poses import PoseSlice
+    from ros2_memory.history.driven_path import PoseSlice
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
@@ -66,7 +65,8 @@ class Drive:
     between moments of the window, `unrecorded` for how much of it no poses were recorded.
     """
 
-    path: DrivenPath | None = None
+    path: PathSlice | None = None
+    trajectory: Trajectory | None = None
     standstills: tuple[tuple[Standstill, bool], ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     elapsed: Elapsed = field(default_factory=Elapsed)
@@ -75,7 +75,7 @@ class Drive:
     @property
     def known(self) -> Trajectory | None:
         """The path's trajectory, if it has a valid pose."""
-        known = None if self.path is None else self.path.trajectory
+        known = self.trajectory
         return known if known is not None and known.is_known else None
 
     def stops(self, length: Ns) -> tuple[tuple[Standstill, bool], ...]:
@@ -93,7 +93,7 @@ class Drive:
         It is not known where no pose has a valid position, nor where the robot neither moved nor
         stood for most of the time: noise hides where it stood.
         """
-        stood = sum(self.elapsed.between(each.start, each.end) for each, _ in self.standstills)
+        stood = self.elapsed.among((each.start, each.end) for each, _ in self.standstills)
         known = self.known
         if known is None:
             return stood or None
@@ -114,18 +114,18 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
     try:
         topic = resolve_path_topic(view)
         require_one_robot(view, topic, window)
-        path = driven_path(view, topic, window, 0)
-        since = window.start if path is None or path.since is None else path.since
-        standstills, drops = _standstills_in(view, topic, TimeWindow(since, window.stop))
+        path, since = driven_path(view, topic, window)
+        begin = window.start if since is None else since
+        standstills, drops = _standstills_in(view, topic, TimeWindow(begin, window.stop))
     except (InvalidArgumentsError, NoDataError) as error:
         view.notes.add(f"the path is unknown: {error}")
         return Drive(elapsed=elapsed)
     if path is None:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
-    else:
-        path = replace(path, trajectory=across_steps(path, elapsed))
-    unrecorded = 0 if path is None else unrecorded_length(view, topic, path, elapsed)
-    return Drive(path, standstills, drops, elapsed, unrecorded)
+        return Drive(None, None, standstills, drops, elapsed)
+    trajectory = across_steps(path.trajectory(0), path, elapsed)
+    unrecorded = unrecorded_length(view, topic, path, elapsed)
+    return Drive(path, trajectory, standstills, drops, elapsed, unrecorded)
 
 
 def _standstills_in(
@@ -149,7 +149,10 @@ def _standstills_in(
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(
-        (_cut(each, start, end), each.end > end or each.end == last)
+        (
+            each._replace(start=max(each.start, start), end=min(each.end, end)),
+            each.end > end or each.end == last,
+        )
         for each in found
         if each.start < end and each.end > start
     )
@@ -161,13 +164,6 @@ def _standstills_in(
         and bisect_left(begins, each.time - SLOT_NS) == bisect_left(begins, each.time + _BRAKING_NS)
     )
     return standstills, drops
-
-
-def _cut(stood: Standstill, start: Ns, end: Ns) -> Standstill:
-    """Returns what of a standstill is in a time, both ends of which are inclusive."""
-    if start <= stood.start and stood.end <= end:
-        return stood
-    return stood._replace(start=max(stood.start, start), end=min(stood.end, end))
 
 
 def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[Stands]:

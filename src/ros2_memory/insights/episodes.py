@@ -30,11 +30,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.held_values import Held
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
 
 _LOOKED_AT: Final = 50
 """Of the newest values of a topic so many are looked at for an empty text."""
@@ -69,17 +68,13 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
         return False
     # With notes of its own: what cannot be read there may lie outside of the window.
     values = HeldValues(View(view.memory, view.call), topics[0])
-    newest = takewhile(_may_be_state, values.back(MAX_NS))
+    newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
     try:
         return any(held.is_blank for held in islice(newest, _LOOKED_AT))
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
         return False  # The time for reading is over: what can be found without them is.
-
-
-def _may_be_state(held: Held) -> bool:
-    return len(held.word) <= _LONGEST_STATE
 
 
 def find_episodes(
@@ -108,8 +103,7 @@ def find_episodes(
         if not kept:
             raise out_of_time(view, values.reached) from error
         since = values.reached
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"the search ran out of time at {unix_text(since)}: to continue, pass that time as end"
         )
     if not kept:
@@ -160,11 +154,9 @@ def episode_times(
 
 def spell_of(held: Held) -> Spell:
     """Returns a value that held as replies show it."""
-    return Spell(_cut(held.value), held.start, held.stop, held.ended)
-
-
-def _cut(value: JsonValue) -> JsonValue:
-    return shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
+    value = held.value
+    shown = shortened(value, _LONGEST_TEXT) if isinstance(value, str) else value
+    return Spell(shown, held.start, held.stop, held.ended)
 
 
 def with_robot(view: View, topic: str, found: Episode, frame_id: str | None) -> Episode:
@@ -199,8 +191,7 @@ class SaidMeanwhile:
                 return tuple(spell_of(each) for each in held if not each.is_blank)
             except QueryTimeoutError as error:
                 self._is_over = True
-                self._view.notes.complete = False
-                self._view.notes.add(
+                self._view.notes.add_lack(
                     f"{error} before what {self._topic} said was read for all of them: ask for "
                     "fewer, or in a shorter window"
                 )
@@ -235,8 +226,7 @@ def topic_changes(
         held = values.known[::-1]
         if not held:
             raise
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"{error}: only what is after {unix_text(values.reached)} is listed; to see the "
             "rest, ask again with that as end"
         )
@@ -256,7 +246,7 @@ def topic_changes(
     note_unread(view, window, gaps=len(found) > max_samples)
     note_edges(view, window)
     note_robots(view, topic, window)
-    types = view.snapshot.timeline.types_of(topic)
+    types = view.timeline.types_of(topic)
     return Changes(
         topic,
         ", ".join(sorted(types)),

@@ -24,10 +24,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
 
 STATUS_TOPIC: Final = "/_action/status"
 GOAL_WORDS: Final = {3: "canceling", 4: "succeeded", 5: "canceled", 6: "aborted"}
@@ -83,7 +82,7 @@ def goals_in(
     `found_of` has what the messages of each topic report in the window.
     """
     for topic, found in found_of.items():
-        if found is None or GOALS not in view.snapshot.timeline.types_of(topic):
+        if found is None or GOALS not in view.timeline.types_of(topic):
             continue
         # Which goals it listed before: what a window's first message lists need not be new.
         before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
@@ -106,12 +105,16 @@ def goals_asked(
         InvalidArgumentsError: no status meets the condition.
         QueryTimeoutError: the call's time is over.
     """
-    types = {name for topic in topics for name in view.snapshot.timeline.types_of(topic)}
+    types = {name for topic in topics for name in view.timeline.types_of(topic)}
     field = None if condition.field is None else condition.field.rsplit(".", 1)[-1]
     if types != {GOALS} or field not in {None, _STATUS}:
         return None
     on_status = replace(condition, field=_STATUS)
-    wanted = {number for number in _STATUS_WORDS if on_status.matches({_STATUS: _facts(number)})}
+    wanted = {
+        number
+        for number, word in _STATUS_WORDS.items()
+        if on_status.matches({_STATUS: [number, word, *([_FAILED] if word in FAILURES else [])]})
+    }
     if not wanted:
         raise InvalidArgumentsError(
             f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
@@ -124,11 +127,6 @@ def goals_asked(
     goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
     goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
     return [each for each in goals if scope.holds_at(each.last)]
-
-
-def _facts(status: int) -> JsonValue:
-    word = _STATUS_WORDS[status]
-    return [status, word, _FAILED] if word in FAILURES else [status, word]
 
 
 def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:

@@ -29,7 +29,7 @@ from ros2_memory.history.coverage import (
     note_unrecorded,
     recording_gaps,
 )
-from ros2_memory.history.driven_path import length_notes, resolve_path_topic, way_in
+from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import open_span
 from ros2_memory.insights.changes_before import (
@@ -45,9 +45,8 @@ from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
-from ros2_memory.places.robot_places import robot_places
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.pose_frames import robot_places
+from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.results import Before, Event, Recap
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange, View
     from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.robot_places import RobotPlaces
+    from ros2_memory.places.pose_frames import RobotPlaces
     from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import PastChange
 
@@ -204,7 +203,7 @@ def recap(
     if there is None or region is None:
         answer = _with_way(view, answer, drive)
     else:
-        answer = _with_way_there(view, answer, drive, window, there)
+        answer = _with_way_there(answer, drive, there)
         answer = replace(answer, where=region.shown)
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
@@ -213,7 +212,7 @@ def recap(
 
 def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
     """Notes the logs whose errors are no events: those that ROS writes alone are read for them."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     for topic in timeline.topics():
         types = timeline.types_of(topic)
         if FOXGLOVE_LOGS.isdisjoint(types):
@@ -243,7 +242,7 @@ class _There:
     @property
     def length(self) -> Ns:
         """How long they were in all."""
-        return sum(self._elapsed.between(each.start, each.stop) for each in self.spans)
+        return self._elapsed.among((each.start, each.stop) for each in self.spans)
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
@@ -272,8 +271,7 @@ class _There:
 
 
 def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
-    for note in () if drive.path is None else length_notes(drive.path.trajectory):
-        view.notes.add(note)
+    view.notes.add(*() if drive.trajectory is None else length_notes(drive.trajectory))
     known = drive.known
     if known is None:
         return answer
@@ -286,14 +284,10 @@ def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
     )
 
 
-def _with_way_there(
-    view: View, answer: Recap, drive: Drive, window: TimeWindow, there: _There
-) -> Recap:
+def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    driven = None
-    if drive.path is not None:
-        way, _ = way_in(view, resolve_path_topic(view), window)
-        driven = totals_inside(way.line, there.spans) if way is not None and way.poses else None
+    way = drive.path
+    driven = None if way is None or not way.poses else totals_inside(way.line, there.spans)
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,
@@ -316,7 +310,7 @@ def found_events(
     view: View, window: TimeWindow, can_have: Callable[[str], bool] = has_events
 ) -> dict[str, TopicEvents | None]:
     """Returns the events of each topic whose type can have them; None where it has no message."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     return {
         topic: events_in(view, topic, window)
         for topic in timeline.topics()

@@ -7,25 +7,284 @@ Where a scope does not hold, a match counts as no match.
 from __future__ import annotations
 
 import heapq
+from collections import defaultdict
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from itertools import product
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.columns.stored import StoredTable, joined_stored
+from ros2_memory.columns.truth import ColumnCondition, Truth
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.history.matched import MET, NOT_MET, Matching, Tested, runs_of
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.matched import Block, Runs
+    from numpy.typing import NDArray
+
+    from ros2_memory.columns.units import Rows
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
-    from ros2_memory.places.scope import Scope
+    from ros2_memory.places.where import Scope
+    from ros2_memory.storage.base import IntArray
+
+
+MET: Final = 1
+NOT_MET: Final = 0
+UNKNOWN: Final = 2
+"""The message cannot be decoded."""
+
+_MOST_TOGETHER: Final = 64
+"""Parts whose columns are tested at once."""
+_TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
+"""Messages that the bag decides and are no farther apart are read at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tested:
+    """Messages of a topic, ordered by log time, and which of them meet a condition.
+
+    Attributes:
+        times: log times (ns).
+        met: `MET`, `NOT_MET` or `UNKNOWN` for each.
+        sources: a number for recording and type of each; by it those of one log time are ordered.
+    """
+
+    times: IntArray
+    met: NDArray[np.uint8]
+    sources: IntArray
+
+
+class Block(NamedTuple):
+    """Messages of a topic between two log times (inclusive).
+
+    Attributes:
+        topic: its name.
+        first: no message is earlier.
+        last: none is later.
+        has_match: whether some message may meet the condition.
+        tested: tests them.
+    """
+
+    topic: str
+    first: Ns
+    last: Ns
+    has_match: bool
+    tested: Callable[[], Tested]
+
+
+class Matching:
+    """Tests the messages of the topics of a search.
+
+    Attributes:
+        ruled_out: whether a message was seen not to match by its columns.
+    """
+
+    def __init__(self, view: View, search: ReverseSearch) -> None:
+        self.ruled_out = False
+        self._view = view
+        self._search = search
+        self._test = ColumnCondition(search.condition, view.extractor)
+        self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
+
+    def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
+        """Yields the messages of a topic in blocks that do not overlap, the newest block first.
+
+        Raises:
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
+        """
+        waiting: Block | None = None
+        try:
+            for block in self._blocks(topic, window):
+                if waiting is None or block.last < waiting.first:
+                    if waiting is not None:
+                        yield waiting
+                    waiting = block
+                    continue
+                newer, waiting = _parted(waiting, block)
+                if newer is not None:
+                    yield newer
+        except QueryTimeoutError:
+            if waiting is not None:
+                yield waiting
+            raise
+        if waiting is not None:
+            yield waiting
+
+    def _blocks(self, topic: str, window: TimeWindow) -> Iterator[Block]:
+        """Yields a block for each table, the newest first; of parts that are alike one for many."""
+        most = 1
+        together: list[Rows] = []
+        scanned = scan(
+            self._view,
+            topic,
+            window,
+            newest_first=True,
+            may_match=self._test.may_match,
+            may_not_match=True,
+            may_be_empty=True,
+        )
+        try:
+            for rows in scanned:
+                if together and not (len(together) < most and _follows(rows, together[-1])):
+                    yield self._block(topic, together[::-1], window)
+                    # Who goes on reads many.
+                    most, together = min(2 * most, _MOST_TOGETHER), []
+                together.append(rows)
+        except QueryTimeoutError:
+            if together:
+                yield self._block(topic, together[::-1], window)
+            raise
+        if together:
+            yield self._block(topic, together[::-1], window)
+
+    def _block(self, topic: str, parts: Sequence[Rows], window: TimeWindow) -> Block:
+        stored = [rows.table for rows in parts if isinstance(rows.table, StoredTable)]
+        table = parts[0].table if len(parts) == 1 else joined_stored(stored)
+        truth = self._test.truth(table) if parts[0].may_match else Truth(len(table))
+        self.ruled_out |= truth.is_none
+        first, last = max(parts[0].first, window.start), min(parts[-1].last, window.stop - 1)
+        tested = partial(self._tested, topic, parts, truth)
+        return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
+
+    def _tested(self, topic: str, parts: Sequence[Rows], truth: Truth) -> Tested:
+        counting = np.concatenate([rows.mask() for rows in parts])
+        met, unsure = truth.met[counting], truth.unsure[counting]
+        self.ruled_out |= not (met | unsure).all()
+        times, found = np.concatenate([rows.times for rows in parts]), met.astype(np.uint8)
+        sources = self._sources(topic, parts)
+        undecided = np.flatnonzero(unsure)
+        if undecided.size:
+            edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
+            for some in np.split(undecided, edges):
+                found[some] = self._read(topic, times[some], sources[some])
+        return Tested(times, found, sources)
+
+    def _read(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
+        """Returns what the messages at some log times, which ascend, are found to be."""
+        window = TimeWindow(int(times[0]), int(times[-1]) + 1)
+        numbers = self._numbers_of(topic)
+        read: dict[tuple[Ns, int], list[int]] = defaultdict(list)
+        # The newest first, as a search reports what it cannot decode.
+        for each in self._view.stream.messages([topic], window, newest_first=True):
+            met = self._search.matches(each)
+            source = numbers[each.bag.recording, each.type]
+            found = read[each.time, source]
+            found.append(UNKNOWN if met is None else int(met))
+        # Those of one log time come in the order of the file.
+        wanted = zip(times.tolist(), sources.tolist(), strict=True)
+        return [read[key].pop() if read[key] else NOT_MET for key in wanted]
+
+    def _sources(self, topic: str, parts: Sequence[Rows]) -> IntArray:
+        """Returns for each of some rows the number of its recording and type."""
+        numbers = self._numbers_of(topic)
+        of = [numbers[rows.recording, rows.table.channel.type] for rows in parts]
+        return np.repeat(of, [*map(len, parts)])
+
+    def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
+        """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
+        if topic not in self._numbers:
+            timeline = self._view.timeline
+            recordings = sorted(timeline.recordings(topic), key=str)
+            sources = product(recordings, sorted(timeline.types_of(topic)))
+            self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}
+        return self._numbers[topic]
+
+
+def _follows(older: Rows, newer: Rows) -> bool:
+    """Returns whether some rows end before others begin, and have the same columns."""
+    one, other = older.table, newer.table
+    return (
+        older.last < newer.first
+        and older.may_match == newer.may_match
+        and isinstance(one, StoredTable)
+        and isinstance(other, StoredTable)
+        and one.channel is other.channel
+        and one.left_out == other.left_out
+    )
+
+
+def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
+    """Returns two blocks that overlap as those messages that are newer than both can share, if any.
+
+    And all others: what comes later in a scan is no newer than the last of `other`.
+    """
+    for empty, rest in ((one, other), (other, one)):
+        if not empty.tested().times.size:
+            return None, rest
+    in_order = sorted((one, other), key=lambda block: (block.first, block.last))
+    joined = stacked([block.tested() for block in in_order])
+    joined = rows_of(joined, np.lexsort((joined.sources, joined.times)))
+    cut = int(np.searchsorted(joined.times, other.last, side="right"))
+    newer, older = rows_of(joined, slice(cut, None)), rows_of(joined, slice(cut))
+    return _of(one.topic, newer) if newer.times.size else None, _of(one.topic, older)
+
+
+def _of(topic: str, tested: Tested) -> Block:
+    first, last = int(tested.times[0]), int(tested.times[-1])
+    return Block(topic, first, last, has_match=bool(tested.met.any()), tested=lambda: tested)
+
+
+class Runs(NamedTuple):
+    """Consecutive matches in a block, in order.
+
+    Attributes:
+        firsts: log time of the first match of each.
+        lasts: of the last.
+        counts: how many matches.
+        ends: of the next message of the block that is none; `MAX_NS` without one.
+        goes_back: whether an earlier match may belong to the first run.
+        goes_on: whether a later match may belong to the last run.
+        is_blank: whether it has neither a match nor a message that surely is none.
+    """
+
+    firsts: IntArray
+    lasts: IntArray
+    counts: IntArray
+    ends: IntArray
+    goes_back: bool
+    goes_on: bool
+    is_blank: bool
+
+
+def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
+    """Returns the runs of matches in some messages, of which there is at least one.
+
+    A run ends with a message that does not match, and where none comes for longer than
+    `silence_ns`. With `apart` each match is a run of its own.
+    """
+    times, met = tested.times, tested.met
+    begins = np.empty(times.size, np.bool_)
+    begins[0], begins[1:] = False, np.diff(times) > silence_ns
+    # Of two matches, this differs where a message that is none, or a silence, lies between them.
+    ends = np.cumsum((met == NOT_MET) | begins)
+    rows = np.flatnonzero(met == MET)
+    blank = not rows.size and int(ends[-1]) == 0
+    if not rows.size:
+        none = np.empty(0, np.int64)
+        return Runs(none, none, none, none, goes_back=False, goes_on=False, is_blank=blank)
+    new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
+    starts = np.flatnonzero(new)
+    stops = np.r_[starts[1:], rows.size]
+    others = np.flatnonzero(met == NOT_MET)
+    after = np.searchsorted(others, rows[stops - 1])
+    return Runs(
+        times[rows[starts]],
+        times[rows[stops - 1]],
+        stops - starts,
+        np.append(times[others], MAX_NS)[after],
+        goes_back=not apart and int(ends[rows[0]]) == 0,
+        goes_on=not apart and ends[rows[-1]] == ends[-1],
+        is_blank=False,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +402,7 @@ def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | 
     matching = Matching(view, search)
     # What lies outside of a scope is not read, and may well be decodable.
     matching.ruled_out = scope.is_bounded
-    is_log = view.snapshot.timeline.is_log
+    is_log = view.timeline.is_log
     topics = {topic: _OfTopic(topic, apart=is_log(topic)) for topic in search.topics}
     reached = searched = scope.window.stop
     try:
@@ -188,7 +447,7 @@ def _counting(block: Block, scope: Scope) -> Block:
         counts = np.array([scope.holds_at(time) for time in times], np.bool_)
         met = found.met.copy()
         met[matches[~counts]] = NOT_MET
-        return found._replace(met=met)
+        return replace(found, met=met)
 
     return block._replace(tested=tested)
 

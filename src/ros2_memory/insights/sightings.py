@@ -18,11 +18,9 @@ from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.geometry import transform_point
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import (
     MIN_NS,
@@ -38,7 +36,7 @@ from ros2_memory.history.reverse_search import (
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.transforms import connects, transform_at
+from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.insights.episodes import (
     SaidMeanwhile,
@@ -51,8 +49,8 @@ from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import robot_at
-from ros2_memory.places.scope import Scope
+from ros2_memory.places.pose_frames import pose_in, robot_at
+from ros2_memory.places.where import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
@@ -61,14 +59,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue, Pose
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.insights.goals import GoalRun
     from ros2_memory.insights.sighting_search import Run
     from ros2_memory.messages.detections import Detection
-    from ros2_memory.places.scope import WhileCondition
+    from ros2_memory.places.where import WhileCondition
 
 _Row = TypeVar("_Row", Sighting, Episode)
 _MOST_TRIED: Final = 5
@@ -148,10 +146,8 @@ def find_matches(
     )
     if rows.is_nothing:
         silences = describe_silences(view, topics, rows.searched)
-        for sentence in (*silences, *unasked_limit(condition, min_score)):
-            view.notes.add(sentence)
-    for sentence in (*compared_frames(view, topics, condition), *scope.compared_frames):
-        view.notes.add(sentence)
+        view.notes.add(*silences, *unasked_limit(condition, min_score))
+    view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = window.asked()
     first, last = recorded_reach(view.snapshot, window) or (start, end)
     # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
@@ -281,7 +277,7 @@ def read_sightings(
     found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if found.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    is_log = view.snapshot.timeline.is_log
+    is_log = view.timeline.is_log
     logs = {topic for topic in topics if is_log(topic)}
     spans = [
         (run.first, run.last if run.topic in logs else _until(view, run, scope))
@@ -302,7 +298,7 @@ def _until(view: View, run: Run, scope: Scope) -> Ns:
     To its last match where a silence, or the end of a scope, is next; so does a log entry.
     """
     last, until = run.last, run.until
-    if view.snapshot.timeline.is_log(run.topic):
+    if view.timeline.is_log(run.topic):
         return last
     if until is None:
         after = TimeWindow(last + 1, last + SILENCE_NS + 1)
@@ -326,8 +322,8 @@ def _sighting(
     What happens is where the robot was when it began; a thing is where it was last seen from.
     """
     message = view.memory.reader.decode(newest.record)
-    value = condition.counted(view.memory.extractor.exact(message, newest.record.channel.type))
-    seen = detections_of(value, view.memory.extractor.frame(message))
+    value = condition.counted(view.extractor.exact(message, newest.type))
+    seen = detections_of(value, view.extractor.frame(message))
     thing, labels = _matching(seen, condition), {each.label for each in seen}
     robot_at_first = thing is None and run.begun
     at = run.first if robot_at_first else newest.time
@@ -385,13 +381,12 @@ def _with_fields(
         record = newest.record
         message = view.memory.reader.decode(record)
         try:
-            shown = view.memory.extractor.shown(message, record.channel.type, fields)
+            shown = view.extractor.shown(message, record.channel.type, fields)
         except InvalidArgumentsError as error:
             refused.append(error)
             extended.append(sighting)
             continue
-        for sentence in shown.notes:
-            view.notes.add(sentence)
+        view.notes.add(*shown.notes)
         extended.append(replace(sighting, matched=(), value=quote(shown.value)))
     if refused and len(refused) == len(extended):
         raise refused[0]
@@ -400,7 +395,7 @@ def _with_fields(
 
 def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
     """Returns the recording of a sighting's message at a time: its last may be of a later one."""
-    topic, own = newest.record.channel.topic, newest.bag.recording
+    topic, own = newest.topic, newest.bag.recording
     bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
     every = {each.bag.recording for each in bags}
     return own if own in every else min(every, default=own)
@@ -421,8 +416,8 @@ def _spot_of(
     The newest message of all may be newer than the last transform: then one of those just before it
     counts. A note says where none of them can be placed.
     """
-    spot = _spot(view, thing, newest, robot, frame_id)
     targets = _targets(view, robot, frame_id)
+    spot = _spot(view, thing, newest, targets)
     if spot is None or spot.frame_id in targets:
         return spot
     try:
@@ -431,18 +426,18 @@ def _spot_of(
             return spot
     except QueryTimeoutError:
         return spot
-    topic = newest.record.channel.topic
+    topic = newest.topic
     window = TimeWindow(first, newest.time)
-    extractor = view.memory.extractor
+    extractor = view.extractor
     before = view.stream.messages([topic], window, newest_first=True)
     for found in islice(before, _MOST_TRIED):
         message = view.bags.decode(found)
         if message is None:
             continue
-        value = condition.counted(extractor.exact(message, found.record.channel.type))
+        value = condition.counted(extractor.exact(message, found.type))
         if condition.matches(value):
             seen = _matching(detections_of(value, extractor.frame(message)), condition)
-            earlier = _spot(view, seen, found, robot, frame_id)
+            earlier = _spot(view, seen, found, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
@@ -456,32 +451,21 @@ def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str,
     """Returns the frames that places are given in, the first that can be had."""
     if frame_id is not None:
         return (frame_id,)
-    frames = (view.memory.limits.map_frame, "" if robot is None else robot.frame_id)
+    frames = (view.limits.map_frame, "" if robot is None else robot.frame_id)
     return tuple(dict.fromkeys(filter(None, frames)))
 
 
 def _spot(
-    view: View,
-    thing: Detection | None,
-    found: StoredMessage,
-    robot: Pose | None,
-    frame_id: str | None,
+    view: View, thing: Detection | None, found: StoredMessage, targets: Sequence[str]
 ) -> LabelledPlace | None:
-    """Returns where the thing of a message was: in a frame of `_targets`, or the message's own."""
+    """Returns where the thing of a message was: in one of some frames, or the message's own."""
     if thing is None or thing.place is None:
         return None
-    for target in _targets(view, robot, frame_id):
-        if target == thing.frame_id:
-            return LabelledPlace(thing.label, thing.place, target)
-        try:
-            recording = found.bag.recording
-            found_transform = transform_at(
-                view, target, thing.frame_id, found.time, recording, explains=False
-            )
-        except NoDataError:
-            continue
-        in_target = transform_point(found_transform.transform, thing.place)
-        return LabelledPlace(thing.label, in_target, target)
+    seen = Pose(thing.place, None, thing.frame_id)
+    for target in targets:
+        there = pose_in(view, seen, target, found.time, found.bag.recording)
+        if there is not None:
+            return LabelledPlace(thing.label, there.position, target)
     return LabelledPlace(thing.label, thing.place, thing.frame_id)
 
 

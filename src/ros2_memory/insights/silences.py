@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.analysis.motion.trajectory import PathSlice
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
-    from ros2_memory.history.driven_path import DrivenPath
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
 
@@ -77,15 +77,13 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[N
     return united([*recording_gaps(view, window), *_silent(view, topic, window)])
 
 
-def unrecorded_length(view: View, topic: str, path: DrivenPath, elapsed: Elapsed) -> Ns:
+def unrecorded_length(view: View, topic: str, path: PathSlice, elapsed: Elapsed) -> Ns:
     """Returns for how long no poses were recorded between the first and the last of a path.
 
     That is between two bags with poses, whatever others hold, and while the topic was silent.
     """
     window = TimeWindow(path.first, path.last + 1)
-    every = [each.bounds(topic) for each in view.snapshot.timeline.segments_in(window)]
-    firsts = np.concatenate([np.empty(0, np.int64), *(first for first, _ in every)])
-    lasts = np.concatenate([np.empty(0, np.int64), *(last for _, last in every)])
+    firsts, lasts = view.bounds(topic, window)
     order = np.argsort(firsts, kind="stable")
     begins, ends = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
     apart = begins - ends > SHORTEST_GAP_NS

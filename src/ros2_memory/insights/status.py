@@ -63,6 +63,9 @@ def memory_status(memory: Memory, call: Call) -> Status:
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
     heard = _heard(snapshot) if live else latest
+    recorder = ANOTHER if any(each.growing for each in snapshot.active) else None
+    if heartbeat is not None:
+        recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
     gaps = view.gaps(TimeWindow.everything())
     stalls = {*gaps} & {(pause.start, pause.end) for pause in snapshot.suspects}
@@ -76,7 +79,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         earliest=snapshot.dating.earliest,
         latest=latest,
         heard=heard,
-        recorder=_recorder(snapshot, heartbeat, live=live),
+        recorder=recorder,
         live=live,
         restarts=0 if heartbeat is None else heartbeat.restarts,
         missing=() if heartbeat is None else heartbeat.missing,
@@ -136,13 +139,6 @@ def _heard(snapshot: Snapshot) -> Ns | None:
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)
-
-
-def _recorder(snapshot: Snapshot, heartbeat: Heartbeat | None, *, live: bool) -> str | None:
-    """Returns the recorder's state; without one, whether another program records here."""
-    if heartbeat is not None:
-        return state_of(heartbeat, live=live)
-    return ANOTHER if any(each.growing for each in snapshot.active) else None
 
 
 def _describe_unheard(heard: Ns | None, latest: Ns | None) -> Iterator[str]:
@@ -268,10 +264,10 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     foreign_files = frozenset[str]() if foreign is None else foreign.files
     foreign_bytes = None if foreign is None else foreign.total_bytes
     used -= 0 if foreign is None else foreign.bag_bytes
+    state = state_bytes_in(memory.index.bag_dir)
+    used += state
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
     if heartbeat is None or not (recording and heartbeat.is_live(wall)):
-        state = state_bytes_in(memory.index.bag_dir)
-        used += state
         return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes, state)
     grown, since = 0, latest
     if latest is not None:
@@ -282,8 +278,6 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
                 continue
             grown += bag.size
             since = min(bag.start, latest if since is None else since)
-    state = state_bytes_in(memory.index.bag_dir)
-    used += state
     if heartbeat.counted_bytes is not None:
         used, state = heartbeat.counted_bytes, heartbeat.state_bytes
     span = 0 if latest is None or since is None else latest - since
@@ -331,20 +325,20 @@ def undecodable_topics(view: View) -> tuple[Undecodable, ...]:
     """Returns the topics with messages that cannot be decoded, with type and reason."""
     return tuple(
         Undecodable(topic, type_name, reason)
-        for topic in view.snapshot.timeline.topics()
+        for topic in view.timeline.topics()
         for type_name, reason in sorted(undecodable_types(view, topic).items())
     )
 
 
 def undecodable_types(view: View, topic: str) -> dict[str, str]:
     """Returns why messages of a topic cannot be decoded, by type; from one bag for each type."""
-    types = view.snapshot.timeline.types_of(topic)
+    types = view.timeline.types_of(topic)
     reasons = {type_name: _why_undecodable(view, topic, type_name) for type_name in types}
     return {type_name: reason for type_name, reason in reasons.items() if reason}
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    timeline, columns = view.snapshot.timeline, view.memory.columns
+    timeline, columns = view.timeline, view.memory.columns
     bag = timeline.first_with(topic, type_name)
     channels = columns.channels(timeline, bag)
     reasons = [

@@ -15,20 +15,17 @@ from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan
+from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan, remembered
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.facts import State, Stated
+    from ros2_memory.analysis.facts import Stated
     from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Mask
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
@@ -61,22 +58,17 @@ def events_back(
     topic: str,
     window: TimeWindow,
     *,
-    may_match: Callable[[Table], bool | Mask] | None = None,
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[TopicEvents]:
     """Yields the events in times that do not overlap, the newest first.
 
-    Tables that cannot match need not show any. `reached` is called before each table, as by `scan`.
+    `reached` is called before each table, as by `scan`.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    columns = StatedColumns(view.memory.extractor)
+    columns = StatedColumns(view.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
-    if may_match is not None:
-        for together in blocks(opened.rows(newest_first=True), newest_first=True):
-            yield from _events(view, columns, together, may_match)
-        return
 
     def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
         rows = opened.rows(newest_first=True, among=stretch.window)
@@ -85,8 +77,7 @@ def events_back(
             is_whole = all(rows.part is not None for rows in together)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                for events in _events(view, columns, together):
-                    yield first, events
+                yield first, _events(view, columns, together)
 
     for _, events in joined_back(view, opened, EVENTS, make):
         yield events
@@ -114,7 +105,7 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     Raises:
         BagError: the bag cannot be read.
     """
-    reader, columns = view.memory.reader, StatedColumns(view.memory.extractor)
+    reader, columns = view.memory.reader, StatedColumns(view.extractor)
     found: dict[str, list[Stated]] = {}
     for tables in decoded(reader, bag.path, topics=topics) if topics else ():
         for nth, table in enumerate(tables):
@@ -126,46 +117,26 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     return {topic: each for topic, each in events.items() if each is not None}
 
 
-def _events(
-    view: View,
-    columns: StatedColumns,
-    together: list[Rows],
-    may_match: Callable[[Table], bool | Mask] | None = None,
-) -> Iterator[TopicEvents]:
-    """Yields the events of tables that overlap in time; those of whole parts are remembered."""
-    first = together[0]
+def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents:
+    """Returns the events of tables that overlap in time; those of whole parts are remembered."""
+
+    def make() -> TopicEvents:
+        stated = joined_stated([_stated(view, columns, rows) for rows in together])
+        return events_of(stated) or TopicEvents(1, 0)
+
     parts = tuple(rows.part for rows in together if rows.part is not None)
-    known = view.memory.columns.fragments(EVENTS)
-    key = FragmentKey(first.first, "", parts) if len(parts) == len(together) else None
-    events = None if key is None else known.get(key)
-    if events is None and len(together) == 1 and key and may_match and not may_match(first.table):
-        events = TopicEvents(*first.span)
-    if events is not None:
-        yield events
-        return
-    noted = view.notes.added
-    stated = [_stated(view, columns, rows, alone=len(together) == 1) for rows in together]
-    events = events_of(joined_stated(stated))
-    if events is None:
-        return
-    if key is not None and view.notes.added == noted:
-        known.put(key, events)
-    yield events
+    key = FragmentKey(together[0].first, "", parts) if len(parts) == len(together) else None
+    return remembered(view, EVENTS, key, make)
 
 
-def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = False) -> Stated:
-    """Returns what the messages of some rows state: by their columns, else by reading them.
-
-    With `alone` no other messages lie between them: of those that state the same two are enough.
-    """
+def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:
+    """Returns what the messages of some rows state: by their columns, else by reading them."""
     found = columns.of(rows.table)
     if found is None:
         return _stated_by(view, messages_of(view, rows))
     stated, to_read = found.stated, found.to_read(rows.index)
     if rows.index is not None:
         stated = stated.at(rows.index)
-    if alone and not to_read.size and (settled := stated.unchanging(*rows.span)) is not None:
-        return settled
     stated = stated._replace(times=rows.times)
     if to_read.size:
         others = np.setdiff1d(np.arange(len(rows)), to_read)
@@ -175,20 +146,13 @@ def _stated(view: View, columns: StatedColumns, rows: Rows, *, alone: bool = Fal
 
 
 def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
-    states = [(found.time, _state(view, found)) for found in messages]
+    states = []
+    for found in messages:
+        value = view.value(found)
+        states.append((found.time, None if value is None else state_of(value, found.type)))
     # Those of a part come bag after bag, in the order in which bags were stored.
     states.sort(key=lambda each: each[0])
     return stated_by([time for time, _ in states], [state for _, state in states])
-
-
-def _state(view: View, found: StoredMessage) -> State | None:
-    """Returns what a message states; None where it cannot be decoded."""
-    channel = found.record.channel
-    try:
-        message = view.memory.reader.decode(found.record)
-    except UndecodableError:
-        return None
-    return state_of(view.memory.extractor.exact(message, channel.type), channel.type)
 
 
 def note_limits(view: View, topic: str, events: TopicEvents) -> None:

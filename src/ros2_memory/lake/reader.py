@@ -7,8 +7,6 @@ import json
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numpy as np
-
 from ros2_memory.columns.pack import is_large
 from ros2_memory.core.errors import BagError, NotInLakeError
 from ros2_memory.lake.packed_messages import unpacked_messages
@@ -25,7 +23,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.index import LakeBag, LakeIndex
     from ros2_memory.storage.base import Batch, Definition, Record
@@ -143,12 +140,6 @@ class LakeReader(BagReader):
             inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
             if inside.any():
                 yield batch if inside.all() else batch.taken(inside)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of the messages."""
-        found = [each.log_times for each in self.batches(path, [topic], window, bare=[topic])]
-        times: Sequence[Ns] = np.sort(np.concatenate(found)).tolist() if found else ()
-        return times
 
     def times_alone(self, path: Path) -> Collection[str]:
         """Returns the topics whose payloads were not shipped: their messages are large."""

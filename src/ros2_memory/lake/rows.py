@@ -34,7 +34,7 @@ from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.packed_messages import packed_messages
 from ros2_memory.lake.tables import ROWS_VERSION, TABLES
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections

@@ -16,19 +16,18 @@ from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     Waypoint,
     drawn,
-    joined_lines,
 )
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
-from ros2_memory.history.driven_path import note_known_since, resolve_path_topic, way_in
+from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import open_span
 from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import placed_waypoints
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.results import DrivenInside
 
 if TYPE_CHECKING:
@@ -70,8 +69,7 @@ def driven_inside(
     region = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    way, since = way_in(view, name, window)
-    note_known_since(view, since)
+    way, _ = driven_path(view, name, window)
     if way is None or not way.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -79,12 +77,12 @@ def driven_inside(
     totals = totals_inside(way.line, inside)
     waypoints = way_inside(way.line, inside, max_waypoints)
     elapsed = elapsed_in(view, window)
-    duration = sum(elapsed.between(each.start, each.stop) for each in inside)
+    spans = [(each.start, each.stop) for each in inside]
+    duration = elapsed.among(spans)
     average = totals.distance_m / unix_from_ns(duration) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     require_one_robot(view, name, window)
-    spans = [(each.start, each.stop) for each in inside]
     away = None if farthest is None else farthest_from(view, farthest, name, spans, frame_id)
     note_unread(view, window)
     note_edges(view, window)
@@ -146,7 +144,7 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     """
     if not spans:
         return ()
-    inside = joined_lines([_part(line, span) for span in spans])
+    inside = stacked([_part(line, span) for span in spans])
     found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
     return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
 
@@ -157,4 +155,4 @@ def _part(line: Line, span: Inside) -> Line:
     ends = [span.start, span.stop] if span.stop > span.start else [span.start]
     first, last = line.at(np.array(ends[:1])), line.at(np.array(ends[1:], np.int64))
     begins = dataclasses.replace(first, jumps=np.array([True]))
-    return joined_lines([begins, line.rows(inner), last])
+    return stacked([begins, rows_of(line, inner), last])

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import jumps
+from ros2_memory.analysis.motion.robot_track import cut, jumps
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.history.driven_path import resolve_path_topic
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import track_in
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.places.where import parse_where
@@ -22,7 +22,7 @@ from ros2_memory.results import FarthestPose
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.frames import Floats, Mask, Times
+    from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
@@ -50,20 +50,19 @@ def farthest_from(
         InvalidArgumentsError: `value` is no point, or the poses are not in its frame.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    place = parse_where(view.memory.limits, value, 1.0, _ARGUMENT)
+    place = parse_where(view.limits, value, 1.0, _ARGUMENT)
     if place.several:
         raise InvalidArgumentsError(f"{_ARGUMENT} has several places; give one, or x and y")
     if topic != (known := resolve_path_topic(view)):
         raise InvalidArgumentsError(f"{_ARGUMENT} is measured along {known}: leave out topic")
-    own = pose_frame(view, topic)
-    frame = map_placement(view, own, topic, place.frame_id or frame_id).frame_id
+    frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
     min_x, max_x, min_y, max_y = place.region.bounds
     x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
     if not spans:
         return None
     window = TimeWindow(spans[0][0], spans[-1][1] + 1)
     track, tracks = track_in(view, frame, window), RobotTracks(view, frame)
-    times, at_x, at_y = _along(track, np.array(spans, np.int64))
+    times, at_x, at_y = _along(track, spans)
     off_m = np.hypot(at_x - x, at_y - y)
     best: tuple[float, Ns, float, float] | None = None
     for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
@@ -81,31 +80,20 @@ def farthest_from(
     if best is None:
         return None
     away_m, time, *there = best
-    inside = places_at(view.memory.limits.places, frame, *there)
+    inside = places_at(view.limits.places, frame, *there)
     return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
 
 
-def _along(track: RobotTrack, spans: Times) -> tuple[Times, Floats, Floats]:
+def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Floats, Floats]:
     """Returns where the track was in some times: its vertices, and where each begins and ends.
 
     Without those that the robot jumped to and from.
     """
-    starts, stops = track.pieces
-    jumped = jumps(track)
-    vertices = track.times[~(jumped & np.roll(jumped, 1))]
-    ends = spans.ravel()
-    known = _is_in(ends, starts, stops)
-    times = np.concatenate([vertices[_is_in(vertices, *spans.T)], ends[known]])
-    since = times - track.times[:1]
-    own = track.times - track.times[:1]
-    if not len(times):
-        return times, np.zeros(0), np.zeros(0)
-    return times, np.interp(since, own, track.x), np.interp(since, own, track.y)
-
-
-def _is_in(times: Times, starts: Times, stops: Times) -> Mask:
-    """Returns which times are in one of some spans, which are in order."""
-    if not len(starts):
-        return np.zeros(len(times), np.bool_)
-    nth = np.searchsorted(starts, times, side="right") - 1
-    return (nth >= 0) & (times <= stops[nth])
+    found = []
+    for first, last in spans:
+        part = cut(track, TimeWindow(first, last + 1))
+        jumped = jumps(part)
+        fine = ~(jumped & np.roll(jumped, 1))
+        found.append((part.times[fine], part.x[fine], part.y[fine]))
+    times, x, y = (np.concatenate(column) for column in zip(*found, strict=True))
+    return times, x, y

@@ -10,6 +10,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import empty_track, track_of
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.history.counting import pick
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -50,7 +51,7 @@ def local_frame(origin: Geodetic) -> str:
 
 def fixes_in(view: View, topic: str, window: TimeWindow) -> tuple[int, list[tuple[Ns, Geodetic]]]:
     """Returns how many messages a window holds, and the fixes among `MOST_FIXES` of them."""
-    total, messages = view.pick(topic, window, MOST_FIXES)
+    total, messages = pick(view, topic, window, MOST_FIXES)
     return total, [*_fixes(view, messages)]
 
 
@@ -59,7 +60,7 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
 
     None where the topic has no fix at all.
     """
-    if topic not in view.snapshot.timeline.topics():
+    if topic not in view.timeline.topics():
         return None
     every = view.stream.messages([topic], TimeWindow.everything())
     _, origin = next(_fixes(view, islice(every, _MOST_TRIED)), (0, None))
@@ -74,9 +75,9 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
 
 
 def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:
-    extractor = view.memory.extractor
+    extractor = view.extractor
     for each in messages:
         message = view.bags.decode(each)
-        fix = None if message is None else extractor.geodetic(message, each.record.channel.type)
+        fix = None if message is None else extractor.geodetic(message, each.type)
         if fix is not None and math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
             yield each.time, fix

@@ -6,8 +6,6 @@ shown begin and end at poses.
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left, bisect_right
 from contextlib import suppress
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -15,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS
-from ros2_memory.analysis.motion.robot_track import STRETCH_NS
+from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle
@@ -23,8 +21,8 @@ from ros2_memory.core.spans import without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.driven_path import pose_frame, resolve_path_topic
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.history.driven_path import resolve_path_topic
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit
 
@@ -32,11 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.core.spans import Spans
     from ros2_memory.history.view import View
-    from ros2_memory.places.map_placement import MapPlacement
+    from ros2_memory.places.pose_frames import MapPlacement
     from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
 
@@ -79,8 +78,7 @@ def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     """Returns what `track_in` does, and since when it is known."""
     joined = RobotTracks(view, frame_id).over(window)
     if joined.since is not None:
-        view.notes.complete = False
-        view.notes.add(
+        view.notes.add_lack(
             f"visits are known back to {unix_text(joined.since)}: out of time before older "
             "poses were placed"
         )
@@ -99,7 +97,7 @@ def make_tracks(view: View, window: TimeWindow) -> None:
     """Makes what the parts in a window say of where the robot was in the frames of places."""
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_path_topic(view)
-        for frame in map_placement(view, pose_frame(view, topic), topic).frames:
+        for frame in map_placement(view, topic).frames:
             RobotTracks(view, frame).make(window)
 
 
@@ -151,11 +149,9 @@ def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) ->
 
 def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) -> bool:
     """Returns whether poses between two visits were never outside for as long as leaving takes."""
-    first = max(older.start, older.stop - STRETCH_NS)
-    last = min(newer.stop, newer.start + STRETCH_NS)
-    poses = tracks.poses(TimeWindow(first, last + 1))
-    places = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
-    inside = [time for time, x, y in places if region.contains(x, y)]
+    first = max(older.start, older.stop - TRACK_SLICE_NS)
+    last = min(newer.stop, newer.start + TRACK_SLICE_NS)
+    inside = _inside(region, *tracks.poses(TimeWindow(first, last + 1))[:3])
     in_both = inside and inside[0] <= older.stop and inside[-1] >= newer.start
     apart = (later - earlier for earlier, later in pairwise(inside))
     return bool(in_both) and max(apart, default=0) < FLICKER_NS
@@ -165,9 +161,13 @@ def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Regio
     """Returns whether a visit that a window cuts off has a pose in the window."""
     if _vertices_inside(track, one, region):
         return True
-    poses = tracks.poses(TimeWindow(one.start, one.stop + 1))
-    places = zip(poses.x.tolist(), poses.y.tolist(), strict=True)
-    return any(region.contains(x, y) for x, y in places)
+    return bool(_inside(region, *tracks.poses(TimeWindow(one.start, one.stop + 1))[:3]))
+
+
+def _inside(region: Region, times: Times, x: Floats, y: Floats) -> list[Ns]:
+    """Returns those of some times at which the robot was in a region."""
+    rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
+    return [time for time, *place in rows if region.contains(*place)]
 
 
 def shown_visits(
@@ -224,29 +224,27 @@ def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside | None
     start, stop = one.start, one.stop
     if one.entered:
         poses = _poses_around(found, one.start)
-        inside = [time for time, x, y in poses if time <= one.stop and region.contains(x, y)]
-        others = [back for left, back in _absences(poses, inside) if left < one.start]
+        inside = [time for time in _inside(region, *poses) if time <= one.stop]
+        others = [back for left, back in _absences(poses[0], inside) if left < one.start]
         inside = [time for time in inside if time >= max(others, default=MIN_NS)]
         start = min((*inside[:1], *within[:1]), default=MAX_NS)
     if one.left:
         poses = _poses_around(found, one.stop)
-        inside = [time for time, x, y in poses if time >= one.start and region.contains(x, y)]
-        others = [left for left, back in _absences(poses, inside) if back > one.stop]
+        inside = [time for time in _inside(region, *poses) if time >= one.start]
+        others = [left for left, back in _absences(poses[0], inside) if back > one.stop]
         inside = [time for time in inside if time <= min(others, default=MAX_NS)]
         stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
     return one._replace(start=start, stop=stop) if start <= stop else None
 
 
-def _absences(
-    poses: Sequence[tuple[Ns, float, float]], inside: Sequence[Ns]
-) -> Iterator[tuple[Ns, Ns]]:
+def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
     """Yields the last pose inside, and the next one, around each absence as long as leaving takes.
 
     On a straight way from one part of a region to another one there are poses of both.
     """
-    times = [time for time, _, _ in poses]
     for left, back in pairwise(inside):
-        if back - left >= FLICKER_NS and bisect_right(times, left) < bisect_left(times, back):
+        between = (times > left) & (times < back)
+        if back - left >= FLICKER_NS and between.any():
             yield left, back
 
 
@@ -254,18 +252,17 @@ def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> list[Ns]
     """Returns the times of a visit's vertices that are inside."""
     first = int(np.searchsorted(track.times, one.start, side="left"))
     last = int(np.searchsorted(track.times, one.stop, side="right"))
-    columns = (column[first:last].tolist() for column in (track.times, track.x, track.y))
-    return [time for time, x, y in zip(*columns, strict=True) if region.contains(x, y)]
+    visit = slice(first, last)
+    return _inside(region, track.times[visit], track.x[visit], track.y[visit])
 
 
-def _poses_around(found: RegionVisits, at: Ns) -> list[tuple[Ns, float, float]]:
+def _poses_around(found: RegionVisits, at: Ns) -> tuple[Times, Floats, Floats]:
     """Returns the poses between the vertices before and after a time, these included."""
     times = found.track.times
     last = len(times) - 1
     before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
     after = min(int(np.searchsorted(times, at, side="right")), last)
-    poses = found.tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))
-    return list(zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True))
+    return found.tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
 
 
 def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, Ns]:
@@ -288,11 +285,10 @@ def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, N
     nearest = int(off.argmin())
     lasted = int(inner[nearest + 1] - inner[nearest])
     at = int(inner[nearest] + round(float(along[nearest]) * lasted))
-    poses = [
-        (math.hypot(x - circle.x, y - circle.y), time)
-        for time, x, y in _poses_around(found, at)
-        if one.start <= time <= one.stop
-    ]
+    times, x, y = _poses_around(found, at)
+    away_m = np.hypot(x - circle.x, y - circle.y)
+    near = (times >= one.start) & (times <= one.stop)
+    poses = zip(away_m[near].tolist(), times[near].tolist(), strict=True)
     return min(poses, default=(float(min(off[nearest], circle.radius_m)), at))
 
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS, Frames, joined_edges, static_in
+from ros2_memory.analysis.frames import TF_CACHE_NS, static_in
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
-    STRETCH_NS,
+    TRACK_SLICE_NS,
     RobotTrack,
     TrackPart,
     joined_track,
@@ -40,21 +40,25 @@ from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
-from ros2_memory.history.frames import edges_of_rows
 from ros2_memory.history.poses import PoseReader
-from ros2_memory.history.scan import blocks, joined_back, open_scan, scan
-from ros2_memory.history.transforms import lending_to, sessions_of, static_transforms
+from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
+from ros2_memory.history.transforms import (
+    edges_of_rows,
+    frames_over,
+    lending_to,
+    sessions_of,
+    static_transforms,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.frames import Edges, Floats, Mask, Times
+    from ros2_memory.analysis.frames import Edges, Floats, Frames, Mask, Times
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.model import StampedTransform
     from ros2_memory.core.regions import Region
     from ros2_memory.history.driven_path import Body
     from ros2_memory.history.sessions import Session
@@ -122,7 +126,7 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body_by_transforms(view)
-        tf_topics = view.memory.limits.tf_topics
+        tf_topics = view.limits.tf_topics
         self._topics = (view.pose_topic,) if self._body is None else tf_topics
         own = pose_frame(view, view.pose_topic) if self._body is None else self._body.child
         self._own_frame = own
@@ -144,8 +148,8 @@ class RobotTracks:
 
     def _over(self, window: TimeWindow) -> JoinedTrack:
         view = self._view
-        # Whole stretches, so that no vertex depends on the window; and what may reach into it.
-        around = _aligned(window.widened(SILENCE_NS), STRETCH_NS)
+        # Whole slices, so that no vertex depends on the window; and what may reach into it.
+        around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
         found: list[TrackPart] = []
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
@@ -165,7 +169,7 @@ class RobotTracks:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in found)
         one, *others = _by_robot(found)
-        fastest = view.memory.limits.max_plausible_speed_mps
+        fastest = view.limits.max_plausible_speed_mps
         tracks = tuple(joined_track(parts, fastest) for parts in others)
         return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
@@ -196,9 +200,9 @@ class RobotTracks:
 
     def _moving_scans(self, window: TimeWindow) -> list[Scan]:
         """Returns the scans of the moving transforms of a window, and around it."""
-        topics = self._view.snapshot.timeline.topics()
+        topics = self._view.timeline.topics()
         around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
-        named = self._view.memory.limits.tf_topics
+        named = self._view.limits.tf_topics
         return [
             open_scan(self._view, each, around, copies=True) for each in named if each in topics
         ]
@@ -213,23 +217,22 @@ class RobotTracks:
     ) -> Iterator[tuple[Ns, TrackPart]]:
         """Yields the track table by table, of those that begin in a stretch, the newest first."""
         among = stretch.window.intersect(window)
-        around = TimeWindow(stretch.window.start, stretch.last + 1)
-        moving = None if self._is_own else _Moving(scans, around, window)
         for rows in opened.rows(newest_first=True, among=among):
             if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
                 continue
-            groups = self._groups(rows, moving)
-            key = self._key(rows, groups)
+            groups = self._groups(rows, TimeWindow.everything())
+            key = self._key(rows, groups, scans)
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
-                yield rows.first, self._part(rows, groups, reading)
+                yield rows.first, self._part(rows, key, groups, reading)
                 continue
             known = self._known(key)
             if known is not None and not known.left_out:
                 yield rows.first, known.some(_inside(known.times, window))
             elif (inside := _inside(rows.times, window)).size:
-                yield rows.first, self._part(rows.some(inside), groups, reading)
+                groups = self._groups(rows, window)
+                yield rows.first, self._part(rows.some(inside), None, groups, reading)
 
     def _joined_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
@@ -249,77 +252,81 @@ class RobotTracks:
             if own not in numbers:
                 placed_by.append(static_in(static_transforms(self._view, own), span))
             placed_by.append(numbers.setdefault(own, len(numbers)))
-        for scan_ in scans:
-            found = scan_.whole_parts(span.widened(TF_CACHE_NS))
-            if found is None:
-                return None
-            for recording in map(scan_.recording_of, found):
-                if sessions.holds_carried(recording):
-                    return None
-                placed_by.append(numbers.get(sessions.of(recording)))
-            parts += [part for part in found if part not in parts]
+        moving = self._moving_parts(scans, span)
+        if moving is None:
+            return None
+        placed_by += [numbers.get(sessions.of(recording)) for recording in moving.values()]
+        parts += [part for part in moving if part not in parts]
         return FragmentKey(start, self._settings(placed_by), tuple(parts))
+
+    def _moving_parts(self, scans: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
+        """Returns the whole parts that all moving transforms around a time are of.
+
+        Each with its recording. None where there are others, or some are of several recordings.
+        """
+        found: dict[int, Path] = {}
+        for scan_ in scans:
+            parts = scan_.whole_parts(span.widened(TF_CACHE_NS))
+            if parts is None:
+                return None
+            found |= {part: scan_.recording_of(part) for part in parts}
+        is_mixed = any(map(sessions_of(self._view).holds_carried, found.values()))
+        return None if is_mixed else found
 
     def _settings(self, placed_by: Sequence[object]) -> str:
         """Returns what a track depends on besides the poses and transforms in parts, as a text."""
-        clock = self._view.memory.limits.tf_clock
+        clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
 
     def _known(self, key: FragmentKey | None) -> TrackPart | None:
         return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
 
-    def _part(self, rows: Rows, groups: Sequence[_Group], reading: Deadline) -> TrackPart:
+    def _part(
+        self, rows: Rows, key: FragmentKey | None, groups: Sequence[_Group], reading: Deadline
+    ) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
-        key = self._key(rows, groups)
-        part = self._known(key)
-        if part is None:
+
+        def make() -> TrackPart:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
-            noted = self._view.notes.added, len(self._failures)
             placed = self._placed(rows, groups, thins=True)
-            recording = relative(str(rows.recording), str(self._view.memory.index.bag_dir))
-            part = track_part(*placed)._replace(recording=recording)
-            is_sure = noted == (self._view.notes.added, len(self._failures))
-            if key is not None and is_sure:
-                self._view.memory.columns.fragments(TRACKS).put(key, part)
-        return part
+            recording = relative(str(rows.recording), str(self._view.bag_dir))
+            return track_part(*placed)._replace(recording=recording)
 
-    def _key(self, rows: Rows, groups: Sequence[_Group]) -> FragmentKey | None:
+        return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
+
+    def _key(
+        self, rows: Rows, groups: Sequence[_Group], scans: Sequence[Scan]
+    ) -> FragmentKey | None:
         """Returns what the track by some rows follows from; None where that may still change."""
-        own = rows.part
-        parts: list[int] = [] if own is None else [own]
-        placed_by: list[object] = []
-        for group in groups:
-            used = [source.rows.part for source in group.sources]
-            numbers = [part for part in used if part is not None]
-            if len(numbers) < len(used) or any(
-                sessions_of(self._view).holds_carried(source.rows.recording)
-                for source in group.sources
-            ):
-                return None
-            parts += [part for part in numbers if part not in parts]
-            # By their places among the parts: those of one recording have one text.
-            which = [parts.index(part) for part in numbers]
-            placed_by.append((group.since, group.static, which))
-        if own is None:
+        if rows.part is None:
             return None
+        parts, placed_by = [rows.part], []
+        for group in groups:
+            moving = self._moving_parts(scans, group.span)
+            if moving is None:
+                return None
+            sessions, session = sessions_of(self._view), group.session
+            used = [part for part, path in moving.items() if sessions.folder(path) in session]
+            parts += [part for part in used if part not in parts]
+            static = static_in(static_transforms(self._view, session), group.span)
+            # By their places among the parts: those of one recording have one text.
+            placed_by.append((group.since, tuple(static), [parts.index(part) for part in used]))
         return FragmentKey(rows.first, self._settings(placed_by), tuple(parts))
 
-    def _groups(self, rows: Rows, moving: _Moving | None) -> list[_Group]:
-        """Returns by what the poses of some rows are placed, each since when; none: by nothing."""
-        if moving is None:
+    def _groups(self, rows: Rows, window: TimeWindow) -> list[_Group]:
+        """Returns by what the poses of some rows in a window are placed; none: by nothing."""
+        if self._is_own:
             return []
-        sources = moving.around(rows.first, rows.last)
         lenders = self._lenders(rows)
         ends = [since for since, _ in lenders[1:]] + [MAX_NS]
-        groups = []
-        for (since, session), end in zip(lenders, ends, strict=True):
-            span = TimeWindow(max(since, rows.first), min(end, rows.last + 1))
-            used = [source for source in sources if source.is_of(self._view, session)]
-            static = static_in(static_transforms(self._view, session), span)
-            groups.append(_Group(since, span, session, tuple(static), used))
-        return groups
+        whole = TimeWindow(rows.first, rows.last + 1).intersect(window)
+        every = [
+            _Group(since, whole.intersect(TimeWindow(since, end)), session)
+            for (since, session), end in zip(lenders, ends, strict=True)
+        ]
+        return [group for group in every if not group.span.empty]
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
@@ -330,8 +337,8 @@ class RobotTracks:
         first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [(MIN_NS, first)]
-        stretches = (np.unique(rows.times // STRETCH_NS) * STRETCH_NS).tolist()
-        every = [(at, self._lending(recording, at)) for at in stretches]
+        slices = (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist()
+        every = [(at, self._lending(recording, at)) for at in slices]
         return [one for nth, one in enumerate(every) if not nth or one[1] != every[nth - 1][1]]
 
     def poses(self, window: TimeWindow) -> Placed:
@@ -342,13 +349,9 @@ class RobotTracks:
         """
         found = [NOWHERE]
         for topic in self._topics:
-            scans = self._moving_scans(window)
-            moving = None if self._is_own else _Moving(scans, window, window)
-            scanned = scan(self._view, topic, window, newest_first=True)
             found += [
-                self._placed(rows, self._groups(rows, moving), thins=False)
-                for together in blocks(scanned, newest_first=True)
-                for rows in together
+                self._placed(rows, self._groups(rows, window), thins=False)
+                for rows in scan(self._view, topic, window)
             ]
         return _joined(found)
 
@@ -368,7 +371,7 @@ class RobotTracks:
             return _placed(poses, None, self._frame_id)
         found: list[Placed] = []
         for group in groups:
-            frames = self._frames(group)
+            frames = frames_over(self._view, group.session, group.span, self._frame_id)
             if self._body is None:
                 some = poses.between(group.span.start, group.span.stop)
                 found.append(_placed(some, frames, self._frame_id))
@@ -376,14 +379,6 @@ class RobotTracks:
                 edges = edges_of_rows(self._view, rows, group.session)
                 found.append(_placed_body(edges, self._body, frames, group.span, thins=thins))
         return _joined(found)
-
-    def _frames(self, group: _Group) -> Frames:
-        around = group.span.widened(TF_CACHE_NS)
-        moving = [
-            _within(source.edges(self._view, group.session), around) for source in group.sources
-        ]
-        clock = self._view.memory.limits.tf_clock
-        return Frames(group.static, joined_edges(moving), self._frame_id, clock)
 
 
 class _Group(NamedTuple):
@@ -395,8 +390,6 @@ class _Group(NamedTuple):
     since: Ns
     span: TimeWindow
     session: Session
-    static: tuple[StampedTransform, ...]
-    sources: Sequence[_Source]
 
 
 class Placed(NamedTuple):
@@ -422,15 +415,10 @@ NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zero
 
 def _joined(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    times = np.concatenate([part.times for part in parts])
-    order = np.argsort(times, kind="stable")
-    return Placed(
-        times[order],
-        np.concatenate([part.x for part in parts])[order],
-        np.concatenate([part.y for part in parts])[order],
-        np.concatenate([part.heading for part in parts])[order],
-        sum(part.left_out for part in parts),
-    )
+    columns = [np.concatenate(each) for each in zip(*(part[:4] for part in parts), strict=True)]
+    order = np.argsort(columns[0], kind="stable")
+    times, x, y, heading = (column[order] for column in columns)
+    return Placed(times, x, y, heading, sum(part.left_out for part in parts))
 
 
 def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
@@ -479,60 +467,6 @@ def _placed_body(
     )
 
 
-class _Source:
-    """A table of moving transforms; those of log times in a window alone are read."""
-
-    def __init__(self, rows: Rows, window: TimeWindow) -> None:
-        self.rows = rows
-        self._window = window
-        self._edges: dict[Session, Edges] = {}
-
-    def is_of(self, view: View, among: Session) -> bool:
-        """Returns whether it may have transforms of a session."""
-        sessions = sessions_of(view)
-        is_mixed = sessions.holds_carried(self.rows.recording)
-        return is_mixed or sessions.folder(self.rows.recording) in among
-
-    def edges(self, view: View, among: Session) -> Edges:
-        """Returns the transforms of a session in it."""
-        if among not in self._edges:
-            rows = self.rows
-            if not self._window.covers(rows.first, rows.last):
-                rows = rows.some(_inside(rows.times, self._window))
-            self._edges[among] = edges_of_rows(view, rows, among)
-        return self._edges[among]
-
-
-class _Moving:
-    """The tables of moving transforms around times that are asked about, the latest first.
-
-    Args:
-        scans: of the transforms.
-        window: of the times.
-        placed: of those times of which poses are placed.
-    """
-
-    def __init__(self, scans: Sequence[Scan], window: TimeWindow, placed: TimeWindow) -> None:
-        around = window.widened(TF_CACHE_NS)
-        self._waiting = [one.rows(newest_first=True, among=around) for one in scans]
-        self._placed = placed.widened(TF_CACHE_NS)
-        self._held: list[list[_Source]] = [[] for _ in scans]
-
-    def around(self, first: Ns, last: Ns) -> list[_Source]:
-        """Returns the tables that overlap log times (inclusive), none later than asked before."""
-        first, last = first - TF_CACHE_NS, last + TF_CACHE_NS
-        found: list[_Source] = []
-        for waiting, held in zip(self._waiting, self._held, strict=True):
-            held[:] = [source for source in held if source.rows.first <= last]
-            while not held or held[-1].rows.last >= first:
-                rows = next(waiting, None)
-                if rows is None:
-                    break
-                held.append(_Source(rows, self._placed))
-            found += [each for each in held if each.rows.first <= last and each.rows.last >= first]
-        return found
-
-
 def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
     """Returns the slices of the clock of a length that a window is in."""
     start, stop = window.start // length * length, -(-window.stop // length) * length
@@ -542,16 +476,6 @@ def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
 def _inside(times: Times, window: TimeWindow) -> Times:
     """Returns the positions of those times that are in a window."""
     return np.flatnonzero((times >= window.start) & (times < window.stop))
-
-
-def _within(edges: Edges, window: TimeWindow) -> Edges:
-    """Returns the transforms that were received in a window."""
-    found = {}
-    for pair, edge in edges.items():
-        begin, end = np.searchsorted(edge.log_times, (window.start, window.stop)).tolist()
-        if begin < end:
-            found[pair] = edge.rows(slice(begin, end))
-    return found
 
 
 class _Pieces(NamedTuple):
@@ -634,8 +558,7 @@ def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
     if not count:
         return []
     # A piece of a single vertex is a step of no length.
-    ends = np.append(track.begins[1:], [True])
-    after = np.where(ends, np.arange(count), np.arange(count) + 1)
+    after = np.arange(count) + ~track.ends
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
     parts = parts_inside(region, steps)
     lasted = track.times[after] - track.times

@@ -90,10 +90,9 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
 
     Nobody was between the ends of a jump.
     """
-    count = len(track.times)
-    ends = np.append(track.begins[1:], [True])[:count] | jumps(track)
-    after = np.where(ends, np.arange(count), np.arange(count) + 1)
-    alone = ends & np.append([True], ends[:-1])[:count]
+    ends = track.ends | jumps(track)
+    after = np.arange(len(ends)) + ~ends
+    alone = ends & np.append([True], ends[:-1])[: len(ends)]
     real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
     first, last = np.flatnonzero(real), after[real]
     start = np.maximum(track.times[first], window.start)

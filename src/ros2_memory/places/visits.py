@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -25,13 +25,12 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import (
     driven_path,
-    pose_frame,
     resolve_path_topic,
 )
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, open_view, search_window
-from ros2_memory.places.map_placement import map_placement
+from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import (
     WHEREABOUTS,
     place_visits,
@@ -44,7 +43,7 @@ from ros2_memory.places.where import Where, note_other_frame, parse_where, place
 from ros2_memory.results import Visit, Visits
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -52,7 +51,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import View
-    from ros2_memory.places.region_visits import RegionVisits
 
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
@@ -92,8 +90,7 @@ def visits(
     mixed = note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
     asked = frame_id if named_frame is None else named_frame
-    own_frame = pose_frame(view, topic)
-    placement = map_placement(view, own_frame, topic, asked)
+    placement = map_placement(view, topic, asked)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
         placed = places_in(view, memory.limits.places, placement, window)
@@ -115,43 +112,38 @@ def visits(
             unknown=_unknown(view, window, tracks, mixed, elapsed),
             notes=view.notes.sentences(),
         )
-    known = _by_track(view, topic, placement.frame_id, place, (window, now, limit))
-    found = known.found
-    known = known._replace(shown=tuple(_within_asked(each, window) for each in known.shown))
+    found = region_visits(view, placement.frame_id, place, window)
+    newest = _newest(view, topic, found.track, window)
+    # A newer pose shows where the robot is now.
+    stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
+    current = newest if newest is not None and newest >= stale else None
+    by_poses, found = shown_visits(found, window, limit, place, current)
+    shown = tuple(_within_asked(each, window) for each in by_poses)
     if not placement.is_map:
-        known = known._replace(shown=_with_restarts(view, topic, known.shown, now))
+        shown = _with_restarts(view, topic, shown, now)
     if not found.all and asked is None:
-        note_other_frame(view, place, placement, window, f'ask with frame_id "{own_frame}"')
-    _note_doubts(view, known, window)
+        ask = f'ask with frame_id "{placement.pose_frame}"'
+        note_other_frame(view, place, placement, window, ask)
+    _note_doubts(view, shown, newest, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
         frame_id=placement.frame_id,
         x=None if circle is None else circle.x,
         y=None if circle is None else circle.y,
         radius_m=None if circle is None else circle.radius_m,
-        visits=known.shown,
-        more=len(found.all) > len(known.shown),
+        visits=shown,
+        more=len(found.all) > len(shown),
         total=len(found.all),
         now=now,
         duration=found.duration,
-        entries=known.entries,
-        exits=known.exits,
+        entries=sum(one.entered for one, _ in found.all),
+        exits=sum(one.left for one, _ in found.all),
         all_counted=found.is_all,
         where=place.name,
         unknown=_unknown(view, window, [found.track], mixed, found.elapsed),
-        reaches_now=known.newest is not None,
+        reaches_now=newest is not None,
         notes=view.notes.sentences(),
     )
-
-
-class _Known(NamedTuple):
-    """The visits to show, and all of them."""
-
-    shown: tuple[Visit, ...]
-    found: RegionVisits
-    newest: Ns | None
-    entries: int
-    exits: int
 
 
 def asked_place(
@@ -184,19 +176,6 @@ def asked_place(
     return None
 
 
-def _by_track(
-    view: View, topic: str, frame_id: str, place: Where, bounds: tuple[TimeWindow, Ns, int]
-) -> _Known:
-    """Returns the visits by the robot's track; those to show by its poses."""
-    window, now, limit = bounds
-    found = region_visits(view, frame_id, place, window)
-    newest = _newest(view, topic, found.track, window)
-    current = newest if _is_current(view, newest, now) else None
-    shown, found = shown_visits(found, window, limit, place, current)
-    entries, exits = sum(one.entered for one, _ in found.all), sum(one.left for one, _ in found.all)
-    return _Known(shown, found, newest, entries, exits)
-
-
 def _unknown(
     view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans, elapsed: Elapsed
 ) -> Ns:
@@ -221,12 +200,6 @@ def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
     return replace(visit, departed=end) if visit.departed == window.stop - 1 else visit
 
 
-def _is_current(view: View, newest: Ns | None, now: Ns) -> bool:
-    """Whether the newest pose is recent enough to know where the robot is now."""
-    stale = _SPLITS * ns_from_unix(view.memory.limits.split_duration_s)
-    return newest is not None and newest >= now - stale
-
-
 def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) -> tuple[Visit, ...]:
     """Returns visits with the number of odometry resets since."""
     if not shown:
@@ -240,9 +213,8 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
     )
 
 
-def _note_doubts(view: View, known: _Known, window: TimeWindow) -> None:
+def _note_doubts(view: View, shown: Sequence[Visit], newest: Ns | None, window: TimeWindow) -> None:
     """Adds notes on visits that are uncertain."""
-    shown, newest = known.shown, known.newest
     note_unread(view, window, nothing=not shown, gaps=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
@@ -262,11 +234,10 @@ def _resets(view: View, topic: str, since: Ns) -> tuple[Ns, ...]:
     None, with a note, if the time for the answer runs out first.
     """
     try:
-        path = driven_path(view, topic, TimeWindow(since, MAX_NS))
+        path, _ = driven_path(view, topic, TimeWindow(since, MAX_NS))
     except (InvalidArgumentsError, NoDataError):
         return ()  # poses that cannot be read say nothing about resets
     except QueryTimeoutError:
-        view.notes.complete = False
-        view.notes.add("there was no time to check whether odometry restarted since")
+        view.notes.add_lack("there was no time to check whether odometry restarted since")
         return ()
-    return () if path is None else path.trajectory.totals.resets
+    return () if path is None else path.totals.resets

@@ -201,7 +201,7 @@ def make_fragments(
             make_events(view, window, topics_with_changes(view))
             if nth <= len(windows):
                 Watching(view).make(window)
-                memory.columns.make_outlines(view.snapshot.timeline, window)
+                memory.columns.make_outlines(view.timeline, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.

@@ -317,15 +317,6 @@ class BagReader(ABC):
         return map(_unless_error, batched(enumerate(found())))
 
     @abstractmethod
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of `records(path, [topic], window)`, without the payloads.
-
-        Raises:
-            BagVanishedError: the file is not there.
-            BagError: they cannot be read.
-        """
-
-    @abstractmethod
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded; None if its type is known."""
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Batch, Channel, Definition, Record
     from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.sqlite_bag import SqliteBags
@@ -115,11 +114,6 @@ class FileReader(BagReader):
         """Returns the latest message of the topic inside the window."""
         with reading(path), self._open(path) as opened:
             return opened.bags.newest(opened.path, topic, window)
-
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[Ns]:
-        """Returns the log times of the topic inside the window, without reading payloads."""
-        with reading(path), self._open(path) as opened:
-            return opened.bags.log_times(opened.path, topic, window)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file."""

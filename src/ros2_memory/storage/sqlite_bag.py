@@ -231,13 +231,6 @@ class SqliteBags:
                 raise ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
             return None if found is None else self._record(base, wanted, *found)
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
-        """Returns the log times of a topic's messages inside the window, ascending."""
-        with self._opened(path) as (base, known):
-            wanted, right = known.named({topic}), self._is_indexed_right(base, known)
-            rows = _ordered_rows(base, wanted, window, indexed=right)
-            return [time for time, _, _ in rows]
-
     def _record(
         self,
         base: sqlite3.Connection,

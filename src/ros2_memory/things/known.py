@@ -65,9 +65,9 @@ def known_things(
     Raises:
         QueryTimeoutError: the call's time is over before any bag was read.
     """
-    timeline, scanner = view.snapshot.timeline, view.memory.columns
+    timeline, scanner = view.timeline, view.memory.columns
     described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
-    key = ("things", min_score, described, view.memory.limits.map_frame, view.pose_topic)
+    key = ("things", min_score, described, view.limits.map_frame, view.pose_topic)
     kept = scanner.things.get(key)
     if kept is not None and kept[0] is timeline and isinstance(kept[1], KnownThings):
         known = kept[1]
@@ -145,7 +145,7 @@ class _Loader:
         return kept[1] if kept is not None and isinstance(kept[1], int) else _MOST_SPOTS
 
     def _remember_most(self, most: int) -> None:
-        kept = self._view.snapshot.timeline, most
+        kept = self._view.timeline, most
         self._view.memory.columns.things.put(self._key, kept, 1)
 
     def _newest(self, most: int) -> tuple[list[list[Stretch]], bool]:
@@ -204,7 +204,7 @@ class _Loader:
 
         All that is in the map is of epoch 0. Odometry starts again in each session.
         """
-        in_map = self._view.memory.limits.map_frame
+        in_map = self._view.limits.map_frame
         known: dict[Hashable, int] = {(in_map, None): 0}
         names = [in_map or ""]
         epochs = []

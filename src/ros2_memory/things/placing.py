@@ -23,10 +23,9 @@ from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import DetectionRows, joined_detected
-from ros2_memory.history.frames import frames_over
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
-from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.transforms import frames_over, sessions_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -116,7 +115,7 @@ class Placer:
         poses = self._poses(own, window)
         target, frames = self._frames(among, window, poses)
         sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
-        if target == self._view.memory.limits.map_frame and len(poses):
+        if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([each.log_times for each in detected.values()])
             fixes = self._fixes(own, poses.frames.words[0], frames, times)
             sights[0] = sights[0].with_fixes(fixes)
@@ -151,7 +150,7 @@ class Placer:
     def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, Frames]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""
         own = poses.frames.words[0] if len(poses) else ""
-        target = self._view.memory.limits.map_frame or own
+        target = self._view.limits.map_frame or own
         if not among:
             target = own if len(poses) else target
             return target, Frames((), {}, target)
@@ -189,7 +188,7 @@ class Placer:
 
     def _localised(self, own: Session, window: TimeWindow) -> tuple[Ints, Floats]:
         """Returns what the localiser said: when, and its standard deviation (m)."""
-        timeline = self._view.snapshot.timeline
+        timeline = self._view.timeline
         topics = [topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)]
         found = sorted(each for topic in topics for each in self._covariances(topic, own, window))
         times = np.array([time for time, _ in found], np.int64)
@@ -206,9 +205,8 @@ class Placer:
             numbers = rows.times // _SAID_NS
             first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
             for found in messages_of(self._view, rows.some(first)):
-                try:
-                    message = memory.reader.decode(found.record)
-                except UndecodableError:
+                message = self._view.bags.decode(found)
+                if message is None:
                     continue
                 frame = memory.extractor.frame(message).lstrip("/")
                 sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))

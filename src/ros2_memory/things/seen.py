@@ -23,7 +23,7 @@ from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
 from ros2_memory.columns.sights import packed
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import remembered, scan
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 VERSION: Final = 1
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
-STRETCH_NS: Final[Ns] = 60 * SLICE_NS
+SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _SIZE: Final = Struct("<I")
 _MANY: Final = 64
 """A bag that spans more stretches may have odd times."""
@@ -176,13 +176,13 @@ class Watching:
         self._placer = Placer(view)
         self._sessions = sessions_of(view)
         self._of: dict[Path, Session] = {}
-        timeline = view.snapshot.timeline
+        timeline = view.timeline
         self._topics = [
             topic
             for topic in timeline.topics()
             if any(map(may_have_detections, timeline.types_of(topic)))
         ]
-        limits = view.memory.limits
+        limits = view.limits
         self._needed = (
             *self._topics,
             view.pose_topic,
@@ -209,7 +209,7 @@ class Watching:
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        for around in self._stretches_in(window.widened(STRETCH_NS)):
+        for around in self._stretches_in(window.widened(SIGHTS_NS)):
             if around.parts is not None:
                 self._known(around)
 
@@ -254,7 +254,7 @@ class Watching:
             ends = [*accumulate(lengths, initial=at)]
             parts = tuple(data[begin:end] for begin, end in pairwise(ends))
             at = ends[-1]
-            in_map = frame == self._view.memory.limits.map_frame
+            in_map = frame == self._view.limits.map_frame
             found.append(Stretch(start, frame, None if in_map else sessions[nth], spots, parts))
         return found
 
@@ -304,22 +304,18 @@ class Watching:
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
         if is_open or not self._lasts:
             return self._read(around)
-        before = self._view.notes.added
         followed = self._follows_from(around)
         if around.parts is not None:
-            fragments = scanner.fragments(SIGHTS)
             part_key = FragmentKey(around.window.start, followed, around.parts)
-            known = fragments.get(part_key)
-            if known is None:
-                known = SeenBytes(self._read(around))
-                if self._view.notes.added == before:
-                    fragments.put(part_key, known)
-            return known.data
+            return remembered(
+                self._view, SIGHTS, part_key, lambda: SeenBytes(self._read(around))
+            ).data
         # Parts, as these, are of certain recordings.
         bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
         key = (around.window.start, followed, tuple(bags))
         data = scanner.sights.get(key)
         if data is None:
+            before = self._view.notes.added
             data = self._read(around)
             if self._view.notes.added == before:
                 scanner.sights.put(key, data, 200 + len(data) + 100 * len(bags))
@@ -344,7 +340,7 @@ class Watching:
         ]
         # Mostly they are those of the stretch before, object by object.
         if self._followed[0] != (statics, of):
-            limits = self._view.memory.limits
+            limits = self._view.limits
             every = [
                 [(one.parent, one.child, one.transform, time) for one, time in some]
                 for some in statics
@@ -396,7 +392,7 @@ class _Bags:
         around = window.widened(AROUND_NS)
         self._bags = [
             bag
-            for bag in view.snapshot.timeline.overlapping(around)
+            for bag in view.timeline.overlapping(around)
             if not is_carried(bag.file) or any(map(bag.summary.of, needed))
         ]
         count = len(self._bags)
@@ -407,7 +403,7 @@ class _Bags:
 
     def stretches(self) -> list[int]:
         """Returns the numbers of the stretches in which there may be messages, the newest first."""
-        first, last = self._starts // STRETCH_NS, self._ends // STRETCH_NS
+        first, last = self._starts // SIGHTS_NS, self._ends // SIGHTS_NS
         long = np.flatnonzero(last - first > 1)
         more = [_numbers_of(self._view, self._topics, self._bags[nth]) for nth in long.tolist()]
         every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
@@ -452,7 +448,7 @@ class _Parts(NamedTuple):
             return None
         # Before the parts: what is merged meanwhile is in none of those that are known.
         unmerged = scanner.store.unmerged()
-        coverage = scanner.coverage(view.snapshot.timeline)
+        coverage = scanner.coverage(view.timeline)
         if coverage is None:
             return None
         merged = {
@@ -500,17 +496,17 @@ def _in_slices(rows: Rows, slices: Sequence[int]) -> Rows:
 
 def _window(number: int) -> TimeWindow:
     """Returns when a stretch is."""
-    begin = number * STRETCH_NS
-    return TimeWindow(max(begin, MIN_NS), min(begin + STRETCH_NS, MAX_NS))
+    begin = number * SIGHTS_NS
+    return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
 
 
 def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int]:
     """Returns the numbers of the stretches in which a bag may have messages of some topics."""
-    numbers = range(bag.start // STRETCH_NS, bag.end // STRETCH_NS + 1)
+    numbers = range(bag.start // SIGHTS_NS, bag.end // SIGHTS_NS + 1)
     if len(numbers) <= _MANY:
         return numbers
     # Its times are odd: centuries may lie between two messages.
     window = TimeWindow(bag.start, bag.end).widened(1)
-    every = [rows.times // STRETCH_NS for topic in topics for rows in scan(view, topic, window)]
+    every = [rows.times // SIGHTS_NS for topic in topics for rows in scan(view, topic, window)]
     found: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *every])).tolist()
     return found

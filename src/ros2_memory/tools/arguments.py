@@ -32,7 +32,7 @@ from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import named_span_s, rest_of_end_s, rest_of_text_s, unix_from_text
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.places.scope import WhileCondition
+from ros2_memory.places.where import WhileCondition
 
 LATEST_UNIX_S: Final = 9_223_372_036.0
 """The last second that int64 nanoseconds can represent; a larger number is in another unit."""

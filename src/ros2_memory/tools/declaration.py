@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.in_each import in_each
+from ros2_memory.insights.at_each import in_each
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.schema import Signature
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.stays import count_visits
 from ros2_memory.insights.compare import compare
+from ros2_memory.insights.fields import describe_type
 from ros2_memory.insights.recap import recap_or_before
 from ros2_memory.insights.saved_moments import list_moments, remember_moment, show_moment
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.insights.status import memory_status
-from ros2_memory.insights.type_fields import describe_type
 from ros2_memory.places.visits import visits
 from ros2_memory.things.find import find_things
 from ros2_memory.tools.arguments import (

@@ -170,8 +170,9 @@ class SplitSearch:
                 if topic in latched or any(rule.condition is not None for rule in rules):
                     read += [topic] if rules else []
                 elif rules:
-                    found = self._reader.log_times(bag.path, topic, part.window)
-                    times += ((time, topic) for time in found)
+                    batches = self._reader.batches(bag.path, [topic], part.window, bare=[topic])
+                    for batch in batches:
+                        times += ((time, topic) for time in batch.log_times.tolist())
             records = self._reader.records(bag.path, read, part.window) if read else ()
             yield from heapq.merge(
                 (

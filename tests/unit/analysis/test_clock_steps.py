@@ -6,29 +6,30 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.clock_steps import ClockStep, Elapsed, step_over
-from ros2_memory.analysis.motion.odometry import TimedPosition
+from ros2_memory.analysis.poses import NO_POSES, Poses
+from tests.unit.analysis.motion.posed import posed
 
 S = 10**9
 
 
-def poses(begin: float, x: float, speed_mps: float) -> list[TimedPosition]:
+def poses(begin: float, x: float, speed_mps: float) -> Poses:
     """Poses of one second."""
-    return [
-        TimedPosition(round((begin + at / 10) * S), (x + speed_mps * at / 10, 0.0, 0.0))
-        for at in range(11)
-    ]
+    tenths = range(11)
+    return posed(
+        (round((begin + at / 10) * S), (x + speed_mps * at / 10, 0.0, 0.0)) for at in tenths
+    )
 
 
 def over(moved_m: float, *, length: float = 8.0, before: float = 0.5, after: float = 0.5) -> object:
     first = poses(99.0, 0.0, before)
-    second = poses(100 + length, first[-1].position[0] + moved_m, after)
+    second = poses(100 + length, float(first.positions[-1, 0]) + moved_m, after)
     return step_over((100 * S, round((100 + length) * S)), first, second)
 
 
 def test_one_pose_has_no_speed() -> None:
     first, second = poses(99.0, 0.0, 0.5), poses(108.0, 0.5, 0.5)
-    assert step_over((100 * S, 108 * S), first[-1:], second) is None
-    assert step_over((100 * S, 108 * S), first, []) is None
+    assert step_over((100 * S, 108 * S), first.rows(slice(-1, None)), second) is None
+    assert step_over((100 * S, 108 * S), first, NO_POSES) is None
 
 
 @given(

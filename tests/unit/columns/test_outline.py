@@ -23,7 +23,7 @@ from ros2_memory.counts.numbers import count_range
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange, View
-from ros2_memory.insights.field_extremes import extremes_of
+from ros2_memory.insights.fields import extremes_of
 from tests.support.bags import Msg, odom, text, write_mcap
 from tests.support.column_worlds import World
 from tests.support.examples import examples

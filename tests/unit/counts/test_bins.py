@@ -18,8 +18,8 @@ from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.history import driven_path
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.counting import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import boolean, detections, odom, write_mcap
@@ -267,7 +267,7 @@ def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> N
         memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
         known = with_store(memory, bags, part=part)
         for each in (memory, known, known):
-            assert all(counted == read for counted, read in _counts_by_group(each))
+            assert all(counted == read for counted, read in _counts_by_topic(each))
         start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
         questions: list[tuple[str, dict[str, object]]] = [
             ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
@@ -325,16 +325,14 @@ def test_recordings_that_follow_each_other_at_a_full_hour_count_a_copy_once(
     assert ask(known, "pose.pose.position.x").rows == numbers.rows
 
 
-def _counts_by_group(memory: Memory) -> Iterator[tuple[int, int]]:
-    """How many messages each whole group holds, as they are counted, and as they are read."""
-    view = View(memory, Call())
+def _counts_by_topic(memory: Memory) -> Iterator[tuple[int, int]]:
+    """How many messages each topic has, as they are counted, and as they are read."""
+    view, everything = View(memory, Call()), TimeWindow.everything()
     for topic in view.snapshot.timeline.topics():
-        for group in groups_of(view.stream, topic, TimeWindow.everything()):
-            if group.is_whole:
-                counted = view.count_in(topic, group)
-                read = sum(1 for _ in group.messages())
-                if view.notes.complete:
-                    yield counted, read
+        counted, _ = pick(view, topic, everything, 1)
+        read = sum(1 for _ in view.stream.messages([topic], everything))
+        if view.notes.complete:
+            yield counted, read
 
 
 def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:

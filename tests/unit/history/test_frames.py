@@ -17,9 +17,8 @@ from ros2_memory.analysis.frames import edges_of
 from ros2_memory.columns.transforms import pairs_in, stamped_between
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.frames import frames_over, transform_rows
 from ros2_memory.history.scan import scan
-from ros2_memory.history.transforms import sessions_of
+from ros2_memory.history.transforms import edges_of_rows, frames_over, sessions_of
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, tf, transform, write_mcap
 from tests.support.column_worlds import EVERYTHING, World
@@ -79,7 +78,8 @@ def test_columns_hold_the_transforms_of_the_messages(tmp_path: Path, stored: boo
             made.memory.reader.decode(found.record), found.time, static=False
         )
     )
-    found = [edges for _, edges in transform_rows(view, "/tf", EVERYTHING, session_of(view))]
+    session = session_of(view)
+    found = [edges_of_rows(view, rows, session) for rows in scan(view, "/tf", EVERYTHING)]
     assert {pair for edges in found for pair in edges} == expected.keys()
     for pair, whole in expected.items():
         parts = [edges[pair] for edges in found if pair in edges]

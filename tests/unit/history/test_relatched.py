@@ -13,8 +13,8 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.bag_groups import groups_of
 from ros2_memory.history.context import Call
+from ros2_memory.history.counting import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap
@@ -100,11 +100,11 @@ def texts(memory: Memory, window: TimeWindow) -> list[tuple[int, int]]:
     return [(each.time, each.record.publish_time) for each in stream.messages([TOPIC], window)]
 
 
-def in_groups(memory: Memory, window: TimeWindow) -> list[int]:
-    groups = groups_of(View(memory, Call()).stream, TOPIC, window)
-    times = [group.times() for group in groups]
-    assert [len(each) for each in times] == [group.count() for group in groups]
-    return [time for each in times for time in each]
+def picked(memory: Memory, window: TimeWindow) -> list[int]:
+    total, chosen = pick(View(memory, Call()), TOPIC, window, 10_000)
+    times = [each.time for each in chosen]
+    assert len(times) == total
+    return times
 
 
 @settings(
@@ -127,7 +127,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         for window in (TimeWindow.everything(), TimeWindow(edges[0], edges[1] + 1)):
             inside = [each for each in counted if window.contains(each[0])]
             assert texts(memory, window) == [each[:2] for each in inside]
-            assert in_groups(memory, window) == [each[0] for each in inside]
+            assert picked(memory, window) == [each[0] for each in inside]
         [census] = View(memory, Call()).census(TOPIC).values()
         assert (census.first, census.last, census.count) == (
             counted[0][0],

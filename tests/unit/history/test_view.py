@@ -14,6 +14,7 @@ from ros2_memory.core.errors import BagError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call
+from ros2_memory.history.counting import pick
 from ros2_memory.history.view import View
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.mcap_reader import McapReader
@@ -79,7 +80,7 @@ def test_a_message_in_two_overlapping_recordings_counts_once_at_its_earliest_tim
     assert times(view, "/odom", newest_first=True) == expected[::-1]
     census = view.census("/odom")["nav_msgs/msg/Odometry"]
     assert (census.count, census.first, census.last) == (140, expected[0], expected[-1])
-    total, chosen = view.pick("/odom", TimeWindow.everything(), 1000)
+    total, chosen = pick(view, "/odom", TimeWindow.everything(), 1000)
     assert total == 140
     assert [each.time for each in chosen] == expected
 
@@ -124,7 +125,7 @@ def test_a_latched_message_received_again_counts_when_it_was_first_received(
     assert found.time == T0
     census = view.census("/dock")["std_msgs/msg/String"]
     assert (census.count, census.first, census.last) == (2, T0, T0 + 700 * S)
-    assert view.pick("/dock", TimeWindow.everything(), 10)[0] == 2
+    assert pick(view, "/dock", TimeWindow.everything(), 10)[0] == 2
 
 
 def test_where_the_first_copy_is_gone_the_next_one_counts(tmp_path: Path) -> None:
@@ -193,7 +194,7 @@ def test_picked_samples_are_evenly_spaced_over_the_messages_of_many_splits(
             tmp_path / "rec" / f"rec_{split}.mcap",
             [odom(T0 + (split * 20 + n) * S, n, 0.0) for n in range(20)],
         )
-    total, chosen = view_of(tmp_path).pick("/odom", TimeWindow(T0 + 3 * S, T0 + 98 * S), 7)
+    total, chosen = pick(view_of(tmp_path), "/odom", TimeWindow(T0 + 3 * S, T0 + 98 * S), 7)
     assert total == 95
     assert [each.time for each in chosen] == [T0 + (3 + index) * S for index in evenly(95, 7)]
 
@@ -238,6 +239,6 @@ def test_every_message_counts_exactly_once_however_recordings_overlap(
     assert times(view, "/bumper") == expected
     assert times(view, "/bumper", newest_first=True) == expected[::-1]
     assert view.census("/bumper")["std_msgs/msg/Bool"].count == len(expected)
-    total, chosen = view.pick("/bumper", TimeWindow.everything(), 8)
+    total, chosen = pick(view, "/bumper", TimeWindow.everything(), 8)
     assert total == len(expected)
     assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]

@@ -15,11 +15,12 @@ from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.history.context import Memory
+    from ros2_memory.storage.base import Record
 
 S = 10**9
 BEGIN = 1_784_000_000
@@ -79,8 +80,8 @@ def test_a_suspected_hole_is_read_once(tmp_path: Path) -> None:
 
 
 class Unreadable(McapReader):
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> Sequence[int]:
-        raise AssertionError(path)
+    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
+        raise AssertionError(path, topic, window)
 
 
 def steps(memory: Memory, folder: Path) -> list[Any]:

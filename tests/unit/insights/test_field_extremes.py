@@ -10,7 +10,7 @@ from ros2_memory import queries
 from ros2_memory.counts.column_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
-from ros2_memory.insights import field_extremes
+from ros2_memory.insights import fields
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
@@ -89,7 +89,7 @@ def test_a_field_that_leads_into_a_list_means_all_of_it(tmp_path: Path) -> None:
 def test_a_window_of_any_length_has_extremes_of_fields_that_columns_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(field_extremes, "MAX_MESSAGES", 3)
+    monkeypatch.setattr(fields, "MAX_MESSAGES", 3)
     driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)]
     [x] = asked(tmp_path, driven, "position.x").extremes
     assert (x.least, x.least_at, x.most, x.most_at) == (0.0, BEGIN, 8.0, BEGIN + 8 * S)
@@ -101,10 +101,10 @@ def test_a_window_with_too_many_messages_to_read_says_so(
     driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(9)]
     [covariance] = asked(tmp_path, driven, "pose.covariance").extremes
     assert (covariance.least, covariance.least_at) == (0.0, BEGIN)
-    monkeypatch.setattr(field_extremes, "MAX_MESSAGES", 3)
+    monkeypatch.setattr(fields, "MAX_MESSAGES", 3)
     answer = asked(tmp_path, driven, "pose.covariance")
     assert answer.extremes == ()
-    assert field_extremes.TOO_MANY in answer.notes
+    assert fields.TOO_MANY in answer.notes
 
 
 @pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])

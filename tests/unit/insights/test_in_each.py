@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.insights.in_each import hours_of_days
+from ros2_memory.insights.at_each import hours_of_days
 from ros2_memory.tools.arguments import _as_hours
 from tests.support.memories import asked
 from tests.support.rooms import S, asked_of, draw, write

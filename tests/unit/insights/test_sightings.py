@@ -27,7 +27,7 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.scope import WhileCondition
+from ros2_memory.places.where import WhileCondition
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (

@@ -18,8 +18,8 @@ from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.scope import WhileCondition
 from ros2_memory.places.visits import visits
+from ros2_memory.places.where import WhileCondition
 from ros2_memory.queries import position
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
 from tests.support.examples import examples

@@ -156,19 +156,6 @@ def test_batches_of_one_buffer_follow_each_other_and_lie_inside_of_it(
 
 @on_every_shelf
 @settings(max_examples=examples(20))
-@given(messages=_messages(), window=_windows)
-def test_log_times_are_those_of_the_records(
-    shelf: Shelf, messages: list[Msg], window: TimeWindow
-) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        reader, path = _stocked(shelf, folder, messages)
-        for topic in TOPICS:
-            times = list(reader.log_times(path, topic, window))
-            assert times == [record.log_time for record in reader.records(path, [topic], window)]
-
-
-@on_every_shelf
-@settings(max_examples=examples(20))
 @given(messages=_messages())
 def test_a_summary_counts_what_the_messages_say(shelf: Shelf, messages: list[Msg]) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -233,7 +220,6 @@ def test_an_empty_bag_has_no_topics_and_no_times(shelf: Shelf, tmp_path: Path) -
     assert summary.topics == ()
     assert summary.silent == (("/quiet",) if shelf.writes_silent_topics else ())
     assert stocked.reader.closing(stocked.path) is Closing.CLOSED
-    assert list(stocked.reader.log_times(stocked.path, "/quiet", TimeWindow.everything())) == []
 
 
 @on_every_shelf
@@ -318,7 +304,6 @@ def test_a_bag_that_is_gone_has_vanished_for_every_question(shelf: Shelf, tmp_pa
         lambda: reader.summarize(path),
         lambda: reader.closing(path),
         lambda: reader.channels(path),
-        lambda: reader.log_times(path, "/chatter", everything),
     )
     for question in questions:
         with pytest.raises(BagVanishedError) as caught:
@@ -339,7 +324,6 @@ def test_what_is_no_bag_counts_as_closed_and_its_fault_is_reported(
         lambda: stocked.reader.channels(stocked.path),
         lambda: list(stocked.reader.records(stocked.path, ["/chatter"], everything)),
         lambda: list(stocked.reader.batches(stocked.path, ["/chatter"], everything)),
-        lambda: stocked.reader.log_times(stocked.path, "/chatter", everything),
     )
     for question in questions:
         with pytest.raises(BagError) as caught:
@@ -385,7 +369,6 @@ def test_reading_leaves_no_trace_beside_the_bag(shelf: Shelf, tmp_path: Path) ->
     before = [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()]
     stocked.reader.summarize(stocked.path)
     read(stocked.reader, stocked.path, ["/chatter"])
-    stocked.reader.log_times(stocked.path, "/chatter", TimeWindow.everything())
     assert [(file.name, file.stat().st_mtime_ns) for file in tmp_path.iterdir()] == before
 
 

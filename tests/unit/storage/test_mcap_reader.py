@@ -17,8 +17,6 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.mcap import bag_file
-from ros2_memory.storage.mcap.index import chunk_data
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
 from tests.support.mcap_surgery import (
@@ -42,8 +40,6 @@ if TYPE_CHECKING:
     from mcap.records import ChunkIndex
 
     from ros2_memory.storage.base import Record
-    from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.summary import Chunk
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"
@@ -62,34 +58,14 @@ def times(records: list[Record]) -> list[int]:
 
 
 class TestReadingOnlyWhatIsWanted:
-    def test_a_summary_and_log_times_need_no_chunk(self, tmp_path: Path) -> None:
+    def test_a_summary_needs_no_chunk(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
         for number in range(len(chunks_of(path))):
             spoil_chunk(path, number)
         reader = McapReader()
         assert reader.summarize(path).count == 20
-        assert list(reader.log_times(path, "/chatter", TimeWindow(5, 9))) == [5, 6, 7, 8]
         with pytest.raises(BagError, match="does not match its checksum"):
             read(reader, path)
-
-    def test_log_times_compare_the_indexes_with_the_chunks_once(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        # No two of these chunks fit the cache.
-        path = write_mcap(tmp_path / "a.mcap", chatter(4, 300_000), SMALL)
-        read_chunks: list[int] = []
-
-        def noting(
-            file: OpenFile, chunk: Chunk, at_most: int, take_turn: Callable[[], None]
-        ) -> bytes:
-            read_chunks.append(chunk.offset)
-            return chunk_data(file, chunk, at_most, take_turn)
-
-        monkeypatch.setattr(bag_file, "chunk_data", noting)
-        reader = McapReader(cache_mb=1)
-        for _ in range(2):
-            assert list(reader.log_times(path, "/chatter", TimeWindow.everything())) == [0, 1, 2, 3]
-            assert len(read_chunks) == len(chunks_of(path)) == 4
 
     def test_a_damaged_chunk_disturbs_only_the_windows_that_it_overlaps(
         self, tmp_path: Path
@@ -251,14 +227,11 @@ class TestIndexesThatAreWrong:
         assert len(notes) == 1
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
 
-    def test_what_a_wrong_message_index_says_is_in_no_summary_and_no_log_times(
-        self, tmp_path: Path
-    ) -> None:
+    def test_what_a_wrong_message_index_says_is_in_no_summary(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", [*chatter(9), boolean(9, True)])
         (chunk,) = chunks_of(path)
         change_index(path, chunk, 0, 1)
         assert McapReader().summarize(path).of("/chatter")[0].first == 0
-        assert McapReader().log_times(path, "/chatter", TimeWindow(0, 2)) == [0, 1]
         whole = write_mcap(tmp_path / "b.mcap", [*chatter(9), boolean(9, True)])
         assert McapReader().summarize(whole).notes == ()
 

@@ -101,10 +101,6 @@ def test_messages_are_as_many_as_summarised_in_order_and_reversible(name: str) -
             topics = topics_of(summary)
             backwards = list(reader.records(path, topics, EVERYTHING, newest_first=True))
             assert backwards == records[::-1]
-            for topic in topics:
-                assert list(reader.log_times(path, topic, EVERYTHING)) == [
-                    record.log_time for record in records if record.channel.topic == topic
-                ]
 
 
 @needs_real

@@ -126,7 +126,7 @@ class TestSqliteSchemas:
         assert read(reader, path) == with_index
         assert times(with_index) == [1, 1, 2, 3]
 
-    @pytest.mark.parametrize("asked_first", ["newest", "records", "log_times", "summarize"])
+    @pytest.mark.parametrize("asked_first", ["newest", "records", "summarize"])
     def test_an_index_that_is_declared_descending_and_stored_ascending_is_not_believed(
         self, tmp_path: Path, asked_first: str
     ) -> None:
@@ -141,8 +141,6 @@ class TestSqliteSchemas:
         if asked_first == "newest":
             with pytest.raises(BagError, match="index by time is damaged"):
                 reader.newest(path, "/chatter", upto)
-        elif asked_first == "log_times":
-            assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
         elif asked_first == "records":
             with pytest.raises(BagContradictionError):
                 read(reader, path)
@@ -153,7 +151,6 @@ class TestSqliteSchemas:
                 next(records)
             found = [each.log_time for each in records]
             assert found == sorted(range(1000, 1200), reverse=newest_first)
-        assert list(reader.log_times(path, "/chatter", upto)) == [*range(1000, 1200)]
 
     def test_a_time_that_no_clock_shows_is_left_out_and_reported(self, tmp_path: Path) -> None:
         path = write_db3(tmp_path / "a.db3", chatter(3))
@@ -285,7 +282,6 @@ class TestJournals:
         assert times(read(reader, path)) == [0, 1, 5]
         assert (summary.count, summary.complete) == (3, False)
         assert summary.notes[0].startswith("its writer did not finish it")
-        assert list(reader.log_times(path, "/chatter", EVERYTHING)) == [0, 1, 5]
         assert {file.name: file.read_bytes() for file in left.iterdir()} == before
 
     def test_a_wal_that_grows_is_read_anew(self, live: tuple[Path, sqlite3.Connection]) -> None:

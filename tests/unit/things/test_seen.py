@@ -15,7 +15,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.things import placing
 from ros2_memory.things.find import find_things
-from ros2_memory.things.seen import STRETCH_NS, Watching
+from ros2_memory.things.seen import SIGHTS_NS, Watching
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked, write
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ros2_memory.results import Thing
     from tests.support.bags import Msg
 
-APART_S = STRETCH_NS // 10**9
+APART_S = SIGHTS_NS // 10**9
 
 
 def day() -> list[Msg]:

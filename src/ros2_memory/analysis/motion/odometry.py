@@ -524,15 +524,9 @@ def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
     return median_low(near or [known or own])
 
 
-def is_place(position: Vector3) -> bool:
-    """Returns whether coordinates are a place: finite, and on Earth."""
-    x, y, z = position
-    # A comparison with NaN is false, so this one refuses all three kinds.
-    return abs(x) < FARTHEST_M and abs(y) < FARTHEST_M and abs(z) < FARTHEST_M
-
-
 def are_places(positions: Rows) -> Marks:
-    """Does the same for coordinates as rows."""
+    """Returns which coordinates, as rows, are a place: finite, and on Earth."""
     x, y, z = np.abs(positions).T
+    # A comparison with NaN is false, so this one refuses all three kinds.
     marks: Marks = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
     return marks

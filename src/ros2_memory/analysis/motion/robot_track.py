@@ -4,9 +4,9 @@ Between two vertices the robot is taken to move evenly; no pose is farther than 
 where that has it *at its time*. So a track answers where the robot was, and when it entered a
 region, which a path that is drawn in space alone does not. Vertices are poses.
 
-Which poses are vertices is decided in each *stretch* of the clock by itself, so it does not depend
-on how a history was cut: the first and the last pose of a stretch are vertices, and what lies
-farthest from the line between two of them is another. Poses of a table whose first or last stretch
+Which poses are vertices is decided in each *slice* of the clock by itself, so it does not depend
+on how a history was cut: the first and the last pose of a slice are vertices, and what lies
+farthest from the line between two of them is another. Poses of a table whose first or last slice
 other tables may share are all kept there until the tables are joined.
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 TOLERANCE_M: Final = 0.05
 TOLERANCE_RAD: Final = 0.15
-STRETCH_NS: Final[Ns] = 10 * NS_PER_S
+TRACK_SLICE_NS: Final[Ns] = 10 * NS_PER_S
 _SLOT_NS: Final[Ns] = NS_PER_S // 5
 """Of the poses in a slot of the clock the first and the last count: nothing bends a way between."""
 
@@ -68,10 +68,14 @@ class RobotTrack:
     fastest_mps: float = math.inf
 
     @property
+    def ends(self) -> Mask:
+        """Whether a piece ends at the vertex."""
+        return np.append(self.begins[1:], [True])[: len(self.times)]
+
+    @property
     def pieces(self) -> tuple[Times, Times]:
         """The first and the last time of each piece (ns, inclusive)."""
-        ends = np.append(self.begins[1:], [True])[: len(self.times)]
-        return self.times[self.begins], self.times[ends]
+        return self.times[self.begins], self.times[self.ends]
 
 
 class TrackPart(NamedTuple):
@@ -83,7 +87,7 @@ class TrackPart(NamedTuple):
         y: metres.
         turns: headings in whole parts of a turn, continuous from one to the next.
         known: whether the heading is known.
-        settled: whether no other pose can be in the stretch of this one.
+        settled: whether no other pose can be in the slice of this one.
         left_out: poses that could not be placed.
         recording: the folder of the recording that they are of.
     """
@@ -148,8 +152,8 @@ def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: in
     x, y = (np.rint(column[fine] * _PER_M) / _PER_M for column in (x, y))
     known = np.isfinite(heading)
     turns = np.rint(np.where(known, heading, 0.0) / math.tau * _TURN).astype(np.int64)
-    stretches = times // STRETCH_NS
-    settled = (stretches > stretches[:1].sum()) & (stretches < stretches[-1:].sum())
+    slices = times // TRACK_SLICE_NS
+    settled = (slices > slices[:1].sum()) & (slices < slices[-1:].sum())
     turns = _continuous(turns, np.zeros(len(times), np.bool_))
     part = TrackPart(times, x, y, turns, known, settled, left_out)
     return part.some(_vertices(part, keeps=~settled))
@@ -188,12 +192,12 @@ def _continuous(turns: Times, settled: Mask) -> Times:
 
 
 def _vertices(part: TrackPart, keeps: Mask) -> NDArray[np.intp]:
-    """Returns which poses are vertices: those to keep, and what their stretches need besides."""
+    """Returns which poses are vertices: those to keep, and what their slices need besides."""
     times = part.times
     if not len(times):
         return np.zeros(0, np.intp)
     kept = keeps.copy()
-    new = np.diff(times // STRETCH_NS) > 0
+    new = np.diff(times // TRACK_SLICE_NS) > 0
     kept |= np.append([True], new) | np.append(new, [True])
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
     waiting = np.flatnonzero(~kept)

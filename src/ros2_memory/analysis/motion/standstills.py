@@ -28,7 +28,7 @@ first differences; those of second order have six times the variance of the nois
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -36,7 +36,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop, speed_drops
-from ros2_memory.core.arrays import row_sums
+from ros2_memory.core.arrays import row_sums, rows_of, stacked
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -104,12 +104,6 @@ class Box3(NamedTuple):
         """The distance of its far corners."""
         return math.dist(self.low, self.high)
 
-    def united(self, other: Box3) -> Box3:
-        """Returns the box around both."""
-        (a, b, c), (d, e, f) = self
-        (g, h, i), (j, k, m) = other
-        return Box3((min(a, g), min(b, h), min(c, i)), (max(d, j), max(e, k), max(f, m)))
-
 
 class Standstill(NamedTuple):
     """A time in which the robot stood still: from its first pose there to its last (inclusive).
@@ -151,13 +145,9 @@ class Blocks:
         """Returns the number of blocks."""
         return self.numbers.size
 
-    def diagonals(self) -> Floats:
-        """Returns how far (m) the far corners of each box are apart."""
-        return _lengths(self.highs - self.lows)
-
     def are_still(self) -> Marks:
         """Returns whether drift and noise explain the boxes."""
-        found: Marks = self.diagonals() <= np.minimum(
+        found: Marks = _lengths(self.highs - self.lows) <= np.minimum(
             np.maximum(_STILL_M, 4.5 * self.noises), LARGEST_M
         )
         return found
@@ -170,10 +160,7 @@ NO_BLOCKS: Final = Blocks(_NONE, _NONE, _NONE, np.empty(0), _NOWHERE, _NOWHERE, 
 
 def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
     """Returns the blocks of stretches of time that follow each other, of which there is one."""
-    columns = [
-        np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(Blocks)
-    ]
-    return Blocks(*columns)
+    return stacked(parts)
 
 
 class Stands(NamedTuple):
@@ -195,25 +182,24 @@ class Stands(NamedTuple):
         return 1000 + 96 * len(self.blocks) + 200 * len(self.drops)
 
 
-def stands_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Stands:
+def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
     """Returns what shows where the robot stood; see `blocks_of`."""
     inside = poses.between(start, stop)
     places = inside.times[are_places(inside.positions)]
     return Stands(
-        blocks_of(poses, start, stop, goes_on=goes_on),
+        blocks_of(poses, start, stop),
         tuple(each for each in speed_drops(poses) if start <= each.time < stop),
         int(places[-1]) if places.size else MIN_NS,
     )
 
 
-def blocks_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Blocks:
+def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     """Returns the blocks of a stretch of time; chains that are surely too short have none.
 
     Args:
         poses: at least those of the stretch and `BESIDE_NS` beside it.
         start: log time (ns) where the stretch begins; blocks begin there.
         stop: where it ends, and blocks end.
-        goes_on: whether the robot may have stood before the first pose and after the last.
     """
     valid = are_places(poses.positions)
     if not valid.any():
@@ -227,17 +213,12 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns, *, goes_on: bool = False) -> Bl
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(is_last)
     edges = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
     is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
-    if goes_on:
-        is_long |= (edges[0] == 0) | (edges[1] == len(slots) - 1)
     among = np.zeros(len(slots), np.bool_)
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
         among[first + 1 : last] = True
     found = _blocks(slots, np.flatnonzero(among), np.cumsum(is_first))
-    if goes_on:
-        found.starts[found.starts == slots.times[0]] = MIN_NS
-        found.ends[found.ends == slots.times[-1]] = MIN_NS
     inside = (found.firsts >= start) & (found.firsts < stop)
-    return Blocks(*(getattr(found, each.name)[inside] for each in fields(Blocks)))
+    return rows_of(found, inside)
 
 
 def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:

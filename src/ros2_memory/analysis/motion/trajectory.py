@@ -20,6 +20,7 @@ import numpy as np
 from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_places, measured_path
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import headings, joined_poses
+from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -125,16 +126,6 @@ class Line:
         """Returns the number of vertices."""
         return self.times.size
 
-    def rows(self, which: IntArray) -> Line:
-        """Returns some vertices, in the order given."""
-        return Line(
-            self.times[which],
-            self.metres[which],
-            self.places[which],
-            self.headings[which],
-            self.jumps[which],
-        )
-
     def metres_at(self, times: IntArray) -> Floats:
         """Returns the metres driven up to some log times (ns); there must be a vertex."""
         return self._at(times, self.metres)
@@ -166,17 +157,6 @@ class Line:
         since = self.times[0]
         found: Floats = np.interp(times - since, self.times - since, values)
         return found
-
-
-def joined_lines(lines: Sequence[Line]) -> Line:
-    """Returns the vertices of some lines, one line after the other."""
-    return Line(
-        np.concatenate([line.times for line in lines]),
-        np.concatenate([line.metres for line in lines]),
-        np.concatenate([line.places for line in lines]),
-        np.concatenate([line.headings for line in lines]),
-        np.concatenate([line.jumps for line in lines]),
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,13 +194,10 @@ class PathSlice:
         """About how much memory it takes."""
         return _BYTES + 49 * len(self.line)
 
-    def trajectory(
-        self, max_waypoints: int = MAX_WAYPOINTS, tolerance_m: float = TOLERANCE_M
-    ) -> Trajectory:
+    def trajectory(self, max_waypoints: int = MAX_WAYPOINTS) -> Trajectory:
         """Returns the measurements, and the path drawn with so many waypoints at most.
 
-        It is not drawn at all for 0; else with 2 at least, within `tolerance_m` (m) where these are
-        enough.
+        It is not drawn at all for 0; else with 2 at least.
         """
         distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
         avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
@@ -231,7 +208,7 @@ class PathSlice:
         waypoints: tuple[Waypoint, ...] = ()
         error_m = 0.0
         if max_waypoints and len(self.line):
-            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m, tolerance_m)
+            waypoints, error_m = drawn(self.line, max(max_waypoints, 2), self.error_m)
         return Trajectory(
             self.totals,
             avg_speed,
@@ -244,13 +221,10 @@ class PathSlice:
         )
 
 
-def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_M) -> PathSlice:
-    """Measures and draws poses.
+def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
+    """Measures poses, which are in order, and draws them within a quarter of `TOLERANCE_M`.
 
-    Args:
-        poses: in order.
-        fastest_mps: a step that would take a higher speed is a jump.
-        tolerance_m: of the path that is drawn of slices; this one uses a quarter of it.
+    A step that would take a higher speed than `fastest_mps` is a jump.
     """
     valid = np.flatnonzero(are_places(poses.positions))
     known = poses if valid.size == len(poses) else poses.rows(valid)
@@ -268,7 +242,7 @@ def path_slice(poses: Poses, fastest_mps: float, tolerance_m: float = TOLERANCE_
                 known.positions,
                 seconds,
                 ends,
-                tolerance_m=tolerance_m / 4,
+                tolerance_m=TOLERANCE_M / 4,
                 at_most=_MOST_VERTICES,
                 of_time=_OF_TIME,
             )
@@ -311,7 +285,7 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
         jumps = some.line.jumps.copy()
         jumps[:1] |= jumped
         lines.append(replace(some.line, metres=metres, jumps=jumps))
-    line = joined_lines(lines)
+    line = stacked(lines)
     # Where two places turn out to be one, joining takes some metres back.
     metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
     twists = [some.twist for some in slices if some.twist is not None]
@@ -329,16 +303,13 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     )
 
 
-def drawn(
-    line: Line, at_most: int, error_m: float = 0.0, tolerance_m: float = TOLERANCE_M
-) -> tuple[tuple[Waypoint, ...], float]:
+def drawn(line: Line, at_most: int, error_m: float = 0.0) -> tuple[tuple[Waypoint, ...], float]:
     """Draws a line with so many waypoints at most, 2 or more; then the longest jumps alone part it.
 
     Args:
         line: of one vertex at least.
         at_most: see above.
         error_m: how far poses may be off the line.
-        tolerance_m: how far they may be off what is drawn, where so many waypoints are enough.
 
     Returns:
         The waypoints, and how far (m) poses may be off these.
@@ -348,9 +319,9 @@ def drawn(
     parted = np.sort(jumps[np.argsort(-far_m, kind="stable")[: at_most // 2 - 1]])
     ends = np.unique(np.concatenate(([0, len(line) - 1], parted - 1, parted)))
     seconds = (line.times - line.times[0]) / NS_PER_S
-    left_m = max(tolerance_m - error_m, tolerance_m / 4)
+    left_m = max(TOLERANCE_M - error_m, TOLERANCE_M / 4)
     kept, off_m = simplified(line.places, seconds, ends, tolerance_m=left_m, at_most=at_most)
-    chosen = line.rows(kept)
+    chosen = rows_of(line, kept)
     parts = (chosen.jumps & np.isin(kept, [0, *parted])).tolist()
     columns = chosen.times.tolist(), chosen.places.tolist(), chosen.headings.tolist(), parts
     waypoints = tuple(

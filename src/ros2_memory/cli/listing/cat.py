@@ -68,7 +68,7 @@ def cat(
     topic, bags = bags.with_topic(topic, "cat")
     memory = bags.memory()
     view = View(memory, Call())
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     if any(mark in topic for mark in "*?[") and topic not in timeline.types:
         matched = match_topics(timeline.topics(), topic)
         some = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
@@ -111,10 +111,10 @@ def _extracted(
     Raises:
         InvalidArgumentsError: the first message that has another value has no such field.
     """
-    extractor, left_out = view.memory.extractor, 0
+    extractor, left_out = view.extractor, 0
     is_checked = False
     for stored in messages:
-        message, type_name = view.bags.decode(stored), stored.record.channel.type
+        message, type_name = view.bags.decode(stored), stored.type
         if message is None:
             left_out += 1
             continue

@@ -64,8 +64,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.places.scope import times_in_region
-from ros2_memory.places.where import parse_where
+from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier

@@ -19,7 +19,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import local_track
-from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 
 if TYPE_CHECKING:

@@ -91,7 +91,7 @@ def _numbers(view: View, topic: str, field: str, window: TimeWindow, width: Ns) 
     """Returns the numbers of a field, of times that no edge of a bin cuts, in order."""
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
-        for first, last in view.snapshot.timeline.recordings(topic).values()
+        for first, last in view.timeline.recordings(topic).values()
         if window.overlaps(first, last)
     ]
     if not inside:

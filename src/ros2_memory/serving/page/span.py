@@ -39,7 +39,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.saved_moments import list_moments
 from ros2_memory.insights.status import memory_status
 from ros2_memory.places.local_map import local_track
-from ros2_memory.places.robot_places import robot_places
+from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import data_time_range
 from ros2_memory.serving.page.signals import Signal, signal_in

@@ -17,7 +17,7 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.no_data import topics_of_robot, topics_that_show_poses, topics_with
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
-from ros2_memory.insights.type_fields import fields_of
+from ros2_memory.insights.fields import fields_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -50,7 +50,7 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
         QueryTimeoutError: the call's time is over.
     """
     view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
-    topics = view.snapshot.timeline.topics()
+    topics = view.timeline.topics()
     rows: list[JsonValue] = [
         {
             "topic": topic,
@@ -77,7 +77,7 @@ def _newest_type(view: View, topic: str) -> tuple[str, Census]:
 
 def _rate(view: View, topic: str) -> float | None:
     """Returns how often (Hz) a topic speaks while it is recorded; None for a single message."""
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     spans = timeline.recordings(topic)
     length = sum(last - first for first, last in spans.values())
     count = sum(total.messages for total in timeline.totals(topic).values())
@@ -88,7 +88,7 @@ def _rate(view: View, topic: str) -> float | None:
 
 def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:
     """Returns how many messages each bin of a window has."""
-    extents = [*view.snapshot.timeline.extents(topic, window)]
+    extents = [*view.timeline.extents(topic, window)]
     held = sum(known.count for each in extents for known in each.bag.summary.of(topic))
     width = max((window.stop - window.start) // BINS, 1)
     longest = max((each.last - each.first for each in extents), default=0)
@@ -121,7 +121,7 @@ def _numbers(view: View, topic: str) -> list[str]:
     message = view.bags.decode(found)
     if message is None:
         return []
-    value = view.memory.extractor.exact(message, found.record.channel.type)
+    value = view.extractor.exact(message, found.type)
     numbers = [path or "data" for path, kind in fields_of(value) if kind in _PLOTTED]
     return numbers[:MOST_NUMBERS]
 

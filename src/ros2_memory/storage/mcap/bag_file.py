@@ -401,41 +401,6 @@ class McapBags:
         time, _, place, data = best
         return _fetch_from_chunk(data, wanted, self._uncompressed)(place, time)
 
-    def log_times(self, path: Path, topic: str, window: TimeWindow) -> list[Ns]:
-        """Returns the log times of a topic's messages inside the window, ascending.
-
-        They are compared with the messages if the chunks take no more than `_VERIFIED_BYTES`.
-        """
-        with OpenFile(path) as file:
-            index = self._index(file)
-            try:
-                columns = self._columns(file, index, topic, window)
-            except _ContradictedError as error:
-                index = self._distrust(file, error)
-                columns = self._columns(file, index, topic, window)
-        parts = [column.between(window.start, window.stop).times for column in columns]
-        if window.empty or not parts:
-            return []
-        times: list[Ns] = np.sort(np.concatenate(parts)).tolist()
-        return times
-
-    def _columns(
-        self, file: OpenFile, index: McapIndex, topic: str, window: TimeWindow
-    ) -> list[Column]:
-        """Returns the messages of a topic: all loose ones, and those of overlapping chunks."""
-        wanted = _wanted(index, {topic})
-        columns = [index.loose[channel] for channel in wanted if channel in index.loose]
-        chunks = list(self._chunks_with(file, index, wanted, window))
-        verify = sum([chunk.length for chunk in chunks]) <= _VERIFIED_BYTES
-        for chunk in chunks:
-            held = chunk.channels.intersection(wanted)
-            # What is cached was compared when it was read: the records need not be decompressed.
-            known = [self._indexes.get((file.key, chunk.offset, each)) for each in held]
-            is_new = verify and not all(isinstance(each, Column) for each in known)
-            data = self._readable_data(file, chunk) if is_new else None
-            columns += self._chunk_columns(file, chunk, wanted, data)
-        return columns
-
     def _runs(
         self,
         file: OpenFile,

@@ -52,11 +52,10 @@ def summarise(
     poses: Iterable[tuple[int, Pose, float | None]],
     max_plausible_speed_mps: float,
     max_waypoints: int = 50,
-    tolerance_m: float = TOLERANCE_M,
     cuts: Sequence[int] | None = None,
 ) -> Trajectory:
     way = way_of(arrays(poses), max_plausible_speed_mps, cuts)
-    return way.trajectory(max_waypoints, tolerance_m)
+    return way.trajectory(max_waypoints)
 
 
 def arrays(poses: Iterable[tuple[int, Pose, float | None]]) -> Poses:
@@ -289,13 +288,11 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.totals.jumps
 
 
-@given(st.lists(points, min_size=1, max_size=60), st.floats(0.01, 100.0))
-def test_enough_waypoints_stay_within_the_tolerance(
-    positions: list[Vector3], tolerance_m: float
-) -> None:
-    found = summarise(driven(positions), LIMIT_MPS, 1000, tolerance_m)
-    assert found.waypoint_error_m <= tolerance_m * (1 + 1e-9)
-    assert farthest_off(positions, found) <= tolerance_m + 1e-7
+@given(st.lists(points, min_size=1, max_size=60))
+def test_enough_waypoints_stay_within_the_tolerance(positions: list[Vector3]) -> None:
+    found = summarise(driven(positions), LIMIT_MPS, 1000)
+    assert found.waypoint_error_m <= TOLERANCE_M * (1 + 1e-9)
+    assert farthest_off(positions, found) <= TOLERANCE_M + 1e-7
 
 
 @given(st.lists(points, min_size=2, max_size=60))

@@ -357,7 +357,7 @@ def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause:
     # Bags that are not thinned show how often the topics have a message.
     drive_and_stand(bag_dir, "rec_C", 4000)
     own_all(bag_dir)
-    whole = {
+    whole: dict[str, dict[str, Any]] = {
         "recap": {"start": T0 / S, "end": T0 / S + 119.9},
         "get_topic_in_range": {
             "topic": "/bumper",

@@ -1,23 +1,33 @@
-"""The fields that replies show of a message type, as the dot-paths that tools take."""
+"""Fields of messages, as the dot-paths that tools take: which a type has, and their extremes."""
 
 from __future__ import annotations
 
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
+from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers, TooManyError
+from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import open_view
-from ros2_memory.results import TypeFields
+from ros2_memory.results import Extremes, TypeFields
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.view import View
 
 MAX_FIELDS: Final = 100
+MAX_MESSAGES: Final = 4_000
+"""How many one question reads where columns do not hold a field: minutes of odometry, an hour of a
+slow topic."""
+
+TOO_MANY: Final = "the window has too many messages to compute extremes: ask for a shorter one"
 
 
 def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
@@ -27,7 +37,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         NoDataError: no topic was recorded under the type, or none of its messages can be decoded.
     """
     view = open_view(memory, call, memory.clock.now())
-    timeline = view.snapshot.timeline
+    timeline = view.timeline
     topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:
         known = sorted(set(chain.from_iterable(timeline.types.values())))
@@ -38,7 +48,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     failure = ""
     for topic in topics:
         found = view.stream.newest(topic, TimeWindow.everything())
-        if found is None or found.record.channel.type != type_name:
+        if found is None or found.type != type_name:
             continue
         try:
             message = memory.reader.decode(found.record)
@@ -77,3 +87,38 @@ def _kind(value: JsonValue) -> str:
     if isinstance(value, str):
         return "text"
     return "number"
+
+
+def extremes_of(
+    view: View, topic: str, window: TimeWindow, fields: Sequence[str]
+) -> tuple[Extremes, ...]:
+    """Returns the extremes of each of the fields (dot-paths) that holds numbers.
+
+    None, with a note, where more than `MAX_MESSAGES` would have to be read from bags. Messages that
+    cannot be decoded do not count, nor do NaN and infinities.
+
+    Args:
+        view: the call's.
+        topic: its name.
+        window: of log time.
+        fields: dot-paths.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    names = tuple(dict.fromkeys(fields))
+    whole = np.empty(0, np.int64)
+    found = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
+    try:
+        found.collect(window)
+    except TooManyError:
+        view.notes.add(TOO_MANY)
+        return ()
+    if found.since is not None:
+        view.notes.add_lack(f"out of time: extremes are of what is after {unix_text(found.since)}")
+    extremes = []
+    for nth, field in enumerate(names):
+        least, most = (found.extreme(nth, [0], sign) for sign in (LEAST, GREATEST))
+        if least is not None and most is not None:
+            extremes.append(Extremes(field, *least, *most))
+    return tuple(extremes)
