@@ -1,58 +1,274 @@
-"""A recorder on a small budget, with `memory.keep`: deleted splits are answered from memory."""
+"""The whole system over real DDS: a robot drives, is recorded, and is asked about while it drives.
+
+Three recorders record the same drive, each with a server of its own: one rotates, one has its
+recorder process killed and is restarted later, and one, with splits of 10 s, is killed whole.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 
-from ros2_memory.bag_dir.layout import is_thinned
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.live_recorder import NS_PER_S, answer, answering, closed_files, machine
+from tests.support.closed_form import position
+from tests.support.live_recorder import (
+    NS_PER_S,
+    RECORDED_TOPICS,
+    Answer,
+    LiveRecorder,
+    answering,
+    answers,
+    await_answerable,
+    await_moment,
+    bag_files,
+    closed_files,
+    machine,
+    stamp_of,
+    ticks,
+)
 from tests.support.ros_processes import (
-    RECORDERS,
-    installation,
+    Robot,
     publishing_robot,
+    real_or_double,
     ros_environment,
 )
+from tests.timing import Watch, driven
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.support.real_recorder import RealRecorder
+    from tests.integration.test_server_process import Served
+    from tests.support.live_recorder import Machine
+
+HZ: Final = 50.0
+AGO_S: Final = 10
+VISION: Final = "/vision/scene/scene_objects"
+TEN_S_AGO: Final = ("get_position_seconds_ago", {"seconds_ago": AGO_S})
+TRAVELLED: Final = 0.05  # m: how far from the closed form an answer may be
 
 
-@pytest.fixture(params=RECORDERS)
-def installed(request: pytest.FixtureRequest) -> RealRecorder | None:
-    return installation(request)
+@dataclass
+class Drive:
+    """What came of it."""
+
+    watch: Watch
+    rotating: LiveRecorder
+    killed: LiveRecorder
+    ten: LiveRecorder
+    t0: int = 0
+    published: dict[str, int] = field(default_factory=dict)
+    positions: dict[str, Answer] = field(default_factory=dict)
+    """Replies about 10 s ago, by what had happened before."""
+    cups: tuple[int, Any, int] = (0, None, 0)
+    """Seconds at which a cup was seen last: by the bags before, as answered, by the bags after."""
+    scissors: dict[str, Any] = field(default_factory=dict)
+    topics: list[dict[str, Any]] = field(default_factory=list)
+    totals: dict[str, int] = field(default_factory=dict)
+    after: dict[str, Any] = field(default_factory=dict)
+    """`data_time_range` of each memory at the end."""
 
 
-def test_positions_of_deleted_splits_are_answered_from_memory(
-    installed: RealRecorder | None, tmp_path: Path
-) -> None:
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Drive:
+    return driven(lambda watch: drive_once(tmp_path_factory.mktemp("live"), watch), judge)
+
+
+def judge(drive: Drive) -> None:
+    """All that holds where programs run in time: the robot's, the recorders' in a handover."""
+    for what in AFTER:
+        is_right(drive, what)
+    is_the_last_cup(drive)
+    counts_once(drive)
+    is_not_moved(drive)
+    for name in drive.after:
+        all_answers(drive, name)
+
+
+def drive_once(folder: Path, watch: Watch) -> Drive:
+    options = ("--hz", f"{HZ:g}", "--subscribers", "3")
     with (
-        ros_environment(tmp_path, real=installed) as env,
-        machine(tmp_path, env) as site,
-        publishing_robot(env, tmp_path / "truth.json", "--topics", "/odom", "--hz", "50"),
+        ros_environment(folder, real=real_or_double()) as env,
+        machine(folder, env) as site,
+        # It is there, and silent, before any of them rotates.
+        publishing_robot(env, folder / "truth.json", *options) as robot,
+        ExitStack() as stack,
     ):
-        recorder = site.record(
-            "year",
-            "memory.keep=true",
-            "recording.split_duration_s=2",
-            "recording.session_duration_s=6",
-            "retention.max_total_gb=0.0003",
-            topics=["/odom"],
+        # Once the robot drives nothing else should be busy starting.
+        served = {
+            name: stack.enter_context(answering(site.bag_dir(name), folder / f"{name}.log"))
+            for name in ("rotating", "killed", "ten")
+        }
+        short = "recording.split_duration_s=2"
+        drive = Drive(
+            watch,
+            site.record("rotating", short, "recording.session_duration_s=7"),
+            site.record("killed", short),
+            site.record("ten", "recording.split_duration_s=10"),
         )
-        recorder.wait_for("memory_kept", 2)
+        _drive(drive, site, served, robot)
+        return drive
+
+
+def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot) -> None:
+    drive.t0 = robot.t0
+
+    def ask(name: str, what: str) -> None:
+        (drive.positions[what],) = answers(served[name], TEN_S_AGO)
+
+    await_moment(drive.t0 + 3 * NS_PER_S)
+    drive.killed.kill_child()
+    drive.killed.wait_for_subscriptions()
+    child_is_back = max(drive.killed.subscribed_all().values())
+
+    await_moment(drive.t0 + 12 * NS_PER_S)
+    ask("ten", "12 s, in splits of 10 s")
+    ask("rotating", "12 s, in splits of 2 s")
+    drive.cups = _cups(drive, served["ten"])
+    drive.ten.kill(with_children=False)
+    drive.ten = site.record("ten", "recording.split_duration_s=10")
+
+    drive.rotating.wait_for("rotated", 3)
+    await_answerable(served["killed"], child_is_back)
+    await_moment(child_is_back + 12 * NS_PER_S)
+    ask("rotating", "rotations")
+    ask("killed", "a killed recorder")
+    drive.killed.stop()
+    drive.killed = site.record("killed", "recording.split_duration_s=2")
+    drive.killed.wait_for_subscriptions()
+    ask("killed", "a restart")
+
+    drive.ten.wait_for_subscriptions()
+    daemon_is_back = max(drive.ten.subscribed_all().values())
+    await_answerable(served["ten"], daemon_is_back)
+    await_moment(daemon_is_back + 12 * NS_PER_S)
+    ask("ten", "a killed daemon")
+
+    drive.published = robot.stop()
+    drive.watch.report("the robot", robot.late_s)
+    for recorder in (drive.rotating, drive.killed, drive.ten):
         recorder.stop()
-    kept = recorder.events("memory_kept")
-    assert all(each["messages"] for each in kept)
-    reader = McapReader()
-    paths = [path for path in closed_files(recorder.bag_dir) if not is_thinned(path)]
-    left = [summary for summary in map(reader.summarize, paths) if not summary.empty]
-    with answering(recorder.bag_dir, site.folder / "server.log") as served:
-        earliest = answer(served, "data_time_range")["earliest"]
-        assert (earliest + 1) * NS_PER_S < min(summary.start for summary in left)
-        reply = answer(served, "get_position_at", timestamp=earliest + 1)
-    assert (reply["from"], reply["resolution_s"]) == ("memory", 1)
-    assert earliest <= reply["timestamp"] <= earliest + 1
+    _look_back(drive, served)
+
+
+def _look_back(drive: Drive, served: dict[str, Served]) -> None:
+    """Asks about the whole drive after its end."""
+    found = ("find_last_match", {"topic": "/vision/*/scene_objects"} | _contains("scissors"))
+    for name in ("rotating", "killed"):
+        drive.scissors[name] = answers(served[name], found)[0].reply
+    span = {"start": drive.t0 / NS_PER_S - 60, "end": drive.t0 / NS_PER_S + 600, "max_samples": 2}
+    totals = [("get_topic_in_range", {"topic": topic, **span}) for topic in RECORDED_TOPICS]
+    listed, *counted = answers(served["rotating"], ("list_recorded_topics", {}), *totals)
+    drive.topics = listed.reply
+    drive.totals = {reply.reply["topic"]: reply.reply["total"] for reply in counted}
+    for name, server in served.items():
+        drive.after[name] = answers(server, ("data_time_range", {}))[0].reply
+
+
+def _contains(label: str) -> dict[str, Any]:
+    return {"condition_type": "contains", "value": label, "fields": "header.stamp"}
+
+
+def _cups(drive: Drive, server: Served) -> tuple[int, Any, int]:
+    def by_the_bags() -> int:
+        reader, newest = McapReader(), 0
+        for bag in closed_files(drive.ten.bag_dir):
+            for record in reader.records(bag, [VISION], TimeWindow.everything()):
+                message = reader.decode(record)
+                labels = [seen.label for seen in getattr(message, "detections", [])]
+                newest = max(newest, stamp_of(message) if "cup" in labels else 0)
+        return newest
+
+    before = by_the_bags()
+    found = ("find_last_match", {"topic": "/vision/*/scene_objects"} | _contains("cup"))
+    (reply,) = answers(server, found)
+    return before, reply.reply, by_the_bags()
+
+
+def _stamp(told: Any) -> int:
+    """The header stamp in a reply, in ns: those of the robot are whole milliseconds."""
+    milliseconds: float = told["value"]["header.stamp"] * 1000
+    return round(milliseconds) * 10**6
+
+
+AFTER: Final = (
+    "12 s, in splits of 10 s",
+    "12 s, in splits of 2 s",
+    "rotations",
+    "a killed recorder",
+    "a restart",
+    "a killed daemon",
+)
+
+
+@pytest.mark.parametrize("what", AFTER)
+def test_where_the_robot_was_10_s_ago_is_right_after(drive: Drive, what: str) -> None:
+    with drive.watch.excusing():
+        is_right(drive, what)
+
+
+def is_right(drive: Drive, what: str) -> None:
+    told, asked, answered = drive.positions[what]
+    assert "age_s" in told, told
+    now = told["timestamp"] + told["age_s"]  # in whole milliseconds
+    assert asked - 0.002 <= now <= answered + 0.002
+    x, y = position(now - AGO_S - drive.t0 / NS_PER_S)
+    assert math.hypot(told["x"] - x, told["y"] - y) <= TRAVELLED
+
+
+@pytest.mark.parametrize("name", ["rotating", "killed"])
+def test_scissors_were_last_seen_when_the_robot_last_published_them(
+    drive: Drive, name: str
+) -> None:
+    assert _stamp(drive.scissors[name]) == drive.t0 + 17 * NS_PER_S
+
+
+def test_the_last_cup_is_that_of_the_newest_closed_split(drive: Drive) -> None:
+    with drive.watch.excusing():
+        is_the_last_cup(drive)
+
+
+def is_the_last_cup(drive: Drive) -> None:
+    before, told, after = drive.cups
+    assert told is not None
+    assert "value" in told, told
+    assert _stamp(told) in {before, after}
+
+
+def test_over_three_rotations_every_message_that_was_sent_counts_once(drive: Drive) -> None:
+    assert len(drive.rotating.events("rotated")) >= 3
+    with drive.watch.excusing():
+        counts_once(drive)
+
+
+def counts_once(drive: Drive) -> None:
+    assert {row["topic"]: row["count"] for row in drive.topics} == drive.published
+    assert drive.totals == drive.published
+
+
+def test_over_three_rotations_no_message_is_moved(drive: Drive) -> None:
+    with drive.watch.excusing():
+        is_not_moved(drive)
+
+
+def is_not_moved(drive: Drive) -> None:
+    files = bag_files(drive.rotating.bag_dir)
+    found = ticks(files, drive.t0, HZ)
+    assert [tick.number for tick in found] == list(range(drive.published["/odom"]))
+    assert len(ticks(files, drive.t0, HZ, counting=False)) > len(found)
+
+
+@pytest.mark.parametrize("name", ["rotating", "killed", "ten"])
+def test_in_the_end_no_file_is_left_that_does_not_answer(drive: Drive, name: str) -> None:
+    # A recorder that does not get to close its files is killed in the end.
+    with drive.watch.excusing():
+        all_answers(drive, name)
+
+
+def all_answers(drive: Drive, name: str) -> None:
+    aside = ("active", "damaged", "incomplete", "unread")
+    assert {kind: drive.after[name][kind] for kind in aside} == {key: [] for key in aside}

@@ -175,6 +175,12 @@ def _explains_otherwise(recorded: Any, got: Any) -> bool:
     return _BRACKETS.sub("", str(recorded)) == _BRACKETS.sub("", str(got))
 
 
+def _names_frames_otherwise(recorded: Any, got: Any) -> bool:
+    """Whether the frame of a place, and those of the robot, are the same in other words."""
+    before = re.search(r'frame_id was (".*?"); places are in (.*?); get_trans', str(recorded))
+    return before is not None and all(frame in str(got) for frame in before.groups())
+
+
 def _notes_no_gaps(recorded: Any, got: Any) -> bool:
     """Whether sentences on gaps are all that is gone."""
     kept = got if isinstance(got, list) else []
@@ -394,6 +400,13 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         "*/duration_s",
         "a state lasts to the last message that said so, not to the one that says otherwise",
         only=_is_longer,
+    ),
+    KnownWrong(
+        "*",
+        "*",
+        "*",
+        "it is the place that is in another frame than the robot, and not the other way round",
+        only=_names_frames_otherwise,
     ),
 )
 """What is known to be wrong in the program that was recorded, as narrowly as can be said."""
