@@ -17,7 +17,7 @@ from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.intervals import IntervalPart, joined, united, visible_in
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.spans import united as united_spans
-from ros2_memory.core.text import named
+from ros2_memory.core.text import listed, named
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
@@ -44,6 +44,7 @@ BY_LABEL: Final = "label"
 ANY_LABEL: Final = ""
 """What `contains` takes for every label."""
 _MOST_LABELS: Final = 60
+_TEXT: Final = "std_msgs/msg/String"
 _COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
     ("count", "count"),
     ("seconds", "duration"),
@@ -96,6 +97,12 @@ def count_labels(
         view.notes.add(
             f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
             "or without messages of the other topic"
+        )
+    texts = [topic for topic in topics if view.timeline.types_of(topic) == (_TEXT,)]
+    if texts and not rows:
+        view.notes.add(
+            f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
+            "label or a list of such, and nothing deeper; leave by out to search texts"
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")

@@ -164,3 +164,15 @@ def test_a_topic_without_detections_has_no_rows(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(BEGIN * S, "cup")])
     reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **{**ANY, "topic": "/chatter"})
     assert reply["rows"] == []
+
+
+@pytest.mark.parametrize(
+    ("said", "rows"),
+    [('[{"label": "cup"}]', 1), ('{"seen": [{"label": "cup"}]}', 0), ("a cup", 0)],
+)
+def test_texts_that_show_nothing_are_named(tmp_path: Path, said: str, rows: int) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(BEGIN * S, said)])
+    every = {"condition_type": "contains", "value": "", "by": "label"}
+    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", topic="/chatter", **every)
+    assert len(reply["rows"]) == rows
+    assert any("/chatter has texts" in note for note in reply["notes"]) == (not rows)
