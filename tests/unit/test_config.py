@@ -73,6 +73,7 @@ class TestDefaults:
                 "max_moments_gb": 1.0,
                 "foreign": "keep",
                 "require_shipped": False,
+                "topics": {},
             },
             "memory": {
                 "keep": False,

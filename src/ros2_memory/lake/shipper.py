@@ -432,7 +432,7 @@ def _is_cut(robot: RobotBags, bag: BagFile, before: ShippedBag | None) -> bool:
 
     The lake keeps those, as it keeps the bags that retention deletes.
     """
-    if before is None:
+    if before is None or before.size == bag.size:
         return False
     receipt = read_receipts(robot.bag_dir).get(before.file)
     return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
