@@ -111,7 +111,9 @@ class Rhythm:
         if any(is_thinned(bag.file) for bag in pause.bags):
             # There each topic has a message in every slot of 7 s, or as often as it had.
             return pause.length > _LONGEST_LEAST_NS
-        several = all(len(self._periods_of(bag)) > 1 for bag in pause.bags)
+        # In the split after a stall one topic may still be silent.
+        enough = any if pause.ran_on else all
+        several = enough(len(self._periods_of(bag)) > 1 for bag in pause.bags)
         if several and pause.length > _GAP_PERIODS * self._slower(pause):
             return True
         if len(pause.bags) == 1:
@@ -122,7 +124,7 @@ class Rhythm:
 
     def _slower(self, pause: Pause) -> Ns:
         """Returns the period of the second most frequent topic, or of the only one, in the bags."""
-        return max(self._periods_of(bag)[-1] for bag in pause.bags)
+        return max(known[-1] for known in map(self._periods_of, pause.bags) if known)
 
     def _periods_of(self, bag: BagFile) -> list[Ns]:
         """Returns the shortest two usual periods of topics in a bag, as far as it has them."""
