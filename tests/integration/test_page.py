@@ -86,6 +86,8 @@ def chromium(scratch: Path) -> Iterator[Browser]:
 def page(chromium: Browser, served: Served) -> Iterator[Browser]:
     """The page with everything shown; what it complains of fails the test."""
     chromium.looks(width=1200, height=900)
+    # Of a page before, whose server may have ended.
+    chromium.open("about:blank")
     chromium.complaints()
     show(chromium, served)
     yield chromium

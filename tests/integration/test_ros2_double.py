@@ -84,6 +84,9 @@ def session(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
         assert session.active_bytes == 0
         assert len(session.small.splits()) == SPLITS
         assert {topic for topic, *_ in messages(session.late)} == set(TOPICS)
+        # That it had subscribed when the drive began; the late one counts as a subscriber, too.
+        recorded = [topic for topic, *_ in messages(session.default)]
+        assert recorded.count("/odom") == session.published["/odom"]
         found.append(session)
 
     in_time(once)
