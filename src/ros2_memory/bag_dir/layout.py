@@ -60,10 +60,10 @@ ERASING_FILE: Final = f"{OWN_FOLDER}/erasing.json"
 TRIGGERS_FILE: Final = f"{OWN_FOLDER}/triggers.json"
 SCREENED_FILE: Final = f"{OWN_FOLDER}/screened.json"
 SHIPPED_FILE: Final = f"{OWN_FOLDER}/shipped.jsonl"
+SUPERSEDED_FILE: Final = f"{OWN_FOLDER}/superseded.json"
 FORGOTTEN_FILE: Final = f"{OWN_FOLDER}/forgotten.jsonl"
 DELETED_FILE: Final = f"{OWN_FOLDER}/deleted.jsonl"
 EXPIRED_FILE: Final = f"{OWN_FOLDER}/expired.json"
-KEPT_FILE: Final = f"{OWN_FOLDER}/kept.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""

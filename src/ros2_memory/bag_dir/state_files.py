@@ -4,7 +4,7 @@
     lost.jsonl         the recorder, `forget`: messages that are in no bag, for the notes of answers
     expired.json       the recorder: messages that `retention.topics` takes out of bags, likewise
     deleted.jsonl      the recorder: what retention deletes, so that nobody calls it lost
-    kept.json          the recorder: bags of which thinned days have what stays, for the index
+    superseded.json    the recorder: bags of which thinned days have what stays, for the index
     shipped.jsonl      `ship`: which bags are in a lake, for retention
     forgotten.jsonl    `forget`: what is deleted here, for the lake that may have it
     erasing.json       `forget`: messages that are being taken out of bags
@@ -33,11 +33,11 @@ from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
     EXPIRED_FILE,
     FORGOTTEN_FILE,
-    KEPT_FILE,
     LOST_FILE,
     RECORDED_FILE,
     SCREENED_FILE,
     SHIPPED_FILE,
+    SUPERSEDED_FILE,
     TRIGGERS_FILE,
     has_own_name,
 )
@@ -264,11 +264,11 @@ def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     return tuple(united(every, _TOUCHING_NS))
 
 
-# kept.json
+# superseded.json
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class Superseded:
     """Bags that no longer count, since thinned days have what stays of them.
 
     A kill may leave them there. One does count until its day is as it is listed.
@@ -283,17 +283,17 @@ class Kept:
     bags: dict[str, str] = field(default_factory=dict)
 
 
-KEPT: Final = JsonDocument(KEPT_FILE, Kept)
+SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded)
 
 
-@until_changed(KEPT_FILE)
-def _kept(bag_dir: Path) -> Kept | None:
-    return KEPT.read(bag_dir)
+@until_changed(SUPERSEDED_FILE)
+def _superseded(bag_dir: Path) -> Superseded | None:
+    return SUPERSEDED.read(bag_dir)
 
 
-def read_kept(bag_dir: Path) -> Kept:
+def read_superseded(bag_dir: Path) -> Superseded:
     """Returns the bags that no longer count; none where the file cannot be read."""
-    return _kept(bag_dir) or Kept()
+    return _superseded(bag_dir) or Superseded()
 
 
 # shipped.jsonl

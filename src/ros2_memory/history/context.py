@@ -409,7 +409,7 @@ class Notes:
                 self._notes[note.kind, note.file] = note
 
     def add_lack(self, note: str | Note) -> None:
-        """Adds a note on what bears on the answer and could not be read."""
+        """Adds a note on data that the answer needs and that could not be read."""
         self.complete = False
         self.add(note)
 

@@ -142,7 +142,7 @@ def pick(
 
 
 def _times_in(opened: Scan, window: TimeWindow) -> IntArray:
-    """Returns the log times of the messages in a part of what a scan is of, in order."""
+    """Returns the log times (ns) of the messages in a stretch of a scan, in order."""
     every = [np.empty(0, np.int64), *(rows.times for rows in opened.rows(among=window))]
     times = np.concatenate(every)
     return np.sort(times[(times >= window.start) & (times < window.stop)])

@@ -253,7 +253,7 @@ class PoseSlice:
         return joined_poses([block.poses.between(start, stop) for block in self._blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
-        """Returns what the poses are told apart by; None where not all are of whole parts."""
+        """Returns the key of the poses in memory; None where not all are of whole parts."""
         parts: list[int] = []
         for block in self._blocks:
             if block.parts is None:

@@ -59,7 +59,7 @@ class Wanted(TypedDict, total=False):
 
 
 class How(Wanted, total=False):
-    """What `open_scan` may be told."""
+    """The options of `open_scan`."""
 
     columns: bool
     copies: bool

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.bag_dir.layout import COMPRESSED, other_form
-from ros2_memory.bag_dir.state_files import read_kept
+from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
@@ -172,14 +172,18 @@ class BagTable:
 
     def _counting(self) -> Timeline:
         """Returns the bags without those of which thinned days have what stays, if there are."""
-        kept = read_kept(self._bag_dir)
-        days = {name: self._bag(name) for name in kept.days}
+        superseded = read_superseded(self._bag_dir)
+        days = {name: self._bag(name) for name in superseded.days}
         whole = {
             name
             for name, day in days.items()
-            if day is not None and (day.size, day.mtime_ns) == kept.days[name]
+            if day is not None and (day.size, day.mtime_ns) == superseded.days[name]
         }
-        bags = [*filter(None, (self._bag(name) for name, day in kept.bags.items() if day in whole))]
+        bags = [
+            *filter(
+                None, (self._bag(name) for name, day in superseded.bags.items() if day in whole)
+            )
+        ]
         return self._timeline.changed(bags, ()) if bags else self._timeline
 
     def _bag(self, name: str) -> BagFile | None:

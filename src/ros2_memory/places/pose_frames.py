@@ -225,7 +225,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         known = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)} (as asked, or of a place), and where the robot "
-            f"was is known in {known} only: ask for that, or give the place this frame"
+            f"was is known in {known} only: ask in that frame, or make it the `frame` of the place"
         )
     return placement
 

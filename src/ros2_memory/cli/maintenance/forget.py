@@ -448,7 +448,7 @@ class _Forget:
                 self._bag_dir, [deleted_of(self._name(path), of) for path, of in splits.items()]
             )
         except OSError as error:
-            kept.append(f"a note of what was deleted: {error.strerror or error}")
+            kept.append(f"the list of deleted bags: {error.strerror or error}")
 
     def _delete_files(self, bags: Sequence[BagFile], kept: list[str]) -> tuple[list[BagFile], int]:
         """Deletes bags in every form; returns which, and their bytes; adds faults to `kept`."""

@@ -20,7 +20,7 @@ import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import ERASING_FILE, MEMORY_FOLDER, memory_file, utc_day
-from ros2_memory.bag_dir.state_files import KEPT, Kept, read_kept
+from ros2_memory.bag_dir.state_files import SUPERSEDED, Superseded, read_superseded
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
@@ -113,7 +113,7 @@ class MemoryDays:
         writer: writes the days.
         own: lists the days as the recorder's own.
         extractor: has the schema map, by which detections are found.
-        limits: what may stay; None: nothing, also of what is there.
+        limits: which messages stay; None: none, and the days that exist are deleted.
         static_topics: topics that are latched whatever their publishers declare.
     """
 
@@ -344,12 +344,14 @@ class MemoryDays:
         self._own.hold(self._folder, [path.name])
         name = str(path.relative_to(bag_dir))
         beside = self._write_beside(path, self._joined(path, records))
-        status, before = beside.stat(), read_kept(bag_dir)
+        status, before = beside.stat(), read_superseded(bag_dir)
         # Those that could not be deleted yet.
         left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
         listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
         days = {known: before.days[known] for known in {*left.values()} - {name}}
-        KEPT.write(bag_dir, Kept({**days, name: (status.st_size, status.st_mtime_ns)}, listed))
+        SUPERSEDED.write(
+            bag_dir, Superseded({**days, name: (status.st_size, status.st_mtime_ns)}, listed)
+        )
         beside.replace(path)
         flush(self._folder)
         flush(bag_dir)
