@@ -413,7 +413,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     known, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in known:
         return known[key]
-    if sessions_of(view).are_joined(*pair):
+    if sessions_of(view).are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
         return False
     wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)
@@ -422,6 +422,14 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     if view.notes.added == noted:  # else something could not be read, and may be next time
         known[key] = differ
     return differ
+
+
+def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
+    """Whether a recording may have bags in a window: with a clock that was not set, it spans years."""
+    folder = str(recording)
+    segments = view.timeline.segments_in(window)
+    spans = (segment.folder_spans[folder] for segment in segments if folder in segment.folders)
+    return any(window.overlaps(*span) for span in spans)
 
 
 def _differ_in(

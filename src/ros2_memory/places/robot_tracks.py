@@ -490,10 +490,12 @@ class _Pieces(NamedTuple):
 def _by_robot(found: Sequence[TrackPart]) -> list[list[TrackPart]]:
     """Returns the parts of the track in order of time, and of others what lies beside it.
 
-    Where several recordings place a robot at a time, that which began first is in the track.
+    Where several recordings place a robot at a time, that which began first is in the track; of
+    those that began at one time the first by name.
     """
     parts = sorted(
-        (part for part in found[::-1] if len(part.times)), key=lambda part: int(part.times[0])
+        (part for part in found[::-1] if len(part.times)),
+        key=lambda part: (int(part.times[0]), part.recording),
     )
     by_recording: dict[str, list[TrackPart]] = defaultdict(list)
     for part in parts:

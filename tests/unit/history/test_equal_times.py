@@ -47,6 +47,7 @@ QUESTIONS: Final[Sequence[tuple[str, dict[str, Any]]]] = [
     ("get_topic_in_range", {"topic": "/chatter", "max_samples": 9}),
     ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x"], "by": "hour"}),
     ("trajectory_summary", {}),
+    ("visits", {"x": 1.0, "y": 0.0, "radius_m": 0.5}),
     ("recap", {}),
 ]
 
@@ -147,6 +148,8 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
 @example(seed=35, part=0.5, has_types=False)
 @example(seed=6, part=0.5, has_types=True)
 @example(seed=321, part=1.0, has_types=True)
+@example(seed=1136, part=1.0, has_types=False)
+@example(seed=2261696819, part=0.5, has_types=True)
 def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
     seed: int, part: float, has_types: bool
 ) -> None:
