@@ -34,7 +34,7 @@ from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.fill import Batch, Filling
     from ros2_memory.core.model import BagFile
@@ -54,8 +54,6 @@ PRUNE_INTERVAL_S: Final = 600.0
 
 LONGEST_TURN_S: Final = 600.0
 """How long one of several stores is filled before it is the next one's turn."""
-_WRITTEN_TOGETHER: Final = 8
-"""Slices of the clock of which what follows is written at once."""
 _AGAIN: Final = 4
 """Slices of the clock of which what follows is made again in a round."""
 _LATELY: Final = 4
@@ -192,23 +190,33 @@ def make_fragments(
         TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
         for number in sorted(touched, reverse=True)
     ]
-    for nth, window in enumerate([*windows, *stretches], 1):
+    pieces = [piece for window in windows for piece in _pieces_of(window)]
+    unwritten: Ns = 0
+    for nth, window in enumerate([*pieces, *stretches]):
         try:
             view = View(memory, Call(stored=True))
             make_statics(view, window)
             make_drive(view, window)
             make_tracks(view, window)
             make_events(view, window, topics_with_changes(view))
-            if nth <= len(windows):
+            if nth < len(pieces):
                 Watching(view).make(window)
                 memory.columns.make_outlines(view.timeline, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.
-        if nth % _WRITTEN_TOGETHER == 0:
+        unwritten += window.stop - window.start
+        if unwritten >= STRETCH_NS:
             memory.columns.write_fragments()
+            unwritten = 0
         memory.large.release()
     memory.columns.write_fragments()
+
+
+def _pieces_of(window: TimeWindow) -> Iterator[TimeWindow]:
+    """Yields the newest `STRETCH_NS` of a window, and so on: few fragments wait to be written."""
+    for stop in range(window.stop, window.start, -STRETCH_NS):
+        yield TimeWindow(max(window.start, stop - STRETCH_NS), stop)
 
 
 async def keep_backfilled(

@@ -174,3 +174,23 @@ def test_stored_slices_of_a_path_are_those_that_are_measured_now(world: World) -
     for one, other in zip(stored, made, strict=True):
         np.testing.assert_array_equal(one.line.times, other.line.times)
         np.testing.assert_array_equal(one.line.metres, other.line.metres)
+
+
+def test_of_a_long_backlog_no_fragment_is_dropped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though it is of more than may wait to be written."""
+    for number in range(24):
+        start = T0 + number * 1800 * S
+        poses = [odom(start + n * 60 * S, number + n / 300, 0.1 * (n % 7)) for n in range(30)]
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", poses)
+    stored = []
+    for most in (40, 10_000):
+        monkeypatch.setattr("ros2_memory.columns.fragments._MOST_WAITING", most)
+        file = tmp_path / f"with_{most}.sqlite"
+        World.of(tmp_path, file=file).fill()
+        with closing(sqlite3.connect(file)) as base:
+            stored.append({*base.execute("SELECT kind, start_ns FROM fragment")})
+    few, many = stored
+    assert few == many
+    assert len(many) > 10 * 40
