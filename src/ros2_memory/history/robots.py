@@ -425,7 +425,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
 
 
 def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
-    """Whether a recording may have bags in a window: with a clock that was not set, it spans years."""
+    """Whether a recording may have bags in a window: one that a wrong clock dated spans years."""
     folder = str(recording)
     segments = view.timeline.segments_in(window)
     spans = (segment.folder_spans[folder] for segment in segments if folder in segment.folders)

@@ -483,14 +483,12 @@ class _Pieces(NamedTuple):
 
     starts: Times
     stops: Times
-    first: Ns
-    last: Ns
 
 
 def _by_robot(found: Sequence[TrackPart]) -> list[list[TrackPart]]:
     """Returns the parts of the track in order of time, and of others what lies beside it.
 
-    Where several recordings place a robot at a time, that which began first is in the track; of
+    Where several recordings place a robot in a slice, that which began first is in the track; of
     those that began at one time the first by name.
     """
     parts = sorted(
@@ -506,26 +504,40 @@ def _by_robot(found: Sequence[TrackPart]) -> list[list[TrackPart]]:
     kept: list[TrackPart] = []
     placed: list[_Pieces] = []
     for own in by_recording.values():
+        times = np.sort(np.concatenate([part.times for part in own]))
         # They are in the order of their first times: no later one reaches back to the others.
-        placed = [pieces for pieces in placed if pieces.last >= own[0].times[0]]
-        beside: list[TrackPart] = []
-        for part in own:
-            first, last = int(part.times[0]), int(part.times[-1])
-            fresh = np.ones(len(part.times), np.bool_)
-            for pieces in placed:
-                if pieces.first <= last and pieces.last >= first:
-                    nth = np.searchsorted(pieces.starts, part.times, side="right") - 1
-                    fresh &= (nth < 0) | (part.times > pieces.stops[nth])
-            kept.append(part if fresh.all() else part.some(np.flatnonzero(fresh)))
-            if not fresh.all():
-                beside.append(part.some(np.flatnonzero(~fresh)))
-        if beside:
-            others.append(beside)
-        times = np.concatenate([part.times for part in own])
-        times.sort()
-        starts, stops = pieces_of(times, times)
-        placed.append(_Pieces(starts, stops, int(starts[0]), int(stops[-1])))
+        placed = [pieces for pieces in placed if pieces.stops[-1] >= times[0]]
+        taken = _slices_beside(times, placed)
+        is_beside = [np.isin(part.times // TRACK_SLICE_NS, taken) for part in own]
+        kept += [
+            part.some(np.flatnonzero(~beside)) if beside.any() else part
+            for part, beside in zip(own, is_beside, strict=True)
+        ]
+        if taken.size:
+            others.append(
+                [
+                    part.some(np.flatnonzero(beside))
+                    for part, beside in zip(own, is_beside, strict=True)
+                    if beside.any()
+                ]
+            )
+        placed.append(_Pieces(*pieces_of(times, times)))
     return [kept, *others]
+
+
+def _slices_beside(times: Times, placed: Sequence[_Pieces]) -> Times:
+    """Returns the slices in which poses of some times, ascending, lie beside others.
+
+    Whole ones: which of their poses are vertices was decided by all of them.
+    """
+    slices, begin = np.unique(times // TRACK_SLICE_NS, return_index=True)
+    firsts, lasts = times[begin], times[np.append(begin[1:], len(times)) - 1]
+    is_beside = np.zeros(len(slices), np.bool_)
+    for pieces in placed:
+        nth = np.searchsorted(pieces.stops, firsts)
+        is_beside |= np.append(pieces.starts, MAX_NS)[nth] <= lasts
+    beside: Times = slices[is_beside]
+    return beside
 
 
 def _without_jumps(parts: Parts, every: Mask) -> Parts:
