@@ -183,9 +183,7 @@ class Segment:
         """By folder, the tally of the bags in it."""
         folders, of = self._folder_rows
         tallies = np.zeros((len(folders), 3), np.int64)
-        messages = np.zeros(len(self.bags), np.int64)
-        for _, rows, numbers in _columns(self).groups:
-            messages[rows] = numbers[:, :, 0].sum(axis=1)
+        messages = _columns(self).numbers[:, :, 0].sum(axis=0)
         sizes = np.array([bag.size for bag in self.bags], np.int64)
         np.add.at(tallies, of, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
         return {
@@ -220,16 +218,17 @@ class Segment:
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
         """By topic and type, the totals of the bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        for schema, _, numbers in _columns(self).groups:
-            rows = zip(
-                schema.topics,
-                numbers[:, :, 1].min(axis=0).tolist(),
-                numbers[:, :, 2].max(axis=0).tolist(),
-                numbers[:, :, 0].sum(axis=0).tolist(),
-                strict=True,
-            )
-            for (topic, type_name, *_), first, last, messages in rows:
-                add_totals(totals.setdefault(topic, {}), type_name, (first, last, messages))
+        columns = _columns(self)
+        counts, firsts, lasts = columns.numbers.transpose(2, 0, 1)
+        rows = zip(
+            columns.headers,
+            firsts.min(axis=1, initial=MAX_NS, where=counts > 0).tolist(),
+            lasts.max(axis=1, initial=MIN_NS, where=counts > 0).tolist(),
+            counts.sum(axis=1).tolist(),
+            strict=True,
+        )
+        for (topic, type_name, *_), first, last, messages in rows:
+            add_totals(totals.setdefault(topic, {}), type_name, (first, last, messages))
         return totals
 
     @cached_property
@@ -320,11 +319,10 @@ class Segment:
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
         columns = _columns(self)
-        topics = {topic for group in columns.groups for topic in group.schema.positions}
         lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
         return {
             topic: _presence_of(column, lengths)
-            for topic in sorted(topics)
+            for topic in sorted(columns.topics)
             if (column := columns.of(topic)) is not None
         }
 
@@ -380,45 +378,51 @@ def folder_of(bag: BagFile) -> str:
     return bag.file[: bag.file.rfind("/")]
 
 
-class _SchemaGroup(NamedTuple):
-    """Bags of one schema: their positions in the segment, and their numbers by bag and topic."""
-
-    schema: SummarySchema
-    bags: NDArray[np.intp]
-    numbers: NDArray[np.int64]
-
-
 class _Columns:
-    """The numbers of a segment's summaries, and the columns that were asked for."""
+    """The numbers of a segment's summaries.
+
+    Attributes:
+        headers: of all topics, each type of one by itself.
+        numbers: by header and bag the count, 0 where it has none, the first and the last time.
+    """
 
     def __init__(self, bags: Sequence[BagFile]) -> None:
-        rows: dict[int, list[int]] = {}
+        by_schema: dict[int, list[int]] = {}
         for row, bag in enumerate(bags):
-            rows.setdefault(id(bag.summary.schema), []).append(row)
-        self.groups: list[_SchemaGroup] = []
-        for own in rows.values():
-            numbers = numbers_of([bags[row].summary for row in own])
-            schema = bags[own[0]].summary.schema
-            self.groups.append(_SchemaGroup(schema, np.array(own, np.intp), numbers))
-        self._columns: dict[str, TopicColumn | None] = {}
+            by_schema.setdefault(id(bag.summary.schema), []).append(row)
+        schemas = [bags[rows[0]].summary.schema for rows in by_schema.values()]
+        headers = dict.fromkeys(chain.from_iterable(schema.topics for schema in schemas))
+        numbered = {header: number for number, header in enumerate(headers)}
+        self.headers = tuple(headers)
+        self.numbers = np.zeros((len(headers), len(bags), 3), np.int64)
+        for schema, rows in zip(schemas, by_schema.values(), strict=True):
+            own = [numbered[header] for header in schema.topics]
+            found = numbers_of([bags[row].summary for row in rows])
+            self.numbers[np.ix_(own, rows)] = found.swapaxes(0, 1)
+        self._every = np.arange(len(bags))
+        self._columns: dict[str, TopicColumn] = {}
+        self._of_topics: dict[str, list[int]] = {}
+        for header, number in numbered.items():
+            self._of_topics.setdefault(header.topic, []).append(number)
+
+    @property
+    def topics(self) -> Collection[str]:
+        """Their names."""
+        return self._of_topics.keys()
 
     def of(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
-        if topic not in self._columns:
-            self._columns[topic] = self._merged(topic)
-        return self._columns[topic]
+        if topic in self._of_topics and topic not in self._columns:
+            self._columns[topic] = self._column(self._of_topics[topic])
+        return self._columns.get(topic)
 
-    def _merged(self, topic: str) -> TopicColumn | None:
-        columns = [
-            TopicColumn(bags, *(numbers[:, position, nth] for nth in (1, 2, 0)))
-            for schema, bags, numbers in self.groups
-            for position in schema.positions.get(topic, ())
-        ]
-        if len(columns) < 2:
-            return columns[0] if columns else None
-        merged = TopicColumn(*map(np.concatenate, zip(*columns, strict=True)))
-        order = np.argsort(merged.bags, kind="stable")
-        return TopicColumn(*(each[order] for each in merged))
+    def _column(self, own: Sequence[int]) -> TopicColumn:
+        counts, firsts, lasts = self.numbers[own[0]].T
+        if len(own) == 1 and counts.all():
+            return TopicColumn(self._every, firsts, lasts, counts)
+        bags, types = np.nonzero(self.numbers[own, :, 0].T)
+        counts, firsts, lasts = self.numbers[own][types, bags].T
+        return TopicColumn(bags, firsts, lasts, counts)
 
 
 @lru_cache(maxsize=_CACHED_SEGMENTS)
