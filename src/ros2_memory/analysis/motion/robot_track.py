@@ -165,29 +165,50 @@ def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
 
 
 def joined_track(parts: Sequence[TrackPart], fastest_mps: float = math.inf) -> RobotTrack:
-    """Returns the track by the poses of several tables; of two of one time the first counts."""
-    if not parts:
+    """Returns the track by the poses of several tables; of two of one time the first counts.
+
+    Those of each recording are joined first: its slices are its own.
+    """
+    by_recording: dict[str, list[TrackPart]] = {}
+    for part in parts:
+        by_recording.setdefault(part.recording, []).append(part)
+    if not by_recording:
         return empty_track()
-    whole = united_parts(parts)
-    if len(parts) > 1:
-        order = np.argsort(whole.times, kind="stable")
-        times = whole.times[order]
-        whole = whole.some(order[np.diff(times, prepend=times[:1] - 1) > 0])
-        whole = whole.some(thinned(whole.times))
-    whole = whole._replace(turns=_continuous(whole.turns, whole.settled))
-    whole = whole.some(_vertices(whole, keeps=whole.settled))
-    heading = np.where(whole.known, whole.turns * (math.tau / _TURN), np.nan)
+    every = [_joined(own) for own in by_recording.values()]
+    of = np.repeat(np.arange(len(every)), [len(one.times) for one in every])
+    whole = united_parts(every)
+    if len(every) > 1:
+        order = _in_time(whole.times)
+        whole, of = whole.some(order), of[order]
+    turns = _continuous(whole.turns, np.diff(of, prepend=-1) == 0)
+    heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
-def _continuous(turns: Times, settled: Mask) -> Times:
-    """Returns headings without jumps by whole turns; between settled ones they have none."""
+def _joined(parts: Sequence[TrackPart]) -> TrackPart:
+    """Returns the track by the poses of several tables of one recording."""
+    whole = united_parts(parts)
+    if len(parts) > 1:
+        whole = whole.some(_in_time(whole.times))
+        whole = whole.some(thinned(whole.times))
+    among = whole.settled & np.append([False], whole.settled[:-1])[: len(whole.settled)]
+    whole = whole._replace(turns=_continuous(whole.turns, among))
+    return whole.some(_vertices(whole, keeps=whole.settled))
+
+
+def _in_time(times: Times) -> NDArray[np.intp]:
+    """Returns the order of some times, of equal ones the first alone."""
+    order = np.argsort(times, kind="stable")
+    return order[np.diff(times[order], prepend=times.min(initial=0) - 1) > 0]
+
+
+def _continuous(turns: Times, are_known: Mask) -> Times:
+    """Returns headings without jumps by whole turns; the steps that are known have none."""
     steps = np.diff(turns, prepend=turns[:1])
     short = (steps + _TURN // 2) % _TURN - _TURN // 2
-    among = settled & np.append([False], settled[:-1])[: len(settled)]
     first = (turns[:1].sum() + _TURN // 2) % _TURN - _TURN // 2
-    whole: Times = first + np.cumsum(np.where(among, steps, short))
+    whole: Times = first + np.cumsum(np.where(are_known, steps, short))
     return whole
 
 
