@@ -70,9 +70,14 @@ def test_a_map_that_no_transform_leads_to_is_denied(tmp_path: Path) -> None:
         map_placement(view, "/odom", "map")
 
 
-_HERE = {"x": 0.0, "y": 0.0, "radius_m": 2.0}
-_WINDOW = {"start": BEGIN // S, "end": BEGIN // S + 200}
-_MOVING = {"topic": "/odom", "field": "position.x", "condition_type": "above", "value": -5.0}
+_HERE: dict[str, object] = {"x": 0.0, "y": 0.0, "radius_m": 2.0}
+_WINDOW: dict[str, object] = {"start": BEGIN // S, "end": BEGIN // S + 200}
+_MOVING: dict[str, object] = {
+    "topic": "/odom",
+    "field": "position.x",
+    "condition_type": "above",
+    "value": -5.0,
+}
 _OVER_RUNS: list[tuple[str, dict[str, object]]] = [
     ("visits", {"x": 0.0, "y": 0.0}),
     ("visits", {"by": "day", "where": _HERE, **_WINDOW}),
