@@ -218,6 +218,8 @@ def _position_in(
         coordinates = pose.position
     if not all(map(math.isfinite, coordinates)):
         view.notes.add("the recorded position is not a number")
+    if geodetic is not None and not geodetic.has_fix:
+        view.notes.add("no fix: the receiver states (fix_status -1) that this is not its position")
     if geodetic is None and pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
     if geodetic is None:
