@@ -101,6 +101,7 @@ def compare(
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
+    view.notes.retract_outside(*windows)
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),
