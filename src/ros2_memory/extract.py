@@ -125,7 +125,7 @@ class Plan:
     fields: Mapping[str, Segments]
     poses: tuple[PointPose | PlanarPose, ...]
     twists: tuple[tuple[Route, Route], ...]
-    geodetic: tuple[Route, Route, Route] | None = None
+    geodetic: tuple[Route, Route, Route, Route] | None = None
     pose_frame: Route | None = None
     velocity_frame: Route | None = None
 
@@ -253,11 +253,12 @@ class SchemaExtractor:
         routes = self.plan(type_name).geodetic
         if routes is None:
             return None
-        latitude, longitude, altitude = (number(route.of(message)) for route in routes)
+        latitude, longitude, altitude, status = (number(route.of(message)) for route in routes)
         if latitude is None or longitude is None:
             return None
         above = math.nan if altitude is None else altitude
-        return Geodetic(latitude, longitude, above, _text(FRAME.of(message)))
+        has_fix = status is None or status >= 0
+        return Geodetic(latitude, longitude, above, _text(FRAME.of(message)), has_fix)
 
     def own_path(self, path: str, type_name: str) -> str:
         """Returns a full path in a message as one in its extracted value.
@@ -325,6 +326,10 @@ class SchemaExtractor:
         """Returns the frame in a message's header; empty where it has none."""
         return _text(FRAME.of(message))
 
+    def stamp(self, message: object) -> Ns | None:
+        """Returns the stamp (ns) in a message's header; None where it has none."""
+        return nanoseconds(_STAMP.of(message))
+
     def transforms(
         self, message: object, log_time: Ns, *, static: bool
     ) -> tuple[StampedTransform, ...]:
@@ -388,7 +393,7 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
         fields=paths,
         poses=_poses(paths.keys(), route),
         twists=((route("linear_velocity"), route("angular_velocity")),) if has_twist else (),
-        geodetic=(route("latitude"), route("longitude"), route("altitude"))
+        geodetic=(route("latitude"), route("longitude"), route("altitude"), route("fix_status"))
         if has_geodetic
         else None,
         pose_frame=route("pose_frame") if "pose_frame" in paths else None,

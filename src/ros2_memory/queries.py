@@ -99,7 +99,7 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.farthest import farthest_from
-from ros2_memory.places.pose_frames import placed, placed_waypoints, with_place
+from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -218,6 +218,8 @@ def _position_in(
         coordinates = pose.position
     if not all(map(math.isfinite, coordinates)):
         view.notes.add("the recorded position is not a number")
+    if geodetic is not None and not geodetic.has_fix:
+        view.notes.add("no fix: the receiver states (fix_status -1) that this is not its position")
     if geodetic is None and pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
     if geodetic is None:
@@ -551,6 +553,7 @@ def trajectory_summary(
     require_one_robot(view, name, window)
     note_unread(view, window)
     note_edges(view, window)
+    note_runs(view, name, path.frames[0], window)
     elapsed = elapsed_in(view, window)
     unrecorded = unrecorded_length(view, name, path, elapsed)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))

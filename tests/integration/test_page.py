@@ -328,6 +328,20 @@ def test_what_the_server_had_no_time_for_is_kept_and_asked_for_again(page: Brows
     assert kept[3] is None is shown[2]
 
 
+def test_a_look_without_things_leaves_those_shown_and_is_not_the_last(page: Browser) -> None:
+    """As at the end of filling: what was not known yet is asked for again, and nothing vanishes."""
+    late, gone, robots = page.run(
+        "const before = { ...state.view, things: [{ label: 'cup' }] }, late = { ...before };"
+        "delete late.things; delete late.path; const next = whole(late, before);"
+        "const robots = { ...before, paths: [{ name: 'red', error: 'no time', late: true }] };"
+        "return [[next.things.length, next.path.t.length === before.path.t.length, next.isWhole],"
+        "  whole(late, null).things.length, [whole(robots, null).isWhole, whole(before).isWhole]];"
+    )
+    assert late == [1, True, False]
+    assert gone == 0
+    assert robots == [False, True]
+
+
 def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:
     """Two things far from all others have their names; of twelve in one place some have none."""
     drawn = page.run(

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.view import View
+from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
     Msg,
     boolean,
@@ -101,12 +104,11 @@ def tracked(ns: int, x: float, y: float) -> Msg:
     return Msg("/vicon/robot", "geometry_msgs/msg/TransformStamped", ns, body)
 
 
-def fix(ns: int, north: float, east: float) -> Msg:
-    status = make("sensor_msgs/msg/NavSatStatus", status=0, service=1)
+def fix(ns: int, north: float, east: float, status: int = 0) -> Msg:
     body = make(
         "sensor_msgs/msg/NavSatFix",
         header=header(ns, "gps"),
-        status=status,
+        status=make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
         latitude=48.1234567 + north,
         longitude=11.7654321 + east,
         altitude=519.5,
@@ -223,6 +225,18 @@ ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
     ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
     ("visits", {"x": 0.0, "y": 0.0}),
 ]
+
+
+def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> None:
+    states = [fix(T0 + n * S, n * 1e-5, 0.0, -1 if n < 5 else 0) for n in range(9)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", states)
+    memory = memory_of(tmp_path)
+    for at, has_fix in ((4, False), (5, True)):
+        found = asked(memory, tmp_path, "get_position_at", timestamp=T0 / S + at, topic="/fix")
+        assert found["latitude"] == pytest.approx(48.1234567 + at * 1e-5)
+        assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
+    _, fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
+    assert [at for at, _ in fixes] == [T0 + n * S for n in range(5, 9)]
 
 
 @each_way

@@ -98,7 +98,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "write the messages that an answer rests on to MCAP",
         {
             0: "the same question over the file gives the same answer",
-            1: "its answer differs, or a type in it has no definition (stderr names them)",
+            1: "its answer differs, or a type that it needs has no definition (stderr names them)",
         },
     ),
     "forget": CommandEntry(

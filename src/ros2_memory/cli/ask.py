@@ -98,13 +98,13 @@ def ask(
         if _SETTING.fullmatch(word)
         or (is_folder(word) and not (word == tool and word in complete(word)))
     ]
-    name, *rest = [word for word in words if word not in of_settings] or [None]
+    asked = [word for word in words if word not in of_settings]
     loaded, _ = load_to_look(bag_dir, [*(settings or ()), *of_settings], recording)
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     tools = {known.name: known for known in dispatcher.tools}
-    if name is None:
+    if not asked:
         rows = [_tool_row(known) for known in dispatcher.tools]
         if as_json:
             print_line(json.dumps(rows))
@@ -112,7 +112,10 @@ def ask(
             print_reply(stdout_console(), rows)
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return False
-    arguments = question_for(memory, name, tools.get(name), [word for word in rest if word])
+    # A folder that is not there may stand before the tool.
+    name = next((word for word in asked if word in tools), asked[0])
+    rest = [word for word in asked if word and word != name]
+    arguments = question_for(memory, name, tools.get(name), rest)
     with spinner(f"asking {name}"):
         (reply,) = call_tools(dispatcher, {name: arguments})
     answer: JsonValue = json.loads(reply.text)
@@ -177,8 +180,9 @@ def parse_arguments(given: Sequence[str], known: Mapping[str, JsonObject]) -> di
         key, equals, text = word.partition("=")
         if not equals or not key:
             raise InvalidArgumentsError(
-                f"{word!r} is not an argument; write key=value, such as seconds_ago=10, or one "
-                "JSON object"
+                f"{word!r} is not an argument, and there is no such file or folder; write "
+                "key=value, such as seconds_ago=10, or one JSON object, or name a bag or a folder "
+                "of bags"
             )
         arguments[key] = text if _takes_text(known.get(key, {})) else _from_json(text, text)
     return arguments

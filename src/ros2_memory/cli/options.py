@@ -417,11 +417,19 @@ class Bags:
         """Returns the topic of a command, before which a path may stand, and the bags.
 
         Raises:
-            InvalidArgumentsError: there is a path, and no topic.
+            InvalidArgumentsError: there is a path, and no topic; or a path that does not exist.
         """
         others = self.words or []
-        if not Path(first).exists() or any(map(is_folder, others)):
+        if any(map(is_folder, others)):
             return first, self
+        if not _exists(first):
+            second = next((word for word in others if "=" not in word), None)
+            if second is None:
+                return first, self
+            raise InvalidArgumentsError(
+                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
+                "folder of bags beside the topic"
+            )
         topic = next((word for word in others if "=" not in word), None)
         if topic is None:
             kind = "folder" if Path(first).is_dir() else "file"

@@ -4,8 +4,9 @@
 
 `recording` and `date` (UTC, of the log time) are columns for whatever reads such folders (Hive
 partitioning). The files have the others: `topic`, `type`, `log_time` and `publish_time` (UTC, to
-the nanosecond), `value` (the extracted message as JSON, long arrays thinned), and for messages with
-a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded.
+the nanosecond), `value` (the extracted message as JSON, long arrays thinned), for messages with
+a pose `frame_id`, `x`, `y`, `z` (m) and `qx`, `qy`, `qz`, `qw`, unrounded, and for those with a
+header its stamp, `header_stamp` (UTC, to the nanosecond).
 """
 
 from __future__ import annotations
@@ -43,6 +44,7 @@ SCHEMA: Final = pa.schema(
         ("undecodable", pa.string()),
         ("frame_id", pa.string()),
         *((name, pa.float64()) for name in ("x", "y", "z", "qx", "qy", "qz", "qw")),
+        ("header_stamp", pa.timestamp("ns", tz="UTC")),
     ]
 )
 _GROUP_ROWS: Final = 20_000
@@ -151,12 +153,13 @@ class Dataset:
             message = self._reader.decode(record)
         except UndecodableError as error:
             self.undecoded.add(channel.type)
-            return (*row, None, error.reason, None, *_NO_POSE)
+            return (*row, None, error.reason, None, *_NO_POSE, None)
         shown = self._extractor.shown(message, channel.type)
         # The text for replies is ASCII with escapes; a column of UTF-8 has the letters themselves.
         text = encodable(_AS_JSON(shown.value) if "\\" in shown.text else shown.text)
+        stamp = self._extractor.stamp(message)
         pose = self._extractor.pose(message, channel.type)
         if pose is None:
-            return (*row, text, None, None, *_NO_POSE)
+            return (*row, text, None, None, *_NO_POSE, stamp)
         frame = encodable(pose.frame_id) or None
-        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]))
+        return (*row, text, None, frame, *pose.position, *(pose.orientation or _NO_POSE[3:]), stamp)

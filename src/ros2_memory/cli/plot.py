@@ -358,10 +358,11 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         except InvalidArgumentsError:
             if wanted is None or wanted == frame:
                 raise
+    fastest = found.trajectory.max_speed
     line = (
         f"{found.trajectory.totals.distance_m:.1f} m in "
-        f"{format_duration(unix_from_ns(found.end - found.start))}, "
-        f"at most {found.trajectory.max_speed:.2f} m/s; by {found.topic}"
+        f"{format_duration(unix_from_ns(found.end - found.start))}"
+        f"{'' if fastest is None else f', at most {fastest:.2f} m/s'}; by {found.topic}"
     )
     vertices = found.trajectory.waypoints
     times = np.array([vertex.time for vertex in vertices])

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Final, cast
+from typing import Annotated, Final, NamedTuple, cast
 
 import typer
 
@@ -78,21 +78,25 @@ def prove(
     parts = _parts(view)
     if not parts:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing is recorded: see ros2-memory info")
-    undefined: list[str] = []
+    read, tried = reads.spans(), list[_Proof]()
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
-        for nth, spans in enumerate(_more_and_more(view, reads.spans(), parts)):
+        for nth, spans in enumerate(_more_and_more(view, read, parts)):
             path = Path(folder) / str(nth) / output.name
             path.parent.mkdir()
+            undefined: list[str] = []
             count = _write(path, view, spans, parts, undefined)
             settings, _ = load_to_look(None, [str(path), *looking, *others])
             found = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
-            beside, differing = _differing(expected, found)
-            if not differing:
+            tried.append(_Proof(path, count, undefined, *_differing(expected, found)))
+            if not tried[-1].differing and (nth or not tried[-1].beside):
                 break
-        path.replace(output)
-    done = {"path": str(output), "messages": count, "same": not differing, "differing": differing}
-    written = json.dumps({**done, "beside": beside})
-    print_line(written if as_json else f"{counted(count, 'message')} in {output}")
+        same = [one for one in tried if not one.differing]
+        proof = min(same, key=lambda one: len(one.beside), default=tried[-1])
+        proof.path.replace(output)
+    beside, differing = proof.beside, proof.differing
+    done = {"path": str(output), "messages": proof.messages, "same": not differing}
+    written = json.dumps({**done, "differing": differing, "beside": beside})
+    print_line(written if as_json else f"{counted(proof.messages, 'message')} in {output}")
     if beside:
         print_notes([f"only the bags themselves give the same {listed(beside)}"])
     said = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
@@ -101,9 +105,24 @@ def prove(
         if len(parts) > 1 and output.suffix == ".mcap":
             said += f"; -o {output.with_suffix('')} keeps recordings apart"
     print(said, file=sys.stderr)
-    lacking = describe_undefined(undefined)
+    lacking = describe_undefined(proof.undefined)
     print_notes([lacking] if lacking else [])
-    return bool(differing or lacking)
+    rests_on = {name for topic in read for name in view.timeline.types_of(topic)}
+    return bool(differing or not rests_on.isdisjoint(proof.undefined))
+
+
+class _Proof(NamedTuple):
+    """A file or folder that was written.
+
+    `undefined`: types without a definition. `beside`, `differing`: keys of the reply over it that
+    differ, those on files and others.
+    """
+
+    path: Path
+    messages: int
+    undefined: list[str]
+    beside: list[str]
+    differing: list[str]
 
 
 class _Reads:
@@ -185,10 +204,12 @@ def _more_and_more(
     """Yields what an answer may rest on: what was read, then more where that is not all.
 
     That is what lies between on the topics that were read, these as a whole, and everything. The
-    first and the last messages of each part say when "now" is, and what was recorded.
+    first and the last message of all say when "now" is, those of each part what was recorded.
     """
-    ends = [(at, at + 1) for _, window in parts for at in (window.start, window.stop - 1)]
+    times = sorted(at for _, window in parts for at in (window.start, window.stop - 1))
+    whole, ends = ([(at, at + 1) for at in some] for some in ((times[0], times[-1]), times))
     every = view.timeline.topics()
+    yield {topic: united([*read.get(topic, ()), *whole]) for topic in every}
     between = {topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()}
     ever = [(MIN_NS, MAX_NS)]
     for found in (read, between, dict.fromkeys(read, ever), dict.fromkeys(every, ever)):

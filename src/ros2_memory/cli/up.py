@@ -130,6 +130,8 @@ def up(
     is_open = not settings.memory.keep and sources("memory.keep").startswith("in ")
     if is_open and _remembers(bags, yes=yes):
         robot.words.append("memory.keep=true")
+        if script is None:  # else the folder would not be that of the service's user
+            (bags / MEMORY_FOLDER).mkdir(exist_ok=True)
     if script is not None:
         _hand_over(script, robot)
     return _run_programs(robot.words, robot.bag_dir)
@@ -232,7 +234,10 @@ def _remembers(bags: Path, *, yes: bool) -> bool:
         return True
     if yes or not sys.stdin.isatty():
         return False
-    return typer.confirm(_KEEP_FOR_A_YEAR, default=False)
+    if typer.confirm(_KEEP_FOR_A_YEAR, default=False):
+        return True
+    print_line("no such memory is kept; with memory.keep=false `up` does not ask")
+    return False
 
 
 def _show_list(robot: _Robot, found: Survey, disk: Disk) -> None:

@@ -208,12 +208,16 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class Geodetic:
-    """A position on Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN."""
+    """A position on Earth (WGS 84): degrees north and east, metres above the ellipsoid or NaN.
+
+    `has_fix` is False where the receiver says that it has none (`NavSatStatus.STATUS_NO_FIX`).
+    """
 
     latitude: float
     longitude: float
     altitude: float
     frame_id: str = ""
+    has_fix: bool = True
 
 
 @dataclass(frozen=True, slots=True)

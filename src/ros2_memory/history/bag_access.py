@@ -151,12 +151,12 @@ class BagAccess:
             self.notes.complete = False
         name = short_name(bag.path)
         if isinstance(error, BagVanishedError):
-            self.notes.add(Note(_DELETED, name, until=until))
+            self.notes.add(Note(_DELETED, name, since=first, until=until))
         elif isinstance(error, BagContradictionError):
-            self.notes.add(Note(_CONTRADICTS_ITSELF, name, error.reason, until))
+            self.notes.add(Note(_CONTRADICTS_ITSELF, name, error.reason, first, until))
         else:
             kind = _NOT_TO_ITS_END if error.lost is None else _NOT_WHOLE
-            self.notes.add(Note(kind, name, error.reason, until))
+            self.notes.add(Note(kind, name, error.reason, first, until))
 
     def read(
         self,

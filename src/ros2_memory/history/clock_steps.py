@@ -20,6 +20,7 @@ from ros2_memory.analysis.clock_steps import (
     step_over,
 )
 from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
+from ros2_memory.analysis.motion.trajectory import mean_speed
 from ros2_memory.analysis.poses import NO_POSES, joined_poses
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
@@ -127,7 +128,7 @@ def across_steps(found: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajec
     return replace(
         found,
         totals=replace(found.totals, gaps=gaps, gap_m=found.totals.gap_m if gaps else 0.0),
-        avg_speed=found.totals.distance_m / elapsed_s if elapsed_s > 0 else found.avg_speed,
+        avg_speed=mean_speed(found.totals.distance_m, elapsed_s) or found.avg_speed,
     )
 
 
@@ -141,9 +142,11 @@ def while_recorded(
     recorded = elapsed.between(path.first, path.last) - unrecorded
     if not unrecorded or recorded <= 0:
         return found
-    avg_speed = found.totals.distance_m / unix_from_ns(recorded)
-    is_stated = found.max_speed_from == "twist"
-    fastest = found.max_speed if is_stated else max(found.max_speed, avg_speed)
+    avg_speed, fastest = mean_speed(found.totals.distance_m, unix_from_ns(recorded)), None
+    if found.max_speed_from == "twist":
+        fastest = found.max_speed
+    elif avg_speed is not None:
+        fastest = max(found.max_speed or 0.0, avg_speed)
     return replace(found, avg_speed=avg_speed, max_speed=fastest)
 
 

@@ -15,7 +15,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import MAX_NS, Deadline, ms_from_ns, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ms_from_ns, unix_from_ns
 from ros2_memory.index.listed_splits import absent_splits, listing_from_json, listing_to_json
 from ros2_memory.retention.latched_carry import origin_of
 
@@ -371,12 +371,14 @@ class Note(NamedTuple):
         kind: the sentence.
         file: its name as replies have it.
         detail: what is special about this one; may be empty.
-        until: no part of it is after this log time.
+        since: no part of it is before this log time.
+        until: none is after this one.
     """
 
     kind: Reason
     file: str
     detail: str = ""
+    since: Ns = MIN_NS
     until: Ns = MAX_NS
 
 
@@ -404,9 +406,10 @@ class Notes:
                 continue
             self.added += 1
             self._order.setdefault(note.kind)
-            known = self._notes.get((note.kind, note.file))
-            if known is None or known.until < note.until:
-                self._notes[note.kind, note.file] = note
+            known = self._notes.get((note.kind, note.file), note)
+            newest = note if known.until < note.until else known
+            since = min(known.since, note.since)
+            self._notes[note.kind, note.file] = newest._replace(since=since)
 
     def add_lack(self, note: str | Note) -> None:
         """Adds a note on data that the answer needs and that could not be read."""
@@ -454,17 +457,21 @@ class Notes:
         return details.issuperset(bag.summary.remarks)
 
     def keys(self) -> frozenset[NoteKey]:
-        """Returns which notes there are, for `retract_before`."""
+        """Returns which notes there are, for `retract_outside`."""
         return frozenset(self._notes)
 
-    def retract_before(self, moment: Ns, keep: Collection[NoteKey] = frozenset()) -> None:
-        """Removes the notes on what lies before a moment, except those to `keep`.
+    def retract_outside(
+        self, *windows: TimeWindow, keep: Collection[NoteKey] = frozenset()
+    ) -> None:
+        """Removes the notes on what lies outside of all windows, except those to `keep`.
 
-        For a question that did not need it: how far back is read besides what is asked for depends
-        on what is stored, and the reply must not.
+        For a question about these alone: what is read besides depends on what is stored, and the
+        reply must not.
         """
         self._notes = {
-            key: note for key, note in self._notes.items() if note.until >= moment or key in keep
+            key: note
+            for key, note in self._notes.items()
+            if key in keep or any(window.overlaps(note.since, note.until) for window in windows)
         }
 
 

@@ -251,7 +251,7 @@ def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     )
     if found:
         spans = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in found[-MAX_NAMED:]]
-        excluded = "excluded by privacy (recording.exclude_when), so there is no data of it"
+        excluded = "excluded by the rules of recording.exclude_when, so there is no data of it"
         yield f"{excluded}: {listed(spans, len(found))}"
 
 

@@ -302,6 +302,11 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             f"the positions are noisy: all steps add up to {totals.path_sum_m:.2f} m; "
             "distance_m leaves out what noise adds"
         )
+    if path.avg_speed is None and path.poses:
+        yield (
+            f"{counted(path.poses, 'pose')} within {totals.duration_s:.3f} s: too short to say how "
+            "fast"
+        )
     if totals.is_uncertain:
         yield (
             "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "

@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
@@ -377,7 +377,9 @@ class ReverseSearch:
             for part in candidates.windows():
                 messages = self._view.stream.messages(part.topics, part.window, newest_first=True)
                 for found in filter(self.matches, messages):
-                    self._view.notes.retract_before(found.time, noted_before)
+                    self._view.notes.retract_outside(
+                        TimeWindow(found.time, MAX_NS), keep=noted_before
+                    )
                     self._view.stream.find_first_copy(found)
                     self.note_undecodable()
                     return found

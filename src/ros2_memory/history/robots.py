@@ -19,7 +19,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, united
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, iso_local
+from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import copy_key
 from ros2_memory.history.merged_stream import bag_span_of
@@ -345,7 +345,7 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
         return []
     finally:
         # The answer itself needed nothing of what was read here.
-        view.notes.retract_before(MAX_NS, noted_before)
+        view.notes.retract_outside(keep=noted_before)
     return found
 
 

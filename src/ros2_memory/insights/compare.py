@@ -17,12 +17,11 @@ from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, resolve_path_topic
-from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import clamped, open_view
 from ros2_memory.insights.drive import drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
-from ros2_memory.places.pose_frames import known_placement
+from ros2_memory.places.pose_frames import changing_origin, is_one_run, known_placement
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
 from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
@@ -102,6 +101,7 @@ def compare(
     recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
+    view.notes.retract_outside(*windows)
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),
@@ -136,7 +136,11 @@ def _things(
         view.notes.add("things are not compared: the two times begin together")
         return frame, ComparedThings((), (), (), (), 0)
     runs = {each.epoch for each in known.estimate.instances}
-    if len(runs) > 1 and not known.has_map and not _is_one_session(view, windows):
+    if (
+        len(runs) > 1
+        and not known.has_map
+        and not is_one_run(view, resolve_path_topic(view), windows)
+    ):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
@@ -183,10 +187,10 @@ def _paths_apart(
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
         return _WaysApart()
-    if not placement.is_map and not _is_one_session(view, windows):
+    if not placement.is_map and not is_one_run(view, resolve_path_topic(view), windows):
         view.notes.add(
-            f"standstills and paths are not compared: the origin of {frame} changes with every "
-            "start, and no transforms lead to a map"
+            f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
+            "lead to a map"
         )
         return _WaysApart()
     region = None if where is None else where.region
@@ -218,17 +222,6 @@ def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther |
         return None
     inside = places_at(places, frame, point.x, point.y)
     return FarFromOther((point.x, point.y), inside, point.away_m, point.time)
-
-
-def _is_one_session(view: View, windows: tuple[TimeWindow, TimeWindow]) -> bool:
-    """Whether all poses of two windows are of one session, whose odometry goes on."""
-    topic, sessions = resolve_path_topic(view), sessions_of(view)
-    found = {
-        sessions.of(recording)
-        for recording, span in view.timeline.recordings(topic).items()
-        if any(each.overlaps(*span) for each in windows)
-    }
-    return len(found) < 2
 
 
 def _places(

@@ -207,6 +207,7 @@ def recap(
         answer = replace(answer, where=region.shown)
         if stood is not None:
             answer = replace(answer, stood=there.length_of(drive.standstills))
+    view.notes.retract_outside(window)
     return replace(answer, notes=view.notes.sentences())
 
 

@@ -200,7 +200,7 @@ def _finished(row: _Row, elapsed: Elapsed, other: SaidMeanwhile | None) -> _Row:
 
 
 def _of_goals(view: View, goals: list[GoalRun], window: TimeWindow, shown: _Shown) -> _Rows:
-    view.notes.retract_before(window.start)
+    view.notes.retract_outside(window)
     found = tuple(
         _goal_sighting(view, each, shown.frame_id)
         for each in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
@@ -216,7 +216,7 @@ def _of_texts(view: View, topic: str, condition: Condition, scope: Scope, shown:
     searched = scope.window
     if texts.since is not None:
         searched = TimeWindow(texts.since, searched.stop)
-    view.notes.retract_before(searched.start)
+    view.notes.retract_outside(searched)
     found = tuple(
         with_robot(view, topic, each, shown.frame_id)
         for each in texts.episodes
@@ -240,7 +240,7 @@ def _of_matches(
     searched, is_cut = scope.window, found.searched_to is not None
     if is_cut:
         searched = TimeWindow(runs[-1].first, searched.stop)
-    view.notes.retract_before(searched.start)
+    view.notes.retract_outside(searched)
     # To say where the robot was takes longest.
     wanted = [
         (run, newest)

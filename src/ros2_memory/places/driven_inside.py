@@ -16,6 +16,7 @@ from ros2_memory.analysis.motion.trajectory import (
     MAX_WAYPOINTS,
     Waypoint,
     drawn,
+    mean_speed,
 )
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
@@ -79,7 +80,7 @@ def driven_inside(
     elapsed = elapsed_in(view, window)
     spans = [(each.start, each.stop) for each in inside]
     duration = elapsed.among(spans)
-    average = totals.distance_m / unix_from_ns(duration) if duration else 0.0
+    average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
         waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
     require_one_robot(view, name, window)
@@ -95,8 +96,9 @@ def driven_inside(
         inside[0].start if inside else None,
         inside[-1].stop if inside else None,
         totals.distance_m,
+        average,
         # Measured over a second, it is below the mean of a visit that hardly lasts as long.
-        max(totals.max_speed, average),
+        None if average is None else max(totals.max_speed or 0.0, average),
         waypoints,
         away,
         notes=view.notes.sentences(),
@@ -104,26 +106,30 @@ def driven_inside(
 
 
 class InsideTotals(NamedTuple):
-    """What was driven inside: metres, and the highest speed (m/s) over a second."""
+    """What was driven inside: metres, and the highest speed (m/s) over a second.
+
+    `max_speed` is None where no time inside is long enough for one.
+    """
 
     distance_m: float
-    max_speed: float
+    max_speed: float | None
 
 
 def totals_inside(line: Line, spans: Sequence[Inside]) -> InsideTotals:
     """Returns what was driven along a line in some times."""
-    metres = fastest = 0.0
+    metres, speeds = 0.0, [] if spans else [0.0]
     for span in spans:
         start, stop = line.metres_at(np.array([span.start, span.stop])).tolist()
         metres += stop - start
-        fastest = max(fastest, _fastest(line, span, stop - start))
-    return InsideTotals(metres, fastest)
+        fastest = _fastest(line, span, stop - start)
+        speeds += [] if fastest is None else [fastest]
+    return InsideTotals(metres, max(speeds, default=None))
 
 
-def _fastest(line: Line, span: Inside, driven_m: float) -> float:
+def _fastest(line: Line, span: Inside, driven_m: float) -> float | None:
     lasted = span.stop - span.start
     if lasted <= _SPEED_NS:
-        return driven_m / unix_from_ns(lasted) if 2 * lasted >= _SPEED_NS else 0.0
+        return mean_speed(driven_m, unix_from_ns(lasted))
     end = span.stop - _SPEED_NS
     inner = line.times[np.searchsorted(line.times, span.start) :]
     inner = inner[: np.searchsorted(inner, end)]

@@ -79,5 +79,7 @@ def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, 
     for each in messages:
         message = view.bags.decode(each)
         fix = None if message is None else extractor.geodetic(message, each.type)
-        if fix is not None and math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
+        if fix is None or not fix.has_fix:
+            continue
+        if math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
             yield each.time, fix

@@ -46,7 +46,7 @@ from ros2_memory.history.transforms import (
 from ros2_memory.places.robot_tracks import RobotTracks
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -252,6 +252,31 @@ def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> M
     return own
 
 
+def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
+    """Returns whether all poses in some windows are of one session, whose odometry goes on."""
+    sessions, asked = sessions_of(view), tuple(windows)
+    found = {
+        sessions.of(recording)
+        for recording, span in view.timeline.recordings(topic).items()
+        if any(window.overlaps(*span) for window in asked)
+    }
+    return len(found) < 2
+
+
+def changing_origin(frame_id: str) -> str:
+    """Returns why coordinates of several runs cannot be compared, for sentences."""
+    return f"the origin of {frame_id or 'their frame'} changes with every start"
+
+
+def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None:
+    """Notes that positions in a frame which is not the map are of several runs of odometry."""
+    if frame_id != view.limits.map_frame and not is_one_run(view, topic, [window]):
+        view.notes.add(
+            f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
+            "coordinates may be another place in each"
+        )
+
+
 @dataclass
 class RobotPlaces:
     """Looks the robot up in a window, by its track: as exact as that, some 5 cm.
@@ -287,6 +312,7 @@ class RobotPlaces:
     def _track(self) -> RobotTrack:
         try:
             joined = RobotTracks(self.view, self.map_frame).over(self.window)
+            note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
         except QueryTimeoutError:
             self.view.bags.check_deadline()
             joined = None

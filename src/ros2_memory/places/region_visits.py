@@ -22,7 +22,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.pose_frames import map_placement
+from ros2_memory.places.pose_frames import map_placement, note_runs
 from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
 from ros2_memory.results import PlaceVisits, Visit
 
@@ -77,6 +77,7 @@ def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
 def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     """Returns what `track_in` does, and since when it is known."""
     joined = RobotTracks(view, frame_id).over(window)
+    note_runs(view, resolve_path_topic(view), frame_id, window)
     if joined.since is not None:
         view.notes.add_lack(
             f"visits are known back to {unix_text(joined.since)}: out of time before older "

@@ -124,6 +124,7 @@ def visits(
     if not found.all and asked is None:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
+    view.notes.retract_outside(window)
     _note_doubts(view, shown, newest, window)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(

@@ -28,7 +28,6 @@ from ros2_memory.core.reply import (
     keys,
     objects,
     result,
-    seconds,
     vector,
 )
 from ros2_memory.core.timebase import Ns, unix_from_ns
@@ -255,7 +254,8 @@ class DrivenInside(AnswerWithNotes):
         start: log time at which the first visit began; None where there was none.
         end: at which the last one ended.
         distance_m: metres driven inside.
-        max_speed: over a second (m/s).
+        avg_speed: the distance by the duration (m/s); None of a moment inside.
+        max_speed: over a second (m/s); None likewise.
         waypoints: of the drawn path; `jump` marks the first of a visit.
         farthest: the pose inside that is farthest from a point, where that was asked for.
     """
@@ -268,15 +268,10 @@ class DrivenInside(AnswerWithNotes):
     start: Ns | None
     end: Ns | None
     distance_m: float
-    max_speed: float
+    avg_speed: float | None
+    max_speed: float | None
     waypoints: tuple[Waypoint, ...]
     farthest: FarthestPose | None = None
-
-    @property
-    def avg_speed(self) -> float:
-        """The distance by the duration (m/s)."""
-        lasted_s = seconds(self.duration)
-        return self.distance_m / lasted_s if lasted_s else 0.0
 
 
 @result(

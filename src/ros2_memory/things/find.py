@@ -88,6 +88,7 @@ def find_things(
         )
     note_robots(view, view.pose_topic, window)
     known = known_things(view, lowest, limits.labels)
+    view.notes.retract_outside(asked_for)
     note_other_frames(view, known, region)
     asked = {known.labels.key(each): each for each in labels}
     places = places_asked(limits, region, known.frames)

@@ -205,10 +205,11 @@ def _path_notes(path: Trajectory) -> Iterator[str]:
                 f"of the jumps {longest} to a waypoint with jump: true; "
                 "that distance was not driven"
             )
-    if path.poses and path.max_speed_from == "positions":
+    mean, fastest = path.avg_speed, path.max_speed
+    if path.poses and fastest is not None and path.max_speed_from == "positions":
         yield "max_speed is measured from positions: the messages have no speed"
     # By more than the rounding of both.
-    if path.avg_speed > path.max_speed + 0.01:
+    if mean is not None and fastest is not None and mean > fastest + 0.01:
         yield (
             "avg_speed, by the positions, is above max_speed of the messages: "
             "one of the two is wrong"

@@ -158,15 +158,31 @@ def _was_null(recorded: Any, got: Any) -> bool:
     return recorded is None
 
 
+_UNKNOWN: Final = ("unknown_s", "is not known at any time of the window", "as from several robots")
+_SEVERAL_RUNS: Final = "changes with every start, and these are several runs of odometry"
+
+
 def _tells_unknown_time(recorded: Any, got: Any) -> bool:
     """Whether a key, a column or notes on unknown time are all that is new."""
     if not isinstance(got, list):
         return bool(recorded == "(absent)")
+    return _tells_more(recorded, got, *_UNKNOWN, _SEVERAL_RUNS)
+
+
+def _tells_runs(recorded: Any, got: Any) -> bool:
+    """Whether the note on several runs of odometry is all that is new."""
+    return _tells_more(recorded, got, _SEVERAL_RUNS)
+
+
+def _tells_more(recorded: Any, got: Any, *new: str) -> bool:
+    """Whether all that is new are sentences with some words."""
     known = recorded if isinstance(recorded, list) else []
-    new = ("unknown_s", "is not known at any time of the window", "as from several robots")
+    got = got if isinstance(got, list) else []
     added = [each for each in got if each not in known]
-    return all(each in got for each in known) and all(
-        any(words in each for words in new) for each in added
+    return (
+        bool(added)
+        and all(each in got for each in known)
+        and all(any(words in each for words in new) for each in added)
     )
 
 
@@ -361,6 +377,13 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
             only=_within(0.6),
         )
         for world in ("home_*", "robot_day_*")
+    ),
+    KnownWrong(
+        "*",
+        "*",
+        "/notes",
+        "that places are of several runs of odometry is not said",
+        only=_tells_runs,
     ),
     KnownWrong(
         "*",

@@ -144,6 +144,13 @@ class TestAsk:
     def test_a_name_that_no_tool_has_lists_those_that_are(self, exits: Program) -> None:
         assert "get_position_seconds_ago" in exits(1, "ask", "where_am_i").err
 
+    @pytest.mark.parametrize("words", [("nowhere", "visits", "x=1"), ("visits", "x=1", "nowhere")])
+    def test_a_folder_that_is_not_there_is_named(
+        self, exits: Program, words: tuple[str, ...]
+    ) -> None:
+        err = exits(2, "ask", *words).err
+        assert "'nowhere' is not an argument, and there is no such file or folder; write" in err
+
     def test_without_a_name_the_tools_are_listed_with_their_arguments(self, exits: Program) -> None:
         assert "seconds_ago, topic?, tolerance_s?" in exits(0, "ask").out
 

@@ -467,6 +467,16 @@ def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
 
 
 class TestTheServer:
+    def test_one_over_http_is_named_beside_stdio_without_a_token(
+        self, robot: Path, exits: Program, port: int, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("MEMORY_API_TOKEN", "a" * 32)
+        shown = exits(0, "doctor", "server.transport=stdio").out
+        assert "each client starts its own server" in shown
+        assert f"answers on 127.0.0.1 port {port}: ok" in shown
+        Answering.asks_for, Answering.reply = "nothing", b"{}"
+        assert "answers on" not in exits(0, "doctor", "server.transport=stdio").out
+
     def test_another_program_is_recognised(self, robot: Path, examined: Examined) -> None:
         Answering.reply = b"<html>a printer</html>"
         wrong = examined(2)

@@ -396,6 +396,18 @@ class TestParquet:
         assert length == pytest.approx(told, abs=1e-3)
         assert told > 4
 
+    def test_stamps_of_headers_are_there_to_the_nanosecond(
+        self, tmp_path: Path, exits: Program
+    ) -> None:
+        poses = [odom(T0 + n, 0.0, 0.0, log_time=T0 + n * NS_PER_S) for n in range(3)]
+        write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*poses, text(T0 + 9, "no header")])
+        exits(0, "export", "--parquet", tmp_path / "rows", tmp_path / "bags")
+        found = queried(
+            tmp_path / "rows", "SELECT topic, epoch_ns(header_stamp) FROM memory ORDER BY log_time"
+        )
+        stamps = [("/odom", T0), ("/chatter", None), ("/odom", T0 + 1), ("/odom", T0 + 2)]
+        assert [*found] == stamps
+
     def test_there_is_a_row_for_each_message_by_recording_and_date(
         self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:

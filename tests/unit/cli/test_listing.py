@@ -105,6 +105,12 @@ class TestPaths:
         (folder / "notes.txt").write_text("not a bag")
         assert words in exits(2, "info", *(folder / each for each in name.split())).err
 
+    @pytest.mark.parametrize("words", [("/odom", "gone"), ("gone", "/odom")])
+    def test_beside_a_topic_a_folder_that_is_not_there_is_named(
+        self, exits: Program, words: tuple[str, ...]
+    ) -> None:
+        assert f"neither {' nor '.join(words)} is a file or folder" in exits(2, "cat", *words).err
+
     def test_of_an_empty_folder_one_line_says_so(self, tmp_path: Path, exits: Program) -> None:
         (tmp_path / "empty").mkdir()
         for command in ("info", "topics", "recordings"):

@@ -91,15 +91,31 @@ def test_it_has_what_was_read_and_what_says_when_now_is(
     assert len(found) < 10
 
 
-def test_types_without_a_definition_are_named_and_the_exit_code_is_1(
+def test_types_without_a_definition_are_named_and_exit_1_where_the_answer_rests_on_them(
     tmp_path: Path, exits: Program
 ) -> None:
     odd = [Msg("/odd", "nobody_msgs/msg/Knows", BEGIN, b"\0\1\0\0\0"), text(BEGIN, "x")]
     write_mcap(tmp_path / "bags" / "rec_0.mcap", odd, McapLayout(definitions=False))
-    question = "get_topic_seconds_ago topic=/chatter seconds_ago=0"
-    err = exits(1, "prove", question, "-o", tmp_path / "proof.mcap", tmp_path / "bags").err
-    assert "the same answer" in err
-    assert "nobody_msgs/msg/Knows has no definition" in err
+    for code, topic in ((0, "/chatter"), (1, "/odd")):
+        question = f"get_topic_seconds_ago topic={topic} seconds_ago=0"
+        proof = tmp_path / f"proof_{code}.mcap"
+        err = exits(code, "prove", question, "-o", proof, tmp_path / "bags").err
+        assert "the same answer" in err
+        assert "nobody_msgs/msg/Knows has no definition" in err
+
+
+def test_topics_of_other_recordings_are_left_out(tmp_path: Path, exits: Program) -> None:
+    for nth in range(4):
+        at = BEGIN + nth * DAY_S * S
+        word = text(at, f"word {nth}", topic=f"/chatter_{nth}")
+        odd = Msg("/odd", "nobody_msgs/msg/Knows", at + S, b"\0\1\0\0\0")
+        own = tmp_path / "bags" / f"rec_{nth}"
+        layout = McapLayout(definitions=False)
+        write_mcap(own / "rec_0.mcap", [word, odd] if nth in {1, 2} else [word], layout)
+    proof = tmp_path / "proof.mcap"
+    question = f"get_topic_at_time topic=/chatter_1 timestamp={BEGIN // S + DAY_S}"
+    assert "Knows" not in exits(0, "prove", question, "-o", proof, tmp_path / "bags").err
+    assert [topic for topic, *_ in messages(proof)] == ["/chatter_0", "/chatter_1", "/chatter_3"]
 
 
 def test_what_lay_between_recordings_needs_a_folder(
@@ -114,7 +130,7 @@ def test_what_lay_between_recordings_needs_a_folder(
     proved = exits(0, "prove", question, "-o", folder, two_days, "--json").json
     assert proved == {
         "path": str(folder),
-        "messages": 202,
+        "messages": 201,
         "same": True,
         "differing": [],
         "beside": [],

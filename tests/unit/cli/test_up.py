@@ -125,6 +125,22 @@ def test_only_a_person_has_something_outlive_the_bags(
     assert ("memory.keep=true" in shown) is remembers
 
 
+def test_what_is_to_outlive_the_bags_is_asked_once(
+    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[list[str]] = []
+
+    def run(words: list[str], bag_dir: Path) -> bool:
+        started.append(words)
+        return False
+
+    monkeypatch.setattr("ros2_memory.cli.up._run_programs", run)
+    for typed in ("y\ny\n", ""):
+        monkeypatch.setattr(sys, "stdin", Terminal(typed))
+        exits(0, "up", "--bag-dir", tmp_path / "bags")
+    assert ["memory.keep=true" in words for words in started] == [True, True]
+
+
 def test_a_list_that_cannot_be_written_is_named(exits: Program, tmp_path: Path) -> None:
     file = tmp_path / "nowhere" / "topics.yaml"
     words = ["--bag-dir", tmp_path / "bags", f"recording.topics_file={file}"]

@@ -117,7 +117,7 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     window = TimeWindow(T0, T0 + 30 * S)
     [excluded] = describe_excluded(bags.bag_dir, window)
     assert excluded == (
-        "excluded by privacy (recording.exclude_when), so there is no data of it: "
+        "excluded by the rules of recording.exclude_when, so there is no data of it: "
         f"{T0 // S + 4}.000000 to {T0 // S + 10}.500001"
     )
     assert [*describe_excluded(bags.bag_dir, TimeWindow(T0, T0 + 3 * S))] == []

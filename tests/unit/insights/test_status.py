@@ -208,7 +208,7 @@ def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Pa
     told = shown(memory, tmp_path)
     assert told["doubts"] == "1 split is not served"
     [note] = told["notes"]
-    assert note.startswith("excluded by privacy (recording.exclude_when)")
+    assert note.startswith("excluded by the rules of recording.exclude_when")
     assert note.endswith(": 0.000000 to 1.000000")
 
 

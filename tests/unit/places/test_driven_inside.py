@@ -122,7 +122,7 @@ def test_the_metres_of_a_stop_are_none_and_speeds_are_those_inside(tmp_path: Pat
     write_mcap(tmp_path / "bag.mcap", messages)
     memory = memory_of(tmp_path)
 
-    def between(low: float, high: float) -> tuple[float, float]:
+    def between(low: float, high: float) -> tuple[float, float | None]:
         found = driven_inside(memory, Call(), ALL, where={"x": [low, high], "y": [-1, 1]})
         return found.distance_m, found.max_speed
 

@@ -8,12 +8,12 @@ import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.transforms import connected
 from ros2_memory.history.view import View
 from ros2_memory.places.pose_frames import map_placement
 from tests.support.bags import odom, write_mcap
-from tests.support.memories import memory_of
+from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
 if TYPE_CHECKING:
@@ -68,3 +68,46 @@ def test_a_map_that_no_transform_leads_to_is_denied(tmp_path: Path) -> None:
     view = View(memory_of(tmp_path), Call())
     with pytest.raises(InvalidArgumentsError, match="known in odom only"):
         map_placement(view, "/odom", "map")
+
+
+_HERE: dict[str, object] = {"x": 0.0, "y": 0.0, "radius_m": 2.0}
+_WINDOW: dict[str, object] = {"start": BEGIN // S, "end": BEGIN // S + 200}
+_MOVING: dict[str, object] = {
+    "topic": "/odom",
+    "field": "position.x",
+    "condition_type": "above",
+    "value": -5.0,
+}
+_OVER_RUNS: list[tuple[str, dict[str, object]]] = [
+    ("visits", {"x": 0.0, "y": 0.0}),
+    ("visits", {"by": "day", "where": _HERE, **_WINDOW}),
+    ("find_matches", {**_MOVING, "where": _HERE}),
+    ("find_matches", {**_MOVING, "where": _HERE, "by": "day", **_WINDOW}),
+    ("compare", {"with_start": BEGIN // S, "with_end": BEGIN // S + 200, **_WINDOW}),
+    ("recap", {"where": _HERE, **_WINDOW}),
+    ("trajectory_summary", _WINDOW),
+    ("trajectory_summary", {"where": _HERE, **_WINDOW}),
+    ("trajectory_summary", {"by": "place", "where": _HERE, **_WINDOW}),
+]
+"""Calls of tools that take a place, or return places."""
+
+
+@pytest.mark.parametrize(("tool", "given"), _OVER_RUNS)
+def test_places_over_several_runs_of_odometry_have_a_note(
+    tmp_path: Path, tool: str, given: dict[str, object]
+) -> None:
+    """The same coordinates are not the same place, unless a map places both runs."""
+    drive = [odom(BEGIN + n * S // 5, min(n / 50, 1.0), 0.0) for n in range(300)]
+    write_mcap(tmp_path / "first" / "first_0.mcap", drive)
+    alone = asked(memory_of(tmp_path), tmp_path, tool, **given)
+    assert "error" not in alone
+    assert not any("changes with every start" in note for note in alone.get("notes", ()))
+
+    again = [odom(BEGIN + n * S // 5, min(n / 50 - 10, 1.0), 0.0) for n in range(500, 800)]
+    write_mcap(tmp_path / "second" / "second_0.mcap", again)
+    both = asked(memory_of(tmp_path), tmp_path, tool, **given)
+    (note,) = [note for note in both["notes"] if "changes with every start" in note]
+    assert "the origin of odom" in note
+    on_map = memory_of(tmp_path, limits=QuerySettings(map_frame="odom"))
+    placed = asked(on_map, tmp_path, tool, **given)
+    assert not any("changes with every start" in note for note in placed.get("notes", ()))

@@ -39,6 +39,8 @@ TOLERANCE_M: Final = 0.05
 """How far a pose may be from the drawn path, unless a limit on count widens it."""
 MAX_WAYPOINTS: Final = 50
 """Vertices of the path that is returned, unless more or fewer are asked for."""
+LEAST_OF_SPEED_S: Final = 0.5
+"""Of poses that span less, noise is as large as what was driven: they say no speed."""
 
 _MOST_VERTICES: Final = 400
 """Vertices that a slice stores of its path, but for the ends of jumps."""
@@ -65,6 +67,11 @@ class Waypoint:
     jump: bool = False
 
 
+def mean_speed(distance_m: float, duration_s: float) -> float | None:
+    """Returns metres by seconds; None of less than `LEAST_OF_SPEED_S`."""
+    return distance_m / duration_s if duration_s >= LEAST_OF_SPEED_S else None
+
+
 @dataclass(frozen=True, slots=True)
 class Trajectory:
     """The measurements of a driven path.
@@ -72,8 +79,9 @@ class Trajectory:
     Attributes:
         totals: path length in 3D in log-time order, as far as its noise allows (see
             `path_length`), and what is left out of it.
-        avg_speed: `distance_m / duration_s` (m/s); 0 where there is no duration.
-        max_speed: the highest speed (m/s), from `max_speed_from`.
+        avg_speed: `distance_m / duration_s` (m/s); None of less than `LEAST_OF_SPEED_S`.
+        max_speed: the highest speed (m/s), from `max_speed_from`; None as `avg_speed`, unless
+            messages state it.
         max_speed_from: `twist`: the messages' own; `positions`: over a second and eight poses.
         waypoints: vertices of the path drawn in space and time: first and last pose, corners,
             turning points, ends of stops, and both ends of the longest jumps.
@@ -83,8 +91,8 @@ class Trajectory:
     """
 
     totals: MotionTotals
-    avg_speed: float
-    max_speed: float
+    avg_speed: float | None
+    max_speed: float | None
     max_speed_from: Literal["twist", "positions"]
     waypoints: tuple[Waypoint, ...]
     waypoint_error_m: float
@@ -200,11 +208,12 @@ class PathSlice:
         It is not drawn at all for 0; else with 2 at least.
         """
         distance_m, duration_s = self.totals.distance_m, self.totals.duration_s
-        avg_speed = distance_m / duration_s if duration_s > 0 else 0.0
+        avg_speed = mean_speed(distance_m, duration_s)
         # Drivers without a twist leave it zero, which is wrong where the robot moved.
         stated = self.twist if self.twist or not distance_m else None
         step_mps = self.step_mps if self.poses <= SPEED_STEPS else 0.0
         measured = self.totals.speed_mps or step_mps
+        fastest = None if avg_speed is None else max(measured, avg_speed)
         waypoints: tuple[Waypoint, ...] = ()
         error_m = 0.0
         if max_waypoints and len(self.line):
@@ -212,7 +221,7 @@ class PathSlice:
         return Trajectory(
             self.totals,
             avg_speed,
-            max(measured, avg_speed) if stated is None else stated,
+            fastest if stated is None else stated,
             "positions" if stated is None else "twist",
             waypoints,
             error_m,

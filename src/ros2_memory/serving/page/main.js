@@ -123,8 +123,11 @@ async function look(isMore = false, isPatient = false) {
     if (reply.status) statusAt = lookedAt;
     if (reply.recordings && !reply.mixed.length) reply.paths = [];
     if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
-    state.view = isMore && view && view.path !== undefined ? continued(view, reply) : whole(reply);
-    Object.assign(state.view, { recording, poses });
+    // Of the same span, what there was no time for stays as it was.
+    const of = [recording, poses, state.last, state.last === null ? given.get("start") + given.get("end") : ""].join();
+    state.view = isMore && view && view.path !== undefined ? continued(view, reply)
+      : whole(reply, view && view.asked === of ? view : null);
+    Object.assign(state.view, { recording, poses, asked: of });
     // Of another span, or of more of it, the path is looked up anew; what came since goes on from it.
     const { start, path } = state.view;
     state.view.of = isMore ? view.of : [recording, poses, start, path && path.whole, Boolean(state.view.filling)].join();
@@ -133,7 +136,7 @@ async function look(isMore = false, isPatient = false) {
     if (reply.status) lookAtTopics();
     if (reply.whole_ms !== undefined) lookAtLabels();
     // What takes long comes later: the rest can be looked at until then.
-    const isPart = reply.range && reply.range.earliest !== null && !(reply.events && reply.path !== undefined);
+    const isPart = reply.range && reply.range.earliest !== null && !isWhole(reply, given);
     if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
   } catch (error) {
     if (mine !== asking || error.name === "AbortError") return;
@@ -240,9 +243,15 @@ function always(reply, range) {
   return reply.throughout.flatMap((label) => spans.map(
     (span) => ({ kind: "thing", ...span, text: `${label} in view` })));
 }
-function whole(reply) {
-  return { path: null, paths: [], seen: null, robot: null, places: [], moments: [], owed: null, ...reply, things: reply.things || [],
-    events: reply.events || [], isWhole: Boolean(reply.events && reply.path !== undefined) };
+/* Whether an answer has all that was asked for, and that takes long. */
+function isWhole(reply, given) {
+  return Boolean(reply.events && reply.path !== undefined && (reply.things || given.get("things") === "0"))
+    && !(reply.paths || []).some((each) => each.late);
+}
+function whole(reply, before) {
+  const { path = null, paths = [], seen = null, robot = null, places = [], things = [], events = [] } = before || {};
+  return { path, paths, seen, robot, places, things, events, moments: [], owed: null, ...reply,
+    isWhole: isWhole(reply, new URLSearchParams()) };
 }
 /* What is shown, with an answer about what came since. */
 function continued(view, reply) {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import is_kept_apart
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import unix_from_ns
@@ -130,7 +130,8 @@ class Recordings:
             try:
                 path = path_in(self.alone(memory, name), call, window)
             except EpisodicError as error:
-                found.append({"name": name, "error": str(error)})
+                late = {"late": True} if isinstance(error, QueryTimeoutError) else {}
+                found.append({"name": name, "error": str(error), **late})
                 continue
             if path is not None:
                 found.append({"name": name, **path})

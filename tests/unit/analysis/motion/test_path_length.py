@@ -95,6 +95,7 @@ def test_an_hour_of_standing_with_10_mm_of_noise_is_no_way(hertz: int, axes: int
     assert in_bags.totals.distance_m < 0.1
     assert whole.is_noisy
     assert whole.totals.path_sum_m == pytest.approx(plain_sum(poses), rel=1e-9)
+    assert whole.max_speed is not None
     assert whole.max_speed < 0.01
 
 

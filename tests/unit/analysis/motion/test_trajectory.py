@@ -17,6 +17,7 @@ from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import Pose
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from ros2_memory.history.driven_path import length_notes
 from tests.support.rosbags_oracle import messages
 from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import points
@@ -103,7 +104,7 @@ def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
 
 
 def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
-    found = summarise(driven(along_x(0, 0.1, 0.2, 0.7, 0.8), 100 * MS), LIMIT_MPS)
+    found = summarise(driven(along_x(0, 0.1, 0.2, 0.7, 0.8, 0.9), 100 * MS), LIMIT_MPS)
     assert found.max_speed == pytest.approx(5.0)
 
 
@@ -122,6 +123,8 @@ def test_of_few_poses_the_distance_is_the_plain_length(
     found = summarise(driven(positions), 1e9)
     assert found.totals.distance_m == pytest.approx(path_length(positions), rel=1e-12)
     assert found.totals.jumps == 0
+    assert found.max_speed is not None
+    assert found.avg_speed is not None
     assert found.max_speed >= found.avg_speed
 
 
@@ -138,13 +141,13 @@ def test_distances_of_two_parts_that_share_a_pose_add_up(
 
 def test_no_pose_makes_an_empty_trajectory() -> None:
     assert summarise([], LIMIT_MPS) == Trajectory(
-        MotionTotals(), 0.0, 0.0, "positions", (), 0.0, 0, 0
+        MotionTotals(), None, None, "positions", (), 0.0, 0, 0
     )
 
 
 def test_one_pose_is_a_place_without_a_way() -> None:
     found = summarise(driven(along_x(2.0)), LIMIT_MPS)
-    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.0, 0.0, 0.0)
+    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.0, 0.0, None)
     assert [waypoint.position for waypoint in found.waypoints] == [(2.0, 0.0, 0.0)]
 
 
@@ -176,13 +179,25 @@ def test_poses_that_arrive_in_a_burst_do_not_make_the_robot_fast() -> None:
     found = summarise([(time, Pose(position, None), None) for time, position in burst], LIMIT_MPS)
     assert found.totals.jumps == 0
     assert found.totals.distance_m == pytest.approx(199 * 0.02)
+    assert found.max_speed is not None
     assert found.max_speed < 6.0
 
 
 def test_poses_of_one_moment_are_a_way_and_no_division_by_zero() -> None:
     found = summarise(driven(along_x(0.0, 0.3, 0.6), 0), LIMIT_MPS)
-    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.6, 0.0, 0.0)
-    assert (found.totals.jumps, found.max_speed) == (0, 0.0)
+    assert (found.totals.distance_m, found.totals.duration_s, found.avg_speed) == (0.6, 0.0, None)
+    assert (found.totals.jumps, found.max_speed) == (0, None)
+
+
+@pytest.mark.parametrize(("count", "is_known"), [(3, False), (25, False), (26, True)])
+def test_poses_within_less_than_half_a_second_say_no_speed(count: int, is_known: bool) -> None:
+    poses = along_x(*(n * 0.8 for n in range(count)))
+    measured = summarise(driven(poses, 20 * MS), 100.0)
+    stated = summarise(driven(poses, 20 * MS, [1.5] * count), 100.0)
+    speed = pytest.approx(40.0) if is_known else None
+    assert (measured.avg_speed, measured.max_speed) == (speed, speed)
+    assert (stated.avg_speed, stated.max_speed) == (speed, 1.5)
+    assert any("too short to say how fast" in note for note in length_notes(stated)) != is_known
 
 
 # Jumps and invalid poses
