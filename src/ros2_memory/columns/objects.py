@@ -50,9 +50,9 @@ def _add_fixed(level: Level, entry: Number | Time | Array, messages: Values[obje
     elif isinstance(entry, Array):
         level.columns[f"{entry.path}.length"] = np.full(len(values), entry.length, np.uint32)
         if entry.is_ranged:
-            counts = np.full(len(values), entry.length)
-            arrays = np.array([_numbers(value) for value in values]).reshape(-1)
-            add_ranges(level.columns, entry.path, counts, arrays, is_bool=entry.is_bool)
+            arrays = np.array([_numbers(value) for value in values])
+            table = arrays.reshape(len(values), entry.length)
+            add_ranges(level.columns, entry.path, table, is_bool=entry.is_bool)
     else:
         if entry.nth is not None:
             values = [_numbers(value)[entry.nth] for value in values]

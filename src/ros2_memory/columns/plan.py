@@ -135,6 +135,9 @@ class Plan:
         steps: in the order of the payload.
         align: the alignment of the first field.
         least: the fewest bytes that such a message takes.
+        unit: the alignment that its layout depends on.
+        ends: if its size is fixed, where it ends when it begins 0, 1, .. `unit` - 1 bytes behind a
+            multiple of `unit`; else empty.
         left_out: see `Table.left_out`.
         has_objects: whether it has strings or sequences of messages.
     """
@@ -142,6 +145,8 @@ class Plan:
     steps: tuple[Step, ...]
     align: int
     least: int
+    unit: int
+    ends: tuple[int, ...]
     left_out: dict[str, str]
     has_objects: bool
 
@@ -182,14 +187,25 @@ class _Planner:
     align: int = 1
     size: int = 0
     read: list[tuple[Number | Time | Array, str, int]] = field(default_factory=list)
+    # Alignment and size of all fields, while their sizes are fixed.
+    layout: list[tuple[int, int]] | None = field(default_factory=list)
     first: int = 0
     least: int = 0
 
     def finished(self) -> Plan:
         """Returns the plan of the fields that were added."""
         self._flush()
+        layout = self.layout or ()
+        unit = max((align for align, _ in layout), default=1)
+        ends = () if self.layout is None else tuple(self._end(start) for start in range(unit))
         objects = any(isinstance(step, Text | Sequence) for step in self.steps)
-        return Plan(tuple(self.steps), self.first or 1, self.least, self.left_out, objects)
+        steps, left_out = tuple(self.steps), self.left_out
+        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, objects)
+
+    def _end(self, at: int) -> int:
+        for align, size in self.layout or ():
+            at += -at % align + size
+        return at
 
     def add_message(self, definition: Definition, path: str, attribute: str) -> None:
         """Adds the fields of a message at a path."""
@@ -271,7 +287,7 @@ class _Planner:
             return
         self.first = self.first or first
         self.least += length * inner.least
-        self.unit, self.rest = 1, 0
+        self.layout, self.unit, self.rest = None, 1, 0
 
     def _fixed(self, read: Number | Time | Array, dtype: str, align: int, size: int) -> None:
         """Adds a field of fixed size to the run."""
@@ -287,6 +303,8 @@ class _Planner:
         self.rest = (self.rest + before + size) % self.unit
         self.first = self.first or align
         self.least += size
+        if self.layout is not None:
+            self.layout.append((align, size))
 
     def _flush(self) -> None:
         """Ends the run."""
@@ -311,7 +329,7 @@ class _Planner:
 
     def _behind(self, unit: int, least: int) -> None:
         """Goes on behind something of variable size, where `unit` is what is known."""
-        self.unit, self.rest = unit, 0
+        self.unit, self.rest, self.layout = unit, 0, None
         self.least += least
 
 

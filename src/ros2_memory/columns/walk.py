@@ -9,6 +9,7 @@ the decoder, which decides message by message.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -24,10 +25,9 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Column, Numbers
     from ros2_memory.storage.base import Batch, IntArray
 
-_MOST_STEPS: Final = 4_000
 _FEW_ROWS: Final = 24
-"""With fewer rows on average and more steps, the elements of sequences are sooner decoded one by
-one than nth by nth."""
+"""With fewer rows on average, the elements of sequences are sooner passed one by one than nth by
+nth."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
 _HEADER_BYTES: Final = 4
@@ -35,9 +35,11 @@ _LITTLE_ENDIAN: Final = 0x0100
 """The first two bytes of the header of plain CDR in little endian, as a number in little endian."""
 _MAX_PADDING: Final = 3
 _EVERY_BYTE: Final = (1,)
+_LENGTH: Final = struct.Struct("<I")
 
 
 Row: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
+Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
 
 class NotWalkedError(Exception):
@@ -71,7 +73,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
         level = Level(left_out=dict(plan.left_out))
         rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
-    except (IndexError, UnicodeDecodeError) as error:
+    except (IndexError, UnicodeDecodeError, struct.error) as error:
         raise NotWalkedError from error
     left = rows.sizes - end
     if left.min() < 0 or left.max() > _MAX_PADDING:
@@ -135,14 +137,13 @@ class _Walk:
 
     def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
         columns = level.columns
-        count = max(len(self.buffer) - run.dtype.itemsize + 1, 0)
-        block = np.ndarray(count, run.dtype, self.buffer, 0, _EVERY_BYTE)[places]
+        # As bytes: field by field numpy gathers ten times as long.
+        block = self.at(f"V{run.dtype.itemsize}", places).view(run.dtype)
         for nth, entry in enumerate(run.fields):
             if isinstance(entry, Array):
                 columns[f"{entry.path}.length"] = np.full(places.size, entry.length, np.uint32)
                 if entry.is_ranged:
-                    counts, values = np.full(places.size, entry.length), block[str(nth)].reshape(-1)
-                    add_ranges(columns, entry.path, counts, values, is_bool=entry.is_bool)
+                    add_ranges(columns, entry.path, block[str(nth)], is_bool=entry.is_bool)
             elif isinstance(entry, Time):
                 time = block[str(nth)]
                 columns[entry.path] = time["f0"] * np.int64(NS_PER_S) + time["f1"]
@@ -172,12 +173,16 @@ class _Walk:
         if not rows:
             return Texts(np.zeros(0, np.uint32), ())
         size = int(sizes[0])
+        words: list[bytes]
         if (sizes == size).all():
             data = self.at(f"V{size}", places).tobytes() if size else b""
             if data == data[:size] * rows:
                 return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
-        ends, buffer = (places + sizes).tolist(), self.buffer
-        words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
+            words = [data[begin : begin + size] for begin in range(0, len(data), size)]
+        else:
+            ends = (places + sizes).tolist()
+            buffer = self.buffer
+            words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
         known: dict[bytes, int] = {}
         codes = [known.setdefault(word, len(known)) for word in words]
         return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
@@ -223,7 +228,10 @@ class _Walk:
         if (at + counts * max(step.plan.least, 1) > rows.sizes).any():
             raise NotWalkedError
         owners = np.repeat(np.arange(at.size), counts)
-        begins, end = self._stepped(step.plan, rows, at, counts)
+        if step.plan.ends:
+            begins, end = _steady(step.plan, at, counts, owners)
+        else:
+            begins, end = self._stepped(step.plan, rows, at, counts)
         if (end > rows.sizes).any():
             raise NotWalkedError
         if level is not None:
@@ -236,10 +244,10 @@ class _Walk:
     def _stepped(
         self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
-        """Returns where elements begin, and where their sequences end."""
+        """Returns where elements of various sizes begin, and where their sequences end."""
         most, total = int(counts.max(initial=0)), int(counts.sum())
-        if most > _MOST_STEPS and total < _FEW_ROWS * most:
-            raise NotWalkedError
+        if total < _FEW_ROWS * most:
+            return self._passed_each(plan, rows, at, counts)
         first = np.cumsum(counts) - counts
         begins = np.zeros(total, np.int64)
         end = at
@@ -255,6 +263,68 @@ class _Walk:
                 end = end.copy()
                 end[left] = behind
         return begins, end
+
+    def _passed_each(
+        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Returns what `_stepped` does, element by element."""
+        begins: list[int] = []
+        ends: list[int] = []
+        spans = zip(rows.origins.tolist(), rows.sizes.tolist(), at.tolist(), strict=True)
+        for (origin, size, position), count in zip(spans, counts.tolist(), strict=True):
+            here = position
+            for _ in range(count):
+                here += -here % plan.align
+                begins.append(here)
+                here = self._passed(plan, origin, here, size)
+            ends.append(here)
+        return np.array(begins, np.int64), np.array(ends, np.int64)
+
+    def _passed(self, plan: Plan, origin: int, at: int, size: int) -> int:
+        """Returns where a message ends that begins `at` behind its origin."""
+        for step in plan.steps:
+            if isinstance(step, Run):
+                at += -at % step.align + step.size
+                continue
+            if isinstance(step, Sequence) and step.length != SEQUENCE:
+                count = step.length
+            else:
+                at += -at % step.align + step.skip
+                (count,) = _LENGTH.unpack_from(self.buffer, origin + at)
+                at += 4
+            if isinstance(step, Text):
+                at += count
+            elif isinstance(step, NumberSequence):
+                at += (-at % step.size if count and step.size > 4 else 0) + count * step.size
+            elif at + count * max(step.plan.least, 1) > size:
+                raise NotWalkedError
+            else:
+                for _ in range(count):
+                    at = self._passed(step.plan, origin, at + -at % step.plan.align, size)
+            if at > size:
+                raise NotWalkedError
+        return at
+
+
+def _steady(
+    plan: Plan, at: IntArray, counts: IntArray, owners: IntArray
+) -> tuple[IntArray, IntArray]:
+    """Returns where elements of a fixed layout begin, and where their sequences end.
+
+    The first begins anywhere; behind it all are equally far apart, since the last field of the
+    strictest alignment puts whatever follows it at the same distance from a multiple.
+    """
+    unit, ends = plan.unit, np.array(plan.ends)
+    first = _aligned(at, plan.align)
+    rest = first % unit
+    second = _aligned(first - rest + ends[rest], plan.align)
+    steady = second % unit
+    step = _aligned(ends[steady], plan.align) - steady
+    nth = within(counts)
+    begins = np.where(nth == 0, first[owners], second[owners] + (nth - 1) * step[owners])
+    last = np.where(counts > 1, second + (counts - 2) * step, first)
+    end = last - last % unit + ends[last % unit]
+    return begins, np.where(counts > 0, end, at)
 
 
 def within(counts: IntArray) -> IntArray:
@@ -275,41 +345,68 @@ def add_sequence(
         values: those of the rows that take no more than `MAX_RANGED_BYTES`, in order.
         is_bool: whether they are booleans.
     """
+    if is_bool:
+        values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
     level.columns[f"{path}.length"] = counts.astype(np.uint32)
     ranged = counts * values.itemsize <= MAX_RANGED_BYTES
-    add_ranges(level.columns, path, np.where(ranged, counts, 0), values, is_bool=is_bool)
+    least, greatest = _ranges(np.where(ranged, counts, 0), values)
+    level.columns[f"{path}.least"], level.columns[f"{path}.greatest"] = least, greatest
     few = counts <= MAX_NUMBERS
     kept = np.repeat(few[ranged], counts[ranged])
     numbers = values if kept.all() else values[kept]
     owners = np.repeat(np.arange(counts.size), np.where(few, counts, 0))
-    level.elements[path] = Elements(owners, {"": numbers != 0 if is_bool else numbers})
+    level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
     if not few.all():
         level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
 
 
-def add_ranges(
-    columns: dict[str, Column], path: str, counts: IntArray, values: Numbers, *, is_bool: bool
-) -> None:
-    """Adds the least and greatest finite value of each row; NaN where there is none.
-
-    Args:
-        columns: take them.
-        path: of the array.
-        counts: the numbers of each row.
-        values: those of all rows, in order.
-        is_bool: whether they are booleans.
-    """
-    if is_bool:
-        values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
-    least, filled = np.full(counts.size, np.nan), counts > 0
+def _ranges(counts: IntArray, values: Numbers) -> tuple[Floats, Floats]:
+    """Returns the least and greatest finite value of each row; NaN where there is none."""
+    least = np.full(counts.size, np.nan)
     greatest = least.copy()
+    filled = counts > 0
     if values.size:
         begins = (np.cumsum(counts) - counts)[filled]
-        low = high = values
-        if values.dtype.kind == "f" and not (finite := np.isfinite(values)).all():
-            low, high = np.where(finite, values, np.inf), np.where(finite, values, -np.inf)
-        least[filled] = np.minimum.reduceat(low, begins)
-        greatest[filled] = np.maximum.reduceat(high, begins)
-        none = least > greatest
-        least[none] = greatest[none] = np.nan
+        low, high = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
+        if not _are_finite(low, high):
+            least_of, greatest_of = _finite_only(values)
+            low = np.minimum.reduceat(least_of, begins)
+            high = np.maximum.reduceat(greatest_of, begins)
+        least[filled], greatest[filled] = low, high
+        _unbounded(least, greatest)
+    return least, greatest
+
+
+def add_ranges(columns: dict[str, Column], path: str, values: Numbers, *, is_bool: bool) -> None:
+    """Adds the least and greatest finite value of each row of numbers."""
+    if is_bool:
+        values = (values != 0).view(np.uint8)
+    # Numpy goes along the last axis, so that the shorter one comes first.
+    table = np.ascontiguousarray(values.T)
+    least, greatest = table.min(0), table.max(0)
+    if not _are_finite(least, greatest):
+        low, high = _finite_only(table)
+        least, greatest = low.min(0), high.max(0)
+    least, greatest = least.astype(np.float64), greatest.astype(np.float64)
+    _unbounded(least, greatest)
     columns[f"{path}.least"], columns[f"{path}.greatest"] = least, greatest
+
+
+def _are_finite(least: Numbers, greatest: Numbers) -> bool:
+    """Returns whether all numbers were finite: NaN and infinities are among their bounds."""
+    if least.dtype.kind != "f":
+        return True
+    return bool(np.isfinite(least).all() and np.isfinite(greatest).all())
+
+
+def _finite_only(values: Numbers) -> tuple[Numbers, Numbers]:
+    """Returns the values twice, with what is not finite put where it is neither bound."""
+    finite = np.isfinite(values)
+    return np.where(finite, values, np.inf), np.where(finite, values, -np.inf)
+
+
+def _unbounded(least: Floats, greatest: Floats) -> None:
+    """Puts NaN where no value was finite."""
+    none = least > greatest
+    if none.any():
+        least[none] = greatest[none] = np.nan
