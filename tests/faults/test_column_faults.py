@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from multiprocessing.process import BaseProcess
     from pathlib import Path
 
-    from ros2_memory.columns.database import Tables
 
 KILLS = 100 if LONG else 3
 SPANNED = {"get_topic_in_range", "find_matches"}
@@ -50,8 +49,8 @@ class StatementCounter:
         self._kill_at = kill_at
         self._connect = database._connect
 
-    def connect(self, target: str, tables: Tables) -> sqlite3.Connection:
-        connection = self._connect(target, tables)
+    def connect(self, target: str) -> sqlite3.Connection:
+        connection = self._connect(target)
         connection.set_trace_callback(self._trace)
         return connection
 
@@ -70,7 +69,7 @@ def fill_up(bag_dir: Path, kill_at: int = 0, small_bytes: int = 0) -> int:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_connect", counter.connect)
         patch.setattr(fill, "LARGE_BYTES", small_bytes)
-        patch.setattr(fill, "decoded_groups", in_groups)
+        patch.setattr(fill, "decoded", in_groups)
         World.of(bag_dir).fill()
     return counter.count
 
@@ -188,7 +187,7 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
     with pytest.MonkeyPatch.context() as patch:
         whole = LongBag.end
         patch.setattr(LongBag, "end", end)
-        patch.setattr(fill, "decoded_groups", in_groups)
+        patch.setattr(fill, "decoded", in_groups)
         assert filling.fill_alone() == 1
     assert found == [set()]
     assert asking.stored() == filling.stored() != set()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
-import time
 from contextlib import closing
 from typing import TYPE_CHECKING, NoReturn
 
@@ -14,8 +13,7 @@ import anyio.lowlevel
 import pytest
 import structlog
 
-from ros2_memory.columns import fill
-from ros2_memory.columns.database import RETRY_S
+from ros2_memory.columns import database, fill
 from ros2_memory.columns.decode import pieces
 from ros2_memory.columns.fill import RETRY_NS, Progress
 from ros2_memory.columns.units import GoneError
@@ -190,7 +188,9 @@ def test_an_older_copy_of_the_store_put_in_its_place_misleads_nobody(tmp_path: P
     assert told(memory) == plainly(tmp_path)
 
 
-def test_a_store_locked_at_the_start_is_gone_back_to(tmp_path: Path) -> None:
+def test_a_store_locked_at_the_start_is_gone_back_to(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_bags(tmp_path)
     _, filler = served(tmp_path)
     fill_up(filler)
@@ -198,18 +198,16 @@ def test_a_store_locked_at_the_start_is_gone_back_to(tmp_path: Path) -> None:
     right = plainly(tmp_path)
     store_of(filler).close()
     memory, filler = served(tmp_path)
-    store, passed = store_of(filler), [0.0]
-    store._monotonic = lambda: time.monotonic() + passed[0]
+    store = store_of(filler)
+    monkeypatch.setattr(database, "RETRY_S", 0.0)
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
         other.execute("PRAGMA locking_mode = EXCLUSIVE")
         other.execute("BEGIN EXCLUSIVE")
         assert told(memory) == right
         assert store.trouble == "is kept in memory: another program has locked its file"
         fill_up(filler)
-        passed[0] += RETRY_S
         filler.look_after()
         assert store.path is None
-    passed[0] += RETRY_S
     filler.look_after()
     assert store_of(filler).path == path
     assert store_of(filler).trouble is None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pytest
 
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -38,7 +38,8 @@ def shared_samples(folder: str) -> list[tuple[Table, list[object]]]:
     found = []
     for path in sorted([*(BAGS / folder).rglob("*.mcap"), *(BAGS / folder).rglob("*.db3")]):
         try:
-            tables = {_key_of(table.channel): table for table in chain(*decoded(reader, path))}
+            groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
+            tables = {_key_of(table.channel): table for table in chain(*groups)}
         except BagError:
             continue
         new = {
@@ -64,7 +65,7 @@ def _sampled(
     reader: Rosbag2Reader, table: Table, records: list[Record]
 ) -> tuple[Table, list[object]]:
     rows = np.unique(np.linspace(0, len(table) - 1, _SAMPLED_ROWS).astype(np.int64))
-    if table.undecodable:
+    if len(records) > len(table):
         records = [record for record in records if _is_decodable(reader, record)]
     assert len(records) == len(table)
     return table.rows(rows), [reader.decode(records[row]) for row in rows]

@@ -13,8 +13,7 @@ however long ago that is.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -30,8 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import IntArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Identities:
+class Identities(NamedTuple):
     """What tells messages apart, of messages of one topic.
 
     Attributes:
@@ -48,22 +46,12 @@ class Identities:
 
     def rows(self, positions: IntArray) -> Identities:
         """Returns some of them."""
-        return Identities(
-            self.log_times[positions],
-            self.publish_times[positions],
-            self.hashes[positions],
-            self.recordings[positions],
-        )
+        return Identities(*(column[positions] for column in self))
 
 
 def joined_identities(parts: Sequence[Identities]) -> Identities:
     """Returns all messages of several parts, in this order."""
-    return Identities(
-        np.concatenate([part.log_times for part in parts]),
-        np.concatenate([part.publish_times for part in parts]),
-        np.concatenate([part.hashes for part in parts]),
-        np.concatenate([part.recordings for part in parts]),
-    )
+    return Identities(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def copies_among(messages: Identities) -> NDArray[np.bool_]:
@@ -80,10 +68,7 @@ def copies_among(messages: Identities) -> NDArray[np.bool_]:
     some = messages.rows(order)
     rows = zip(
         order.tolist(),
-        some.log_times.tolist(),
-        some.publish_times.tolist(),
-        some.hashes.tolist(),
-        some.recordings.tolist(),
+        *(column.tolist() for column in some),
         strict=True,
     )
     for row, time, published, payload, recording in rows:

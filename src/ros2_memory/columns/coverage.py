@@ -70,8 +70,6 @@ class Coverage:
         self._begins: IntArray = begins
         self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
         self._numbers: IntArray = everything[self._order]
-        hashed = [each.hashed for each in segments]
-        self._hashed = (np.concatenate(hashed) if hashed else np.empty(0, np.bool_))[self._order]
 
     def missing_in(self, window: TimeWindow) -> Iterator[BagFile]:
         """Yields the bags that are not stored and have messages in a window or near it."""
@@ -79,24 +77,19 @@ class Coverage:
             if each.missing and window.overlaps(each.segment.first[0], each.segment.latest):
                 yield from each.missing
 
-    def positions(self, numbers: IntArray) -> IntArray:
-        """Returns where these bags are among those that are stored; -1 of others."""
+    def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
+        """Returns which of some numbers are of bags of the timeline."""
         if not self._numbers.size:
-            return np.full(numbers.shape, -1)
+            return np.zeros(numbers.shape, np.bool_)
         at = np.minimum(np.searchsorted(self._numbers, numbers), self._numbers.size - 1)
-        return np.where(self._numbers[at] == numbers, at, -1)
-
-    def among(self, numbers: IntArray) -> IntArray:
-        """Returns those of some numbers whose bags are bags of the timeline."""
-        are_there = self.positions(numbers) >= 0
-        return numbers if are_there.all() else numbers[are_there]
+        are_there: NDArray[np.bool_] = self._numbers[at] == numbers
+        return are_there
 
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
-        """Returns the same of the numbers of a part, which are looked up once."""
-        found = self._of_parts.get(part)
-        if found is None:
-            found = self._of_parts[part] = self.among(numbers)
-        return found
+        """Returns those of the numbers of a part whose bags are bags of the timeline."""
+        if part not in self._of_parts:
+            self._of_parts[part] = numbers[self._are_there(numbers)]
+        return self._of_parts[part]
 
     def counts(self, groups: Sequence[IntArray]) -> IntArray:
         """Returns of how many bags of each group, which has one at least, rows count."""
@@ -104,7 +97,7 @@ class Coverage:
             return np.zeros(0, np.int64)
         begins = np.cumsum([0, *(group.size for group in groups)])[:-1]
         counting: IntArray = np.add.reduceat(
-            self.positions(np.concatenate(groups)) >= 0, begins, dtype=np.int64
+            self._are_there(np.concatenate(groups)), begins, dtype=np.int64
         )
         return counting
 

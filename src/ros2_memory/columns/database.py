@@ -16,6 +16,8 @@ from contextlib import closing, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from ros2_memory.columns.pack import FORMAT
+from ros2_memory.columns.schema import PRAGMAS, STATEMENTS, TABLES
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
@@ -39,32 +41,11 @@ _FEW_PAGES: Final = 256
 """Unused pages that stay in the file, for what is written next."""
 _SUFFIXES: Final = ("-wal", "-shm")
 """The files that SQLite keeps beside one in WAL mode: the write-ahead log and its index."""
+_FIRST_ROWS: Final = f"SELECT {', '.join(f'(SELECT 1 FROM {name})' for name in TABLES)}"
+"""Looks where each table begins."""
 T = TypeVar("T")
 
 log = get_logger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Tables:
-    """The tables of a database, and what distinguishes a file that has them.
-
-    Attributes:
-        version: of the tables and of their content; a file of any other version is set aside.
-        statements: the `CREATE` statements, separated by semicolons.
-        names: of the tables, of which the first rows are read to see that a file is intact.
-        pragmas: settings of each connection, made before anything else.
-    """
-
-    version: int
-    statements: str
-    names: tuple[str, ...]
-    pragmas: tuple[str, ...] = ()
-
-    @property
-    def first_rows(self) -> str:
-        """The query that looks where each table begins."""
-        looks = (f"(SELECT 1 FROM {name})" for name in self.names)
-        return f"SELECT {', '.join(looks)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,26 +85,20 @@ class Database:
         paths: where the file may lie, in order of preference; a database in memory serves where
             none can be written. Where the candidates may change, a function that returns those
             of the moment.
-        tables: what the file holds.
         sources: other files that may be copied to a path that has none yet; only read.
         waits_for: a directory; while it does not exist, nothing is opened or made.
-        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
         self,
         paths: Sequence[Path] | Callable[[], Sequence[Path]],
-        tables: Tables,
         *,
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
-        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._candidate_paths = paths if callable(paths) else lambda: paths
-        self._tables = tables
         self._sources = tuple(sources)
         self._waits_for = waits_for
-        self._monotonic = monotonic
         self._lock = threading.Lock()
         self._opened: OpenDatabase | None = None
         self._databases = 0
@@ -187,16 +162,16 @@ class Database:
 
     def write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
         """Writes all or nothing; returns whether it was written."""
-        give_up_s = self._monotonic() + BUSY_S
+        give_up_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:
                 opened = self._ready()
                 if opened is None:
                     return False
                 try:
-                    _transact(opened.connection, write, self._tables if self.is_failing else None)
+                    _transact(opened.connection, write, is_probe=self.is_failing)
                 except (sqlite3.Error, MemoryError) as error:
-                    if not is_busy(error) or self._monotonic() >= give_up_s:
+                    if not is_busy(error) or time.monotonic() >= give_up_s:
                         self._failed(error)
                         return False
                 # A number or text that SQLite cannot store: the bags stay without an entry.
@@ -255,12 +230,12 @@ class Database:
             if not opened.is_in_place():
                 self._lose("its file was deleted or replaced", aside=opened.is_mixed())
                 return
-        if self._monotonic() - self._tried_s >= RETRY_S:
+        if time.monotonic() - self._tried_s >= RETRY_S:
             self._move_to_preferred_path(opened)
         if opened.path is None or self._opened is not opened:
             return
         # SQLite's page cache hides that the file was overwritten, so another connection looks.
-        fault = _fault_of(opened.path, self._tables, thorough=thorough)
+        fault = _fault_of(opened.path, thorough=thorough)
         if fault is not None and not is_transient(fault):
             with self._lock:
                 if self._opened is opened:
@@ -274,10 +249,10 @@ class Database:
     def _ready(self) -> OpenDatabase | None:
         """Returns the open database, opening one first if need be; None where it may not."""
         if self._opened is None and self._may_open():
-            self._tried_s = self._monotonic()
+            self._tried_s = time.monotonic()
             paths = self._candidate_paths()
-            found = open_file(paths, self._tables, sources=self._sources)
-            self._opened = _in_memory(self._tables) if isinstance(found, str) else found
+            found = open_file(paths, sources=self._sources)
+            self._opened = _in_memory() if isinstance(found, str) else found
             self.trouble = None
             if isinstance(found, str) and paths:
                 self.trouble = f"is kept in memory: {found}"
@@ -288,12 +263,12 @@ class Database:
 
         The content of a file is copied there first; that of memory is made again.
         """
-        self._tried_s = self._monotonic()
+        self._tried_s = time.monotonic()
         paths = tuple(self._candidate_paths())
         # It stays at a path that is no longer a candidate.
         if before.path is not None:
             paths = paths[: paths.index(before.path)] if before.path in paths else ()
-        found = open_file(paths, self._tables, again=True, previous=before.path) if paths else ""
+        found = open_file(paths, again=True, previous=before.path) if paths else ""
         if isinstance(found, str):
             return
         with self._lock:
@@ -341,17 +316,18 @@ class Database:
 def _transact(
     connection: sqlite3.Connection,
     write: Callable[[sqlite3.Connection], None],
-    probed: Tables | None,
+    *,
+    is_probe: bool,
 ) -> None:
-    """Writes in one transaction; with `probed`, its tables, it writes a page at least.
+    """Writes in one transaction; as a probe it writes a page at least.
 
     A transaction without a change touches no disk, and so does not show that the disk works.
     """
     connection.execute("BEGIN IMMEDIATE")
     try:
         write(connection)
-        if probed is not None:
-            connection.execute(f"PRAGMA user_version = {probed.version:d}")
+        if is_probe:
+            connection.execute(f"PRAGMA user_version = {FORMAT:d}")
         connection.execute("COMMIT")
     except BaseException:
         with suppress(sqlite3.Error):
@@ -361,7 +337,6 @@ def _transact(
 
 def open_file(
     paths: Sequence[Path],
-    tables: Tables,
     *,
     again: bool = False,
     previous: Path | None = None,
@@ -371,7 +346,6 @@ def open_file(
 
     Args:
         paths: where it may lie, in order of preference.
-        tables: what it holds.
         again: whether this was tried before, so that what is logged already is logged at debug.
         previous: its path until now. That file, or else the one at the next path, is copied
             to a path that has none yet.
@@ -383,10 +357,8 @@ def open_file(
             path.parent.mkdir(parents=True, exist_ok=True)
             _refuse_links(path)
             if not path.exists():
-                _copy_first_valid(
-                    (previous,) if previous else (*paths[nth:], *sources), path, tables
-                )
-            connection = _connect_and_check(path, tables)
+                _copy_first_valid((previous,) if previous else (*paths[nth:], *sources), path)
+            connection = _connect_and_check(path)
             connection.execute(f"PRAGMA busy_timeout = {_SHORT_MS:d}")
             return OpenDatabase(connection, path, _identities(path))
         except (OSError, sqlite3.Error) as error:
@@ -400,7 +372,7 @@ def open_file(
     return f"no file can be written for it ({reason})"
 
 
-def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> None:
+def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
     """Copies the first of these files that is a database of this version, if any.
 
     The copy appears as a whole, by a hard link, and never replaces a file of another program.
@@ -419,7 +391,7 @@ def _copy_first_valid(sources: Sequence[Path], path: Path, tables: Tables) -> No
                 closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
                 closing(sqlite3.connect(temporary)) as copy,
             ):
-                if original.execute("PRAGMA user_version").fetchone()[0] != tables.version:
+                if original.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
                     continue
                 original.backup(copy)
             with suppress(FileExistsError):
@@ -445,19 +417,18 @@ def _refuse_links(path: Path) -> None:
             raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
 
 
-def _fault_of(path: Path, tables: Tables, *, thorough: bool) -> sqlite3.Error | None:
+def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
     """Returns what is wrong with a file that is open here, as another program sees it.
 
     Args:
         path: the file.
-        tables: what it holds.
         thorough: whether all of it is read; else only where its tables begin.
     """
     # rw and not rwc: a file that was just deleted is not created again.
     address = f"{path.absolute().as_uri()}?mode=rw"
     try:
         with closing(sqlite3.connect(address, uri=True, timeout=_SHORT_MS / 1000)) as connection:
-            connection.execute(tables.first_rows).fetchall()
+            connection.execute(_FIRST_ROWS).fetchall()
             if not thorough:
                 return None
             found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
@@ -466,10 +437,10 @@ def _fault_of(path: Path, tables: Tables, *, thorough: bool) -> sqlite3.Error | 
     return None if found == "ok" else sqlite3.DatabaseError(found)
 
 
-def _in_memory(tables: Tables) -> OpenDatabase:
+def _in_memory() -> OpenDatabase:
     """Returns an empty database in memory."""
-    connection = _connect(":memory:", tables)
-    connection.executescript(tables.statements)
+    connection = _connect(":memory:")
+    connection.executescript(STATEMENTS)
     return OpenDatabase(connection, None)
 
 
@@ -513,7 +484,7 @@ def _identities(path: Path) -> tuple[tuple[int, int] | None, ...]:
     return tuple(found)
 
 
-def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
+def _connect_and_check(path: Path) -> sqlite3.Connection:
     """Connects to a file that can be written and has the tables of this version.
 
     Raises:
@@ -524,8 +495,8 @@ def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
     for _ in range(2):
         connection = None
         try:
-            connection = _connect(str(path), tables)
-            other = _create_or_compare_tables(connection, tables)
+            connection = _connect(str(path))
+            other = _create_or_compare_tables(connection)
             if other is None:
                 return connection
             in_use = _is_used_elsewhere(connection)
@@ -544,12 +515,12 @@ def _connect_and_check(path: Path, tables: Tables) -> sqlite3.Connection:
     raise sqlite3.OperationalError("another program replaces it again and again")
 
 
-def _connect(target: str, tables: Tables) -> sqlite3.Connection:
+def _connect(target: str) -> sqlite3.Connection:
     connection = sqlite3.connect(
         target, timeout=BUSY_S, isolation_level=None, check_same_thread=False
     )
     try:
-        for pragma in tables.pragmas:
+        for pragma in PRAGMAS:
             connection.execute(f"PRAGMA {pragma}")
     except sqlite3.Error:
         connection.close()
@@ -557,7 +528,7 @@ def _connect(target: str, tables: Tables) -> sqlite3.Connection:
     return connection
 
 
-def _create_or_compare_tables(connection: sqlite3.Connection, tables: Tables) -> str | None:
+def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
     """Creates the tables of a new database; returns how an old one is of another version."""
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
@@ -565,18 +536,18 @@ def _create_or_compare_tables(connection: sqlite3.Connection, tables: Tables) ->
     version = connection.execute("PRAGMA user_version").fetchone()[0]
     declared = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
     if version == 0 and declared == 0:
-        for statement in tables.statements.split(";"):
+        for statement in STATEMENTS.split(";"):
             connection.execute(statement)
-        connection.execute(f"PRAGMA user_version = {tables.version:d}")
+        connection.execute(f"PRAGMA user_version = {FORMAT:d}")
     connection.execute("COMMIT")
-    if declared and version != tables.version:
-        return f"it is of version {version}, and this program needs {tables.version}"
+    if declared and version != FORMAT:
+        return f"it is of version {version}, and this program needs {FORMAT}"
     # SQLite keeps the statement that declared a table; tables of its own are named sqlite_*.
     names = "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL AND name NOT GLOB 'sqlite_*'"
     statements = [str(sql) for (sql,) in connection.execute(names).fetchall()]
-    if declared and _without_spacing(statements) != _without_spacing(tables.statements.split(";")):
+    if declared and _without_spacing(statements) != _without_spacing(STATEMENTS.split(";")):
         return "its tables are not those of this version"
-    connection.execute(tables.first_rows).fetchall()
+    connection.execute(_FIRST_ROWS).fetchall()
     return None
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.plan import Plan
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.columns.walk import Level
     from ros2_memory.storage.base import BagReader, Channel, Definition, IntArray, Schema
 
 T = TypeVar("T")
@@ -85,22 +85,34 @@ class BagRows(NamedTuple):
     bags: IntArray
 
 
-def never(channel: Channel) -> bool:
-    """Returns False: no payload is hashed."""
-    del channel
-    return False
-
-
 def pieces(
     reader: BagReader,
     path: Path,
     window: TimeWindow = _EVERYTHING,
     *,
     topics: Collection[str] | None = None,
-    hashed: Callable[[Channel], bool] = never,
+    hashed: Callable[[Channel], bool] = lambda _: False,
     columns: bool = True,
 ) -> Iterator[Piece]:
-    """Yields the messages of a bag, not decoded yet; arguments and errors as of `decoded`."""
+    """Yields the messages of a bag, not decoded yet.
+
+    Lazy: nothing is opened before the first item is requested. In memory is one buffer of the
+    reader.
+
+    Args:
+        reader: reads the bag.
+        path: the file.
+        window: of log time.
+        topics: those to decode; None for all.
+        hashed: of which channels the payloads are hashed.
+        columns: whether there are columns; else only the times of all messages, also of those that
+            cannot be decoded.
+
+    Raises:
+        BagVanishedError: the file is not there.
+        BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
+            read.
+    """
 
     def found() -> Iterator[Piece | BagError]:
         channels = [
@@ -131,54 +143,33 @@ def pieces(
 
 def decoded(
     reader: BagReader,
-    path: Path,
-    window: TimeWindow = _EVERYTHING,
+    read: Iterator[Piece],
     *,
-    topics: Collection[str] | None = None,
-    hashed: Callable[[Channel], bool] = never,
-    columns: bool = True,
-    group_bytes: int = GROUP_BYTES,
+    skip_undecodable: bool = False,
 ) -> Iterator[list[Table]]:
     """Yields the messages of a bag as tables, in groups.
 
     In one group there is one table for each topic, type and definition with messages; a bag that
-    decompresses to less than `group_bytes` is one group. Tables of later groups may overlap earlier
+    decompresses to less than `GROUP_BYTES` is one group. Tables of later groups may overlap earlier
     ones in time, as the chunks of the file do. In memory are one group and one buffer of the
-    reader. Lazy: nothing is opened before the first item is requested.
+    reader.
 
     Args:
         reader: reads the bag.
-        path: the file.
-        window: of log time.
-        topics: those to decode; None for all.
-        hashed: of which channels the payloads are hashed.
-        columns: whether there are columns; else only the times of all messages, also of those that
-            cannot be decoded.
-        group_bytes: how much a group holds, about.
-
-    Raises:
-        BagVanishedError: the file is not there.
-        BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
-            read.
+        read: its `pieces`; what they raise is raised here.
+        skip_undecodable: whether a message that cannot be decoded has no row. Else its topic has
+            rows alone in this group: the bag has to be asked about each of them.
     """
-    read = pieces(reader, path, window, topics=topics, hashed=hashed, columns=columns)
-    return decoded_groups(reader, read, group_bytes)
-
-
-def decoded_groups(
-    reader: BagReader, read: Iterator[Piece], group_bytes: int = GROUP_BYTES
-) -> Iterator[list[Table]]:
-    """Yields what `pieces` yields as `decoded` does."""
 
     def found() -> Iterator[list[Table] | BagError]:
-        group = _Group(reader, group_bytes)
+        group = _Group(reader, skip_undecodable)
         for piece in _or_errors(read):
             if isinstance(piece, BagError):
                 yield piece
                 continue
             if group.is_full_before(piece.batch):
                 yield group.tables()
-                group = _Group(reader, group_bytes)
+                group = _Group(reader, skip_undecodable)
             group.add(piece)
             del piece  # and its buffer, before the next is read
         tables = group.tables()
@@ -188,27 +179,22 @@ def decoded_groups(
     return map(_unless_error, found())
 
 
-def decoded_together(
-    reader: BagReader, bags: Sequence[tuple[Path, Sequence[Piece]]]
-) -> list[BagRows]:
+def decoded_together(reader: BagReader, bags: Sequence[Sequence[Piece]]) -> list[BagRows]:
     """Returns all messages of small bags as tables that have rows of many of them.
 
     Numpy takes longer to be called than to go through the messages of one topic in a bag of 10 s.
-    Messages that cannot be decoded have rows, too, as by `with_all_messages`.
+    Messages that cannot be decoded have rows, too, as of `decoded`.
 
     Args:
-        reader: reads the bags.
-        bags: each with all of its messages. Times that are equal are in this order.
-
-    Raises:
-        BagError: a bag cannot be read again.
+        reader: decodes what cannot be walked.
+        bags: all messages of each. Times that are equal are in this order.
     """
-    buffers = {id(piece.batch.buffer): piece.batch.buffer for _, read in bags for piece in read}
+    buffers = {id(piece.batch.buffer): piece.batch.buffer for read in bags for piece in read}
     ends = accumulate(map(len, buffers.values()), initial=0)
     begins = dict(zip(buffers, ends, strict=False))
     whole = b"".join(buffers.values())
     alike: dict[object, list[_Own]] = defaultdict(list)
-    for nth, (path, read) in enumerate(bags):
+    for nth, read in enumerate(bags):
         # All messages of a topic in a bag are of the first channel, and have columns, or none has.
         firsts: dict[object, Channel] = {}
         kinds: dict[object, _Kind] = {}
@@ -223,45 +209,8 @@ def decoded_together(
             starts = batch.starts + begins[id(batch.buffer)]
             moved = replace(batch, channel=channel, buffer=whole, starts=starts)
             key = (topic, channel.latched, kind.plan is None, kind.is_hashed)
-            alike[key].append(_Own(nth, path, kind, moved))
+            alike[key].append(_Own(nth, kind, moved))
     return [rows for own in alike.values() for rows in _together(reader, own)]
-
-
-def with_all_messages(reader: BagReader, path: Path, table: Table, window: TimeWindow) -> Table:
-    """Returns a table in which each message has a row, also one that cannot be decoded.
-
-    Where there is such a message no row has columns: the bag has to be asked about each of them.
-    What is lost of a bag has no rows, as in `decoded`, which raises that.
-
-    Raises:
-        BagError: none of the rest can be read.
-    """
-    if not table.undecodable:
-        return table
-    channel = table.channel
-    rows: list[tuple[Ns, Ns, int]] = []
-    found = reader.records(path, [channel.topic], window)
-    while True:
-        try:
-            rows.extend(
-                (record.log_time, record.publish_time, zlib.crc32(record.payload))
-                for record in found
-                if record.channel.schema == channel.schema
-            )
-            break
-        except BagError as error:
-            if error.lost is None:
-                raise
-    times, published, hashes = np.ascontiguousarray(np.array(rows, np.int64).reshape(-1, 3).T)
-    return Table(
-        channel,
-        times,
-        published,
-        np.zeros(times.size, np.int64),
-        left_out={"": f"some cannot be decoded: {table.undecodable_reason}"},
-        payload_hashes=None if table.payload_hashes is None else hashes,
-        definition=table.definition,
-    )
 
 
 def _or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
@@ -356,7 +305,7 @@ class _Group:
     """The tables of some buffers of one bag, while they are read."""
 
     reader: BagReader
-    limit: int
+    skip_undecodable: bool
     _parts: dict[tuple[Schema, str, str], list[Table]] = field(default_factory=dict)
     _buffer: bytes = b""
     _bytes: int = 0
@@ -366,9 +315,9 @@ class _Group:
         if batch.buffer is self._buffer or not self._parts:
             return False
         size = self._bytes + len(batch.buffer)
-        if size <= self.limit and size > self.limit // 4:
+        if GROUP_BYTES // 4 < size <= GROUP_BYTES:
             size = sum(part.memory_bytes for parts in self._parts.values() for part in parts)
-        return size > self.limit
+        return size > GROUP_BYTES
 
     def add(self, piece: Piece) -> None:
         """Decodes a piece."""
@@ -378,7 +327,7 @@ class _Group:
             self._bytes += len(batch.buffer)
         parts = self._parts.setdefault(_topic_of(batch), [])
         for some in _parts_of(batch):
-            self._add(parts, _table(piece.kind, some, self.reader))
+            self._add(parts, _table(piece.kind, some, self.reader, skip=self.skip_undecodable))
 
     def _add(self, parts: list[Table], table: Table) -> None:
         """Adds a table to those of its topic, of which all have columns or none has."""
@@ -414,7 +363,6 @@ class _Own(NamedTuple):
     """Messages of one bag among those of others."""
 
     bag: int
-    path: Path
     kind: _Kind
     batch: Batch
 
@@ -443,23 +391,22 @@ def _together(reader: BagReader, own: Sequence[_Own]) -> Iterator[BagRows]:
         np.concatenate([batch.sizes for batch in batches])[order],
     )
     bags = {entry.bag for entry in own}
-    if len(bags) == 1:
-        table = _table(first.kind, whole, reader)
-        table = with_all_messages(reader, first.path, table, _EVERYTHING)
-        yield BagRows(table, np.full(len(table), first.bag))
-        return
     try:
-        yield BagRows(_table(first.kind, whole, None), of[order])
+        table = _table(first.kind, whole, None if len(bags) > 1 else reader)
     except NotWalkedError:
         for bag in sorted(bags):
             yield from _together(reader, [entry for entry in own if entry.bag == bag])
+    else:
+        yield BagRows(table, of[order])
 
 
-def _table(kind: _Kind, batch: Batch, reader: BagReader | None) -> Table:
+def _table(kind: _Kind, batch: Batch, reader: BagReader | None, *, skip: bool = False) -> Table:
     """Returns the messages of a batch as a table; what cannot be walked the reader decodes.
 
+    With `skip` without those that it cannot decode.
+
     Raises:
-        NotWalkedError: there is such a message, and no reader.
+        NotWalkedError: there is a message that cannot be walked, and no reader.
     """
     order = order_of(batch.log_times, batch.places)
     if order is not None:
@@ -480,39 +427,42 @@ def _table(kind: _Kind, batch: Batch, reader: BagReader | None) -> Table:
     if kind.plan is None:
         return table
     try:
-        level = walked(kind.plan, batch)
+        return _with_columns(table, walked(kind.plan, batch))
     except NotWalkedError:
         if reader is None:
             raise
-        return joined(list(_one_by_one(reader, kind.plan, batch, table)))
+    try:
+        return joined([*_one_by_one(reader, kind.plan, batch, table, skip=skip)])
+    except UndecodableError as error:
+        return replace(table, left_out={"": f"some cannot be decoded: {error.reason}"})
+
+
+def _with_columns(table: Table, level: Level) -> Table:
     return replace(table, columns=level.columns, elements=level.elements, left_out=level.left_out)
 
 
-def _one_by_one(reader: BagReader, plan: Plan, batch: Batch, table: Table) -> Iterator[Table]:
-    """Yields parts of a table whose messages the reader decodes."""
+def _one_by_one(
+    reader: BagReader, plan: Plan, batch: Batch, table: Table, *, skip: bool
+) -> Iterator[Table]:
+    """Yields parts of a table whose messages the reader decodes.
+
+    Raises:
+        UndecodableError: it cannot decode one, unless those are skipped.
+    """
     begin = 0
-    count = len(table)
     sizes = batch.sizes.tolist()
-    while begin < count:
+    while begin < len(table):
         messages: list[object] = []
         rows: list[int] = []
-        reason = ""
         size, nth = 0, begin
-        while nth < count and (nth == begin or size + sizes[nth] <= _DECODED_BYTES):
+        while nth < len(table) and (nth == begin or size + sizes[nth] <= _DECODED_BYTES):
             try:
                 messages.append(reader.decode(batch.record(nth)))
                 rows.append(nth)
-            except UndecodableError as error:
-                reason = reason or error.reason
+            except UndecodableError:
+                if not skip:
+                    raise
             size += sizes[nth]
             nth += 1
-        level = level_of(plan, messages)
-        yield replace(
-            table.rows(np.array(rows, np.int64)),
-            columns=level.columns,
-            elements=level.elements,
-            left_out=level.left_out,
-            undecodable=nth - begin - len(rows),
-            undecodable_reason=reason,
-        )
+        yield _with_columns(table.rows(np.array(rows, np.int64)), level_of(plan, messages))
         begin = nth

@@ -14,13 +14,7 @@ import numpy as np
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.decode import (
-    BagRows,
-    decoded_groups,
-    decoded_together,
-    pieces,
-    with_all_messages,
-)
+from ros2_memory.columns.decode import BagRows, decoded, decoded_together, pieces
 from ros2_memory.columns.store import LONG_NS, BagKey
 from ros2_memory.columns.writing import PART_NS, DecodedBags, ReadBag
 from ros2_memory.core.errors import BagError
@@ -292,7 +286,7 @@ class Filling:
             read = pieces(self._reader, bag.path, hashed=partial(_is_hashed, everything=hashed))
             begin, size = _first_pieces(read)
             if size > LARGE_BYTES or bag.end - bag.start > LONG_NS:
-                groups = decoded_groups(self._reader, chain(_popped(begin), read))
+                groups = decoded(self._reader, chain(_popped(begin), read))
                 return self._add_large(to_store, groups, found)
             if found.small_bytes + size > LARGE_BYTES:
                 self._decode(found)
@@ -309,21 +303,19 @@ class Filling:
         second = next(groups, None)
         if second is None and bag.end - bag.start <= LONG_NS:
             self._decode(found)  # bags stay in order
-            own = [
-                BagRows(table, np.zeros(len(table), np.int64)) for table in self._whole(bag, first)
-            ]
+            own = [BagRows(table, np.zeros(len(table), np.int64)) for table in first]
             found.add([to_store], own)
             return False
         begin = [first] if second is None else [first, second]
         del first, second
-        return self._put_long(to_store, self._released_groups(bag, begin, groups))
+        return self._put_long(to_store, self._released_groups(begin, groups))
 
     def _decode(self, found: _Found) -> None:
         """Decodes the small bags together; where that fails, each alone."""
         small, found.small, found.small_bytes = found.small, [], 0
         try:
-            read = [(to_store.bag.path, begin) for to_store, begin in small]
-            found.add([to_store for to_store, _ in small], decoded_together(self._reader, read))
+            tables = decoded_together(self._reader, [begin for _, begin in small])
+            found.add([to_store for to_store, _ in small], tables)
         except Exception as error:  # noqa: BLE001 - of one of them
             if len(small) == 1:
                 self._not_stored(small[0][0].bag, error)
@@ -375,15 +367,13 @@ class Filling:
         return is_stored
 
     def _released_groups(
-        self, bag: BagFile, begin: list[list[Table]], groups: Iterator[list[Table]]
+        self, begin: list[list[Table]], groups: Iterator[list[Table]]
     ) -> Iterator[list[Table]]:
         """Yields groups of tables. Each is freed, and the turn released, before the next."""
         while True:
-            group = begin.pop(0) if begin else next(groups, None)
-            if group is None:
+            tables = begin.pop(0) if begin else next(groups, None)
+            if tables is None:
                 return
-            tables = self._whole(bag, group)
-            del group
             yield tables
             tables.clear()  # who asks for the next still has the list
             if not begin:
@@ -393,10 +383,6 @@ class Filling:
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), LEAST_BYTES_PER_S * length)
-
-    def _whole(self, bag: BagFile, tables: Sequence[Table]) -> list[Table]:
-        everything = TimeWindow.everything()
-        return [with_all_messages(self._reader, bag.path, table, everything) for table in tables]
 
     def _is_settled(self, bag: BagFile) -> bool:
         return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())

@@ -14,7 +14,8 @@ from contextlib import closing
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.database import files_of, is_busy
-from ros2_memory.columns.store import TABLES
+from ros2_memory.columns.pack import FORMAT
+from ros2_memory.columns.schema import PRAGMAS
 from ros2_memory.columns.writing import delete_bags
 from ros2_memory.core.errors import BagError
 
@@ -113,9 +114,9 @@ def rewrite(base: sqlite3.Connection) -> None:
 
 
 def _forget(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> None:
-    if base.execute("PRAGMA user_version").fetchone()[0] != TABLES.version:
+    if base.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
         raise ValueError("it is of another version")
-    for pragma in TABLES.pragmas:
+    for pragma in PRAGMAS:
         base.execute(f"PRAGMA {pragma}")
     base.execute("BEGIN IMMEDIATE")
     try:

@@ -6,19 +6,13 @@ import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, NotRequired, TypedDict, cast
 
-import numpy as np
-
 from ros2_memory.columns.steps import EXACT, Step, step_of
 from ros2_memory.columns.table import Column, Elements, Table, Texts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from ros2_memory.storage.base import Definition, IntArray
-
-_INTEGERS: Final = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
-KINDS: Final = ("bool", *_INTEGERS, "float32", "float64", "text")
-TEXT: Final = KINDS.index("text")
+    from ros2_memory.storage.base import Definition
 
 
 class _Described(TypedDict):
@@ -61,14 +55,12 @@ class Layout:
         left_out: what is no column, and why.
         slots: where a column lies among the packed ones of its table, by its path from there
             (`detections.label`), and where owners lie, by the path of the sequence and `#`.
-        kinds: of each slot the index of its type among `KINDS`.
     """
 
     columns: Mapping[str, Kind]
     sequences: Mapping[str, Layout] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     slots: Mapping[str, Slot] = field(init=False, compare=False, repr=False)
-    kinds: IntArray = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         slots = {path: Slot(nth, kind) for nth, (path, kind) in enumerate(self.columns.items())}
@@ -77,9 +69,7 @@ class Layout:
             begin = len(slots)
             for name, slot in inner.slots.items():
                 slots[f"{path}.{name}".rstrip(".")] = Slot(begin + slot.nth, slot.kind)
-        kinds = np.array([KINDS.index(slot.kind.dtype) for slot in slots.values()], np.int64)
         object.__setattr__(self, "slots", slots)
-        object.__setattr__(self, "kinds", kinds)
 
     @classmethod
     def of(cls, table: Table, definition: Definition | None) -> Layout:

@@ -46,7 +46,7 @@ import math
 import struct
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import zstandard
@@ -56,14 +56,13 @@ from ros2_memory.columns.table import IN_PART, Column, Numbers, Texts, Zone, let
 from ros2_memory.core.large_reads import LARGE_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection
 
     from numpy.typing import NDArray
 
     from ros2_memory.storage.base import IntArray
 
-Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
-Values = TypeVar("Values", "IntArray", "Floats")
+Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
 FORMAT: Final = 16
 """Version of the file. Raise it with every change of its tables and of their bytes."""
@@ -76,8 +75,6 @@ _ARRANGEMENTS: Final = ("flat", "line", "delta", "curve")
 _CONTAINERS: Final = ("<u1", "<u1", "<u2", "<u4", "<u4", "<u8", "<u8", "<u8", "<u8")
 """For each width in bytes the least unsigned integer that numpy has."""
 _FAR_APART: Final = 1 << 62
-_AT_ONCE: Final = 1 << 16
-"""Values that are packed at once, if it is not one column that has more."""
 _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
 """Multiples of a step up to these are fewer bits than the float32 or float64 itself."""
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
@@ -121,46 +118,15 @@ class Packed:
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
     """Returns the column as bytes. `step` counts for floats alone; all others are exact."""
-    return pack_columns([(column, step)])[0]
-
-
-def pack_columns(columns: Sequence[tuple[Column, Step]]) -> list[Packed]:
-    """Returns columns as bytes, as `pack` does one.
-
-    What is done for one is done for all at once, one after the other in one array: a bag has some
-    sixty short columns, and numpy takes longer to be called than to go through one of them.
-    """
-    packed: list[Packed] = []
-    first = values = 0
-    for nth, (column, _) in enumerate(columns):
-        values += len(column.codes) if isinstance(column, Texts) else len(column)
-        if values > _AT_ONCE:
-            packed += _pack_at_once(columns[first : nth + 1])
-            first, values = nth + 1, 0
-    return packed + _pack_at_once(columns[first:])
-
-
-def _pack_at_once(columns: Sequence[tuple[Column, Step]]) -> list[Packed]:
-    found: dict[int, Packed | _Whole] = {}
-    integers: dict[int, Numbers] = {}
-    floats: dict[str, dict[int, tuple[Numbers, Step]]] = {}
-    for nth, (column, step) in enumerate(columns):
-        if isinstance(column, Texts):
-            found[nth] = _pack_texts(column)
-        elif not len(column):
-            found[nth] = Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
-        elif column.dtype.kind == "f":
-            floats.setdefault(column.dtype.str, {})[nth] = (column, step)
-        else:
-            integers[nth] = column
-    if integers:
-        found.update(zip(integers, _pack_integers(list(integers.values())), strict=True))
-    for some in floats.values():
-        found.update(zip(some, _Floats(list(some.values())).packed(), strict=True))
-    waiting = [one for one in found.values() if isinstance(one, _Whole)]
-    arranged = iter(_arranged(waiting) if waiting else ())
-    packed = {nth: next(arranged) if isinstance(one, _Whole) else one for nth, one in found.items()}
-    return [packed[nth] for nth in range(len(columns))]
+    if isinstance(column, Texts):
+        found = _pack_texts(column)
+    elif not len(column):
+        return Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
+    elif column.dtype.kind == "f":
+        found = _pack_floats(column, step)
+    else:
+        found = _pack_integers(column)
+    return _arranged(found) if isinstance(found, _Whole) else found
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
@@ -247,187 +213,82 @@ class _Whole(NamedTuple):
     least: int
     greatest: int
 
-
-class _InLine:
-    """Where columns lie that follow each other in one array. None is empty."""
-
-    def __init__(self, columns: Sequence[Numbers]) -> None:
-        self.lengths = np.array([len(column) for column in columns])
-        self.stops = np.cumsum(self.lengths)
-        self.starts = self.stops - self.lengths
-
-    def parts(self, values: Values) -> list[Values]:
-        """Returns the values of each column."""
-        bounds = zip(self.starts.tolist(), self.stops.tolist(), strict=True)
-        return [values[start:stop] for start, stop in bounds]
-
-    def least(self, values: Values) -> Values:
-        """Returns the least value of each column; NaN where it has one."""
-        return np.minimum.reduceat(values, self.starts)
-
-    def greatest(self, values: Values) -> Values:
-        """Returns the greatest value of each column; NaN where it has one."""
-        return np.maximum.reduceat(values, self.starts)
-
-    def means(self, values: Numbers) -> Floats:
-        """Returns the mean of each column."""
-        means: Floats = np.add.reduceat(values, self.starts, dtype=np.float64) / self.lengths
-        return means
-
-    def rows(self, values: Values) -> Values:
-        """Returns a value of each column for every row of it."""
-        return np.repeat(values, self.lengths)
+    @classmethod
+    def of(cls, form: str, error: float, zone: Zone, numbers: IntArray) -> _Whole:
+        """Returns signed numbers without a head."""
+        return cls(form, error, zone, b"", numbers, int(numbers.min()), int(numbers.max()))
 
 
-def _pack_integers(columns: Sequence[Numbers]) -> Iterator[Packed | _Whole]:
-    lie = _InLine(columns)
+def _pack_integers(column: Numbers) -> Packed | _Whole:
+    name, least, greatest = column.dtype.name, int(column.min()), int(column.max())
+    zone = Zone(least, greatest)
+    if least == greatest:
+        return Packed(f"{name} constant", len(column), 0.0, zone, b"")
     # Unsigned ones of 2**63 and more wrap around, here and back.
-    numbers = np.concatenate(columns, dtype=np.int64, casting="unsafe")
-    leasts, greatests = lie.least(numbers).tolist(), lie.greatest(numbers).tolist()
-    for nth, (column, part) in enumerate(zip(columns, lie.parts(numbers), strict=True)):
-        name = column.dtype.name
-        zone = Zone(leasts[nth], greatests[nth])
-        if name == "uint64":
-            zone = Zone(int(column.min()), int(column.max()))
-        least, greatest = int(zone.least or 0), int(zone.greatest or 0)
-        if least == greatest:
-            yield Packed(f"{name} constant", len(part), 0.0, zone, b"")
-        else:
-            yield _Whole(f"{name} whole", 0.0, zone, b"", part, least, greatest)
+    numbers = column.reshape(-1).astype(np.int64)
+    return _Whole(f"{name} whole", 0.0, zone, b"", numbers, least, greatest)
 
 
 # Floats
 
 
-class _Floats:
-    """Columns of floats of one type."""
-
-    def __init__(self, columns: Sequence[tuple[Numbers, Step]]) -> None:
-        self.columns = [column for column, _ in columns]
-        self.steps = [step for _, step in columns]
-        self.name = self.columns[0].dtype.name
-        self.limit = _MOST_MULTIPLES[self.columns[0].itemsize]
-        lie = _InLine(self.columns)
-        values = np.concatenate(self.columns, dtype=np.float64)
-        self.values = lie.parts(values)
-        bounds = zip(lie.least(values).tolist(), lie.greatest(values).tolist(), strict=True)
-        self.zones = [
-            _zone_of(part, least, greatest)
-            for part, (least, greatest) in zip(self.values, bounds, strict=True)
-        ]
-        self.found: dict[int, Packed | _Whole] = {}
-
-    def packed(self) -> list[Packed | _Whole]:
-        """Returns each as multiples of its step, else with fewer bits, else as it is."""
-        relative, multiples = [], {}
-        for nth, (zone, step) in enumerate(zip(self.zones, self.steps, strict=True)):
-            count = len(self.columns[nth])
-            if zone.least == zone.greatest and zone.nulls in {0, count}:
-                self.found[nth] = Packed(f"{self.name} constant", count, 0.0, zone, b"")
-            elif zone.nulls or not math.isfinite(self._most(nth)):
-                self._exactly(nth)
-            elif step.relative:
-                relative.append(nth)
-            elif step.per_unit and self._most(nth) * step.per_unit < self.limit:
-                multiples[nth] = step.per_unit
-            else:
-                self._exactly(nth)
-        if relative:
-            multiples |= self._decimals(relative)
-        if multiples:
-            self._as_multiples(multiples)
-        rest = [nth for nth in relative if nth not in self.found]
-        if rest:
-            self._rounded(rest)
-        return [self.found[nth] for nth in range(len(self.columns))]
-
-    def _most(self, nth: int) -> float:
-        zone = self.zones[nth]
-        return max(abs(zone.least or 0.0), abs(zone.greatest or 0.0))
-
-    def _decimals(self, members: Sequence[int]) -> dict[int, int]:
-        """The coarsest decimal step that some values of a column nearly have, where they do."""
-        some = [nth for nth in members if self._most(nth) < self.limit]
-        if not some:
-            return {}
-        samples = [self.values[nth][:: max(1, len(self.values[nth]) // _SAMPLE)] for nth in some]
-        scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), np.concatenate(samples))
-        fit = np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)
-        fits = np.logical_and.reduceat(fit, _InLine(samples).starts, axis=1)
-        found: dict[int, int] = {}
-        for nth, column in zip(some, fits.T, strict=True):
-            coarsest = _DECIMALS[int(column.argmax())]
-            if column.any() and self._most(nth) * coarsest < self.limit:
-                found[nth] = coarsest
-        return found
-
-    def _as_multiples(self, per_units: Mapping[int, int]) -> None:
-        """Takes those of the columns that are multiples of a step, or near enough to them."""
-        members = list(per_units)
-        lie = _InLine([self.values[nth] for nth in members])
-        values = np.concatenate([self.values[nth] for nth in members])
-        per_unit = lie.rows(np.array(list(per_units.values()), np.float64))
+def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
+    """Returns a column as multiples of its step, else with fewer bits, else as it is."""
+    values = column.astype(np.float64, copy=False)
+    zone = _zone_of(values)
+    if zone.least == zone.greatest and zone.nulls in {0, len(column)}:
+        return Packed(f"{column.dtype.name} constant", len(column), 0.0, zone, b"")
+    most, limit = max(abs(zone.low), abs(zone.high)), _MOST_MULTIPLES[column.itemsize]
+    if zone.nulls or not math.isfinite(most):
+        return _exactly(column, zone)
+    name = column.dtype.name
+    per_unit = _decimal_step(values) if step.relative and most < limit else step.per_unit
+    if per_unit and most * per_unit < limit:
         multiples = np.rint(values * per_unit)
-        back = multiples / per_unit
-        if self.name == "float32":
-            back = back.astype(np.float32).astype(np.float64)
-        forms = {nth: f"/{number}" for nth, number in per_units.items()}
-        self._take(forms, values, back, multiples.astype(np.int64))
-
-    def _rounded(self, members: Sequence[int]) -> None:
-        """Takes the columns with fewer bits, or as they are: tiny numbers have no bits to spare."""
-        columns = np.concatenate([self.columns[nth] for nth in members])
-        whole = _ordered(columns, rounded=True)
-        back = _from_ordered(whole, columns.dtype, rounded=True)
-        values = columns.astype(np.float64, copy=False)
-        self._take(dict.fromkeys(members, "rounded"), values, back, whole)
-        for nth in members:
-            if nth not in self.found:
-                self._exactly(nth)
-
-    def _take(
-        self, forms: Mapping[int, str], values: Floats, back: Floats, whole: IntArray
-    ) -> None:
-        """Takes columns that come back so, unless one is relative and off by more than it may."""
-        lie = _InLine([self.columns[nth] for nth in forms])
-        errors = np.abs(back - values)
-        excess = lie.greatest(errors - MOST_RELATIVE * np.abs(values)).tolist()
-        worst = lie.greatest(errors).tolist()
-        leasts, greatests = lie.least(whole).tolist(), lie.greatest(whole).tolist()
-        for row, (nth, part) in enumerate(zip(forms, lie.parts(whole), strict=True)):
-            if not self.steps[nth].relative or excess[row] <= 0:
-                self.found[nth] = _Whole(
-                    f"{self.name} {forms[nth]}",
-                    worst[row],
-                    self.zones[nth],
-                    b"",
-                    part,
-                    leasts[row],
-                    greatests[row],
-                )
-
-    def _exactly(self, nth: int) -> None:
-        stored, form = self.columns[nth], "bits"
-        if stored.itemsize == 8:
-            with np.errstate(over="ignore"):
-                short = stored.astype(np.float32)
-            if np.array_equal(short, stored, equal_nan=True):
-                stored, form = short, "float32"
-        whole = _ordered(stored)
-        least, greatest = int(whole.min()), int(whole.max())
-        form = f"{self.name} {form}"
-        self.found[nth] = _Whole(form, 0.0, self.zones[nth], b"", whole, least, greatest)
+        back = (multiples / per_unit).astype(column.dtype, copy=False)
+        errors = np.abs(back.astype(np.float64, copy=False) - values)
+        if not step.relative or _are_small(errors, values):
+            whole = multiples.astype(np.int64)
+            return _Whole.of(f"{name} /{per_unit}", float(errors.max()), zone, whole)
+    if step.relative:
+        whole = _ordered(column, rounded=True)
+        errors = np.abs(_from_ordered(whole, column.dtype, rounded=True) - values)
+        if _are_small(errors, values):
+            return _Whole.of(f"{name} rounded", float(errors.max()), zone, whole)
+    return _exactly(column, zone)  # tiny numbers have no bits to spare
 
 
-def _zone_of(values: Floats, least: float, greatest: float) -> Zone:
-    """The zone of values, by the least and the greatest of them: NaN where there is one."""
-    if not math.isnan(least):
-        return Zone(least + 0.0, greatest + 0.0)  # -0.0 becomes 0.0
-    there = values[~np.isnan(values)]
-    nulls = len(values) - len(there)
-    if not len(there):
-        return Zone(nulls=nulls)
-    return Zone(float(there.min()) + 0.0, float(there.max()) + 0.0, nulls)
+def _decimal_step(values: Floats) -> int:
+    """Returns the coarsest decimal step that some of the values nearly have; 0: none."""
+    sample = values[:: max(1, len(values) // _SAMPLE)]
+    scaled = np.multiply.outer(np.array(_DECIMALS, np.float64), sample)
+    fits = (np.abs(np.rint(scaled) - scaled) <= MOST_RELATIVE * np.abs(scaled)).all(axis=1)
+    return _DECIMALS[int(fits.argmax())] if fits.any() else 0
+
+
+def _are_small(errors: Floats, values: Floats) -> bool:
+    return not (errors > MOST_RELATIVE * np.abs(values)).any()
+
+
+def _exactly(column: Numbers, zone: Zone) -> _Whole:
+    stored, form = column, "bits"
+    if stored.itemsize == 8:
+        with np.errstate(over="ignore"):
+            short = stored.astype(np.float32)
+        if np.array_equal(short, stored, equal_nan=True):
+            stored, form = short, "float32"
+    return _Whole.of(f"{column.dtype.name} {form}", 0.0, zone, _ordered(stored))
+
+
+def _zone_of(values: Floats) -> Zone:
+    there = values
+    if math.isnan(values.min()):
+        there = values[~np.isnan(values)]
+        if not len(there):
+            return Zone(nulls=len(values))
+    # -0.0 becomes 0.0
+    least, greatest = float(there.min()) + 0.0, float(there.max()) + 0.0
+    return Zone(least, greatest, len(values) - len(there))
 
 
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
@@ -456,55 +317,41 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 # Whole numbers
 
 
-def _arranged(columns: Sequence[_Whole]) -> list[Packed]:
-    """The columns, each arranged so that its numbers have the fewest bits on average."""
-    lie = _InLine([column.numbers for column in columns])
-    flat = np.concatenate([column.numbers for column in columns])
-    flat -= lie.rows(np.array([_wrapped(column.least) for column in columns]))
-    slopes = np.rint((flat[lie.stops - 1] - flat[lie.starts]) / (lie.lengths - 1)).astype(np.int64)
-    slope = lie.rows(slopes)
-    line = flat - slope * (np.arange(len(flat)) - lie.rows(lie.starts))
-    steps = _differences(flat, lie.starts)
-    delta = steps - slope
-    delta[lie.starts] = 0
-    curve = _differences(steps, lie.starts)
-    curve[lie.starts + 1] = 0
-    around = (flat - lie.rows(lie.means(flat)), line - lie.rows(lie.means(line)), delta, curve)
-    bits = np.array([lie.means(_bits_of(numbers)) for numbers in around])
-    line -= lie.rows(np.minimum.reduceat(line, lie.starts))
-    numbers = (flat, line, (delta << 1) ^ (delta >> 63), (curve << 1) ^ (curve >> 63))
-    most = [np.maximum.reduceat(some.view(np.uint64), lie.starts).tolist() for some in numbers]
-    found = []
-    for nth, (column, which) in enumerate(zip(columns, bits.argmin(axis=0).tolist(), strict=True)):
-        start, stop = int(lie.starts[nth]), int(lie.stops[nth])
-        name, width, head = _ARRANGEMENTS[which], (most[which][nth].bit_length() + 7) // 8, b""
-        left = numbers[which][start + max(0, which - 1) : stop]
-        if column.greatest - column.least >= _FAR_APART:
-            name, width, left = "plain", 8, flat[start:stop]
-        elif which:
-            head = struct.pack("<q", steps[start + 1] if name == "curve" else slopes[nth])
-        codec = f"{column.form} {name} {width}"
-        data = b"".join((column.head, head, byte_planes(left, width)))
-        found.append(Packed(codec, stop - start, column.error, column.zone, data, len(left)))
-    return found
+def _arranged(column: _Whole) -> Packed:
+    """Returns a column arranged so that its numbers have the fewest bits on average."""
+    flat = column.numbers - _wrapped(column.least)
+    count = len(flat)
+    slope = np.rint((flat[-1:] - flat[:1]) / (count - 1)).astype(np.int64)
+    line = flat - slope * np.arange(count)
+    steps = np.diff(flat)
+    delta, curve = steps - slope, np.diff(steps)
+    around = (flat - flat.mean(), line - line.mean(), delta, curve)
+    which = int(np.argmin([_bits_of(numbers) for numbers in around]))
+    name = _ARRANGEMENTS[which]
+    left: IntArray = (flat, line, delta, curve)[which]
+    head = b""
+    if column.greatest - column.least >= _FAR_APART:
+        name, left = "plain", flat
+    elif name == "line":
+        left = left - left.min()
+    elif name != "flat":
+        left = (left << 1) ^ (left >> 63)
+    if name in {"line", "delta", "curve"}:
+        head = struct.pack("<q", steps[0] if name == "curve" else slope[0])
+    greatest = int(left.view(np.uint64).max(initial=0))
+    width = 8 if name == "plain" else (greatest.bit_length() + 7) // 8
+    data = b"".join((column.head, head, byte_planes(left, width)))
+    codec = f"{column.form} {name} {width}"
+    return Packed(codec, count, column.error, column.zone, data, len(left))
 
 
-def _bits_of(numbers: Numbers) -> Numbers:
-    """Returns about how many bits each number takes, with its sign."""
+def _bits_of(numbers: Numbers) -> float:
+    """Returns about how many bits all numbers take, with their signs."""
     # In single precision and in place: the memory of four such arrays is what takes long.
     sizes = np.abs(numbers.astype(np.float32))
     sizes *= 2
     sizes += 1
-    np.log2(sizes, out=sizes)
-    return sizes
-
-
-def _differences(numbers: IntArray, starts: IntArray) -> IntArray:
-    """What each number is more than the one before it; 0 of the first of each column."""
-    found = np.empty_like(numbers)
-    np.subtract(numbers[1:], numbers[:-1], out=found[1:])
-    found[starts] = 0
-    return found
+    return float(np.log2(sizes, out=sizes).sum(dtype=np.float64))
 
 
 def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> IntArray:
@@ -519,12 +366,12 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
         numbers += from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
     elif name == "delta":
         numbers = np.zeros(count, np.int64)
-        numbers[1:] = _signed(from_planes(data, 8, count - 1, int(width)))
+        numbers[1:] = signed(from_planes(data, 8, count - 1, int(width)))
         numbers[1:] += first
     elif name == "curve":
         numbers = np.zeros(count, np.int64)
         numbers[1] = first
-        numbers[2:] = _signed(from_planes(data, 8, count - 2, int(width)))
+        numbers[2:] = signed(from_planes(data, 8, count - 2, int(width)))
         np.cumsum(numbers[1:], out=numbers[1:])
     else:
         raise ValueError(f"packed columns are not arranged {name!r}")
@@ -536,8 +383,8 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     return numbers
 
 
-def _signed(numbers: Numbers) -> Numbers:
-    """0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
+def signed(numbers: Numbers) -> Numbers:
+    """Returns 0, 1, 2, 3, 4 as 0, -1, 1, -2, 2."""
     signs: Numbers = np.negative(np.bitwise_and(numbers, 1).view(f"<i{numbers.itemsize}"))
     halves: Numbers = np.bitwise_xor(np.right_shift(numbers, 1).view(signs.dtype), signs)
     return halves

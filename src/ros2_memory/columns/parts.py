@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.pack import Packed, compressed, pack_columns
+from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
 from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
 from ros2_memory.columns.table import Zone, joined
@@ -117,7 +117,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
     steps = (slot.kind.step for slot in layout.slots.values())
     columns = [*own.values(), *layout.columns_of(table)]
-    packs = pack_columns([*zip(columns, chain(repeat(EXACT, len(own)), steps), strict=True)])
+    packs = map(pack, columns, chain(repeat(EXACT, len(own)), steps))
     packed.update(zip((*own, *layout.slots), packs, strict=True))
     return PackedPart(
         int(table.log_times[0]),

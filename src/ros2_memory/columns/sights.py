@@ -27,7 +27,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.columns.pack import compressed, decompressed
+from ros2_memory.columns.pack import byte_planes, compressed, decompressed
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def packed(sights: Sights) -> bytes:
     width = 4 if all(int(each.max(initial=0)) < 1 << 32 for each in coded) else 8
     names = json.dumps((sights.topics, sights.labels)).encode()
     head = _HEAD.pack(width, begin, *map(len, sights.tables), len(names))
-    planes = [_planes(each, width) for each in coded]
+    planes = [byte_planes(column, width) for each in coded for column in each.view(np.int64)]
     return compressed(b"".join((head, names, *planes)))
 
 
@@ -183,12 +183,6 @@ class _Unpacked:
         for table, own in zip(tables, np.split(number, ends), strict=True):
             table[:, 0] = own
         return rows
-
-
-def _planes(columns: NDArray[np.uint64], width: int) -> bytes:
-    """Returns the lowest bytes of all numbers of the first column, the next ones, and so on."""
-    every = columns.astype("<u8", order="C").view(np.uint8).reshape(*columns.shape, 8)
-    return every[:, :, :width].transpose(0, 2, 1).tobytes()
 
 
 def _table(at: int, planes: Sequence[Bytes], part: Ints, begin: Ints) -> Ints:

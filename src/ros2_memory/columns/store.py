@@ -19,13 +19,13 @@ import json
 import os
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.columns.database import Database, Tables
+from ros2_memory.columns.database import Database
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.pack import FORMAT, Packed
+from ros2_memory.columns.pack import Packed
 from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
@@ -43,6 +43,7 @@ from ros2_memory.columns.writing import (
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import Ns
 from ros2_memory.storage.base import Channel, Schema
 
 if TYPE_CHECKING:
@@ -52,7 +53,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.fragments import FragmentKey
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Definition, IntArray
 
 FILE: Final = "columns.sqlite"
@@ -62,56 +62,7 @@ _ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 
-TABLES: Final = Tables(
-    version=FORMAT,
-    names=(
-        "bag",
-        "summary",
-        "topic",
-        "definition",
-        "part",
-        "part_column",
-        "zone",
-        "fragment",
-        "fragment_part",
-        "listing",
-        "deletion",
-    ),
-    # Deleted rows are overwritten, and pages that become free go back to the disk.
-    pragmas=("page_size = 1024", "auto_vacuum = INCREMENTAL", "secure_delete = ON"),
-    statements="""
-CREATE TABLE bag (id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT NOT NULL UNIQUE,
-  size INTEGER NOT NULL, mtime_ns INTEGER NOT NULL, sidecar_ns INTEGER NOT NULL,
-  first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  hashed INTEGER NOT NULL, definitions TEXT NOT NULL, summary INTEGER NOT NULL,
-  counts BLOB NOT NULL);
-CREATE TABLE summary (id INTEGER PRIMARY KEY, topics TEXT NOT NULL UNIQUE);
-CREATE TABLE topic (id INTEGER PRIMARY KEY AUTOINCREMENT, name TEXT NOT NULL,
-  encoding TEXT NOT NULL, latched INTEGER NOT NULL, definition INTEGER NOT NULL,
-  layout TEXT NOT NULL,
-  UNIQUE (name, encoding, latched, definition, layout));
-CREATE TABLE definition (id INTEGER PRIMARY KEY, type TEXT NOT NULL, encoding TEXT NOT NULL,
-  text BLOB NOT NULL, UNIQUE (type, encoding, text));
-CREATE TABLE part (id INTEGER PRIMARY KEY AUTOINCREMENT, topic INTEGER NOT NULL,
-  first_ns INTEGER NOT NULL, last_ns INTEGER NOT NULL, messages INTEGER NOT NULL,
-  bags TEXT NOT NULL, dropped TEXT NOT NULL, bytes INTEGER NOT NULL, whole INTEGER NOT NULL);
-CREATE INDEX part_of_topic ON part (topic, first_ns, last_ns);
-CREATE INDEX part_not_whole ON part (id) WHERE NOT whole;
-CREATE TABLE part_column (part INTEGER NOT NULL, path TEXT NOT NULL, same TEXT,
-  data BLOB, UNIQUE (part, path));
-CREATE TABLE zone (topic INTEGER NOT NULL, path TEXT NOT NULL, part INTEGER NOT NULL,
-  codec TEXT NOT NULL, count INTEGER NOT NULL, error REAL NOT NULL, least, greatest,
-  nulls INTEGER NOT NULL, words TEXT, PRIMARY KEY (topic, path, part)) WITHOUT ROWID;
-CREATE TABLE fragment (id INTEGER PRIMARY KEY AUTOINCREMENT, kind TEXT NOT NULL,
-  settings TEXT NOT NULL, start_ns INTEGER NOT NULL, parts TEXT NOT NULL, data BLOB NOT NULL,
-  UNIQUE (kind, settings, start_ns, parts));
-CREATE TABLE fragment_part (part INTEGER NOT NULL, fragment INTEGER NOT NULL,
-  PRIMARY KEY (part, fragment)) WITHOUT ROWID;
-CREATE TABLE listing (folder TEXT PRIMARY KEY, listed TEXT NOT NULL) WITHOUT ROWID;
-CREATE TABLE deletion (id INTEGER PRIMARY KEY AUTOINCREMENT);
-""",
-)
-
+T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
 
 
@@ -223,7 +174,7 @@ class ColumnStore(Database):
         sources: Sequence[Path] = (),
         waits_for: Path | None = None,
     ) -> None:
-        super().__init__(paths, TABLES, sources=sources, waits_for=waits_for)
+        super().__init__(paths, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
         self._topics: tuple[int, dict[int, Topic]] = (0, {})
@@ -274,17 +225,15 @@ class ColumnStore(Database):
 
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
-
-        def ask(connection: sqlite3.Connection) -> dict[str, StoredBag]:
-            among = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
-            rows = connection.execute(
-                "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
-                f" WHERE definitions IN ('', ?) {among}",
-                (self._definitions, *(() if paths is None else (json.dumps(paths),))),
-            )
-            return {bag.path: bag for bag in map(StoredBag._make, rows)}
-
-        return self.read(ask, {})
+        among = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
+        rows = self._rows(
+            list[tuple[str, int, Ns, Ns, int, int]](),
+            "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
+            f" WHERE definitions IN ('', ?) {among}",
+            self._definitions,
+            *(() if paths is None else (json.dumps(paths),)),
+        )
+        return {bag.path: bag for bag in map(StoredBag._make, rows)}
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
@@ -296,43 +245,25 @@ class ColumnStore(Database):
 
     def dropped(self) -> dict[str, Ns]:
         """Returns the topics of which columns were dropped, with the log time (ns) of the first."""
-
-        def ask(connection: sqlite3.Connection) -> dict[str, Ns]:
-            rows = connection.execute(
-                "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
-                " WHERE dropped <> '' GROUP BY name ORDER BY name"
-            )
-            return dict(rows.fetchall())
-
-        return self.read(ask, {})
+        query = (
+            "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
+            " WHERE dropped <> '' GROUP BY name ORDER BY name"
+        )
+        return dict(self._rows(list[tuple[str, Ns]](), query))
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""
-
-        def ask(connection: sqlite3.Connection) -> Ns | None:
-            found: Ns | None = connection.execute("SELECT min(first_ns) FROM bag").fetchone()[0]
-            return found
-
-        return self.read(ask, None)
+        rows = self._rows(list[tuple[Ns | None]](), "SELECT min(first_ns) FROM bag")
+        return rows[0][0] if rows else None
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
-
-        def ask(connection: sqlite3.Connection) -> list[BagKey]:
-            rows = connection.execute(
-                "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE first_ns < ?", (before,)
-            )
-            return [BagKey(*row) for row in rows]
-
-        return self.read(ask, [])
+        query = "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE first_ns < ?"
+        return [BagKey(*row) for row in self._rows(list[tuple[str, int, Ns, Ns]](), query, before)]
 
     def paths(self) -> list[str]:
         """Returns the paths of all bags, also of those that are stored in part."""
-
-        def ask(connection: sqlite3.Connection) -> list[str]:
-            return [path for (path,) in connection.execute("SELECT path FROM bag")]
-
-        return self.read(ask, [])
+        return [path for (path,) in self._rows(list[tuple[str]](), "SELECT path FROM bag")]
 
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
@@ -457,27 +388,22 @@ class ColumnStore(Database):
         `reading` ends the name of a kind that depends on these; nothing does of one that depends
         on none.
         """
-
-        def ask(connection: sqlite3.Connection) -> list[Ns]:
-            rows = connection.execute(
-                "SELECT DISTINCT start_ns FROM (SELECT start_ns FROM fragment"
-                " WHERE kind NOT LIKE '% '"
-                " GROUP BY substr(kind, 1, instr(kind, ' ')), start_ns"
-                " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
-                " ORDER BY start_ns DESC",
-                (reading,),
-            )
-            return [start for (start,) in rows]
-
-        return self.read(ask, [])
+        query = (
+            "SELECT DISTINCT start_ns FROM (SELECT start_ns FROM fragment"
+            " WHERE kind NOT LIKE '% '"
+            " GROUP BY substr(kind, 1, instr(kind, ' ')), start_ns"
+            " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
+            " ORDER BY start_ns DESC"
+        )
+        return [start for (start,) in self._rows(list[tuple[Ns]](), query, reading)]
 
     def listings(self) -> dict[str, str]:
         """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
+        return dict(self._rows(list[tuple[str, str]](), "SELECT folder, listed FROM listing"))
 
-        def ask(connection: sqlite3.Connection) -> dict[str, str]:
-            return dict(connection.execute("SELECT folder, listed FROM listing").fetchall())
-
-        return self.read(ask, {})
+    def _rows(self, none: list[T], query: str, *given: str | int) -> list[T]:
+        """Returns the rows of a query; `none` where the file cannot be read."""
+        return self.read(lambda connection: connection.execute(query, given).fetchall(), none)
 
     def _parts_of(self, key: FragmentKey) -> str:
         return json.dumps([part - self.offset for part in key.parts])

@@ -227,7 +227,7 @@ class Elements:
 class Table:
     """The messages of one topic under one type in a bag, or in a part of it.
 
-    Ordered by log time, ties by place. Messages that cannot be decoded have no row.
+    Ordered by log time, ties by place.
 
     Attributes:
         channel: the first channel of this topic, type and definition.
@@ -239,8 +239,6 @@ class Table:
         left_out: which fields have no column (or not in all rows), by dot-path, and why; "" stands
             for the whole message, whose times are all there is.
         payload_hashes: CRC-32 of each payload, where it was asked for.
-        undecodable: messages that have no row, because they cannot be decoded.
-        undecodable_reason: why the first of them cannot be.
         definition: the fields of the type; None where they are not known.
     """
 
@@ -252,8 +250,6 @@ class Table:
     elements: Mapping[str, Elements] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     payload_hashes: IntArray | None = None
-    undecodable: int = 0
-    undecodable_reason: str = ""
     definition: Definition | None = None
 
     def __len__(self) -> int:
@@ -319,7 +315,6 @@ def joined(tables: Sequence[Table]) -> Table:
     if len(tables) == 1:
         return first
     hashes = [table.payload_hashes for table in tables if table.payload_hashes is not None]
-    reasons = [table.undecodable_reason for table in tables if table.undecodable]
     return Table(
         first.channel,
         np.concatenate([table.log_times for table in tables]),
@@ -329,8 +324,6 @@ def joined(tables: Sequence[Table]) -> Table:
         _joined_elements([table.elements for table in tables], [len(table) for table in tables]),
         dict(ChainMap(*(dict(table.left_out) for table in tables))),
         np.concatenate(hashes) if len(hashes) == len(tables) else None,
-        sum(table.undecodable for table in tables),
-        reasons[0] if reasons else "",
         first.definition,
     ).sorted()
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
 from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.columns.pack import byte_planes, from_planes, signed
 from ros2_memory.columns.steps import METRES
 
 if TYPE_CHECKING:
@@ -43,13 +44,12 @@ def _planes(numbers: IntArray) -> Array:
     """Returns the differences from one number to the next, the lowest bytes of all first."""
     steps = np.diff(numbers, prepend=0)
     folded = (steps << 1) ^ (steps >> 63)  # small ones of either sign have high bytes of 0
-    return folded.astype("<i8").view(np.uint8).reshape(-1, 8).T.reshape(-1)
+    return np.frombuffer(byte_planes(folded, 8), np.uint8)
 
 
 def _numbers(planes: Array) -> IntArray:
-    folded = np.ascontiguousarray(planes.reshape(8, -1).T).view("<u8").reshape(-1)
-    steps = (folded >> np.uint64(1)).astype(np.int64) ^ -(folded & np.uint64(1)).astype(np.int64)
-    return np.cumsum(steps)
+    folded = from_planes(planes.tobytes(), 0, planes.size // 8, 8)
+    return np.cumsum(signed(folded), dtype=np.int64)
 
 
 def _joined(found: Sequence[TrackPart]) -> Sequence[TrackPart]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -31,54 +30,21 @@ class GoneError(BusyError):
         super().__init__("stored columns were deleted while they were read: ask again")
 
 
-class Unit(ABC):
-    """The rows of a topic of one type in a part, or in a bag.
+class BagUnit:
+    """A table of a bag that is not stored. `nth` tells tables of one bag apart.
 
     Attributes:
         key: tells units of one scan apart.
         table: the rows, ordered by log time.
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
-        part: the number of the part; None where it may be replaced, or they are a bag's.
+        part: None, as it is none.
     """
 
-    key: object
-    part: int | None = None
-    table: Table
-    first: Ns
-    last: Ns
-
-    @property
-    @abstractmethod
-    def recording(self) -> Path:
-        """The recording that all the rows are of."""
-
-    @abstractmethod
-    def times(self) -> IntArray:
-        """Returns the log times of the rows (ns)."""
-
-    @abstractmethod
-    def identities(self) -> tuple[IntArray, IntArray] | None:
-        """Returns publish times and hashes of payloads; None where they are not known."""
-
-    @abstractmethod
-    def bags(self) -> Mapping[int, BagFile]:
-        """Returns the bags that rows count of, by the numbers of `bag_numbers`."""
-
-    @abstractmethod
-    def bag_numbers(self) -> IntArray:
-        """Returns for each row the number of its bag."""
-
-    def counting(self) -> NDArray[np.bool_] | None:
-        """Returns which rows are of bags that count; None: all are."""
-        return None
-
-
-class BagUnit(Unit):
-    """A table of a bag that is not stored. `nth` tells tables of one bag apart."""
+    part: Final = None
 
     def __init__(self, bag: BagFile, table: Table, nth: int) -> None:
-        self.key = (bag.file, nth)
+        self.key: object = (bag.file, nth)
         self.table = table
         self.first, self.last = int(table.log_times[0]), int(table.log_times[-1])
         self._bag = bag
@@ -105,9 +71,20 @@ class BagUnit(Unit):
         """Returns 0 for each row."""
         return np.zeros(len(self.table), np.int64)
 
+    def counting(self) -> NDArray[np.bool_] | None:
+        """Returns which rows are of bags that count: all are."""
+        return None
 
-class PartUnit(Unit):
+
+class PartUnit:
     """A part of the store.
+
+    Attributes:
+        key: tells units of one scan apart.
+        table: the rows, ordered by log time.
+        first: the earliest log time, inclusive.
+        last: the latest, inclusive.
+        part: the number of the part; None where it may be replaced.
 
     Args:
         head: what is known of it.
@@ -125,7 +102,7 @@ class PartUnit(Unit):
         counting: IntArray,
         bag_of: Callable[[int], BagFile],
     ) -> None:
-        self.key = head.number
+        self.key: object = head.number
         self.part = head.number if head.is_whole else None
         self.table = table
         self.first, self.last = head.first, head.last
@@ -167,6 +144,9 @@ class PartUnit(Unit):
         if column is None:
             raise GoneError
         return column
+
+
+Unit: TypeAlias = BagUnit | PartUnit
 
 
 class Rows:

@@ -137,8 +137,8 @@ class _Walk:
 
     def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
         columns = level.columns
-        count = max(len(self.buffer) - run.dtype.itemsize + 1, 0)
-        block = np.ndarray(count, run.dtype, self.buffer, 0, _EVERY_BYTE)[places]
+        # As bytes: field by field numpy gathers ten times as long.
+        block = self.at(f"V{run.dtype.itemsize}", places).view(run.dtype)
         for nth, entry in enumerate(run.fields):
             if isinstance(entry, Array):
                 columns[f"{entry.path}.length"] = np.full(places.size, entry.length, np.uint32)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_thinned
-from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.scanner import DECODED_BYTES
 from ros2_memory.core.errors import (
@@ -228,7 +227,7 @@ class BagAccess:
         key = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         known = remembered.get(key) if is_lasting else None
-        groups = decoded(
+        undecoded = pieces(
             self.memory.reader,
             bag.path,
             part,
@@ -236,7 +235,7 @@ class BagAccess:
             hashed=lambda channel: hashed or channel.latched,
             columns=columns,
         )
-        groups = groups if known is None else iter(known)
+        groups = decoded(self.memory.reader, undecoded) if known is None else iter(known)
         read: list[list[Table]] = []
         size = 0
         while True:
@@ -255,9 +254,7 @@ class BagAccess:
             size += 1000 + sum(table.memory_bytes for table in tables)
             if size <= DECODED_BYTES:
                 read.append(tables)
-            for table in tables:
-                with suppress(BagError):  # it was read before, and what is lost was noted
-                    yield with_all_messages(self.memory.reader, bag.path, table, part)
+            yield from tables
             self.check_deadline()
         if is_lasting and known is None:
             remembered.put(key, read, size)

@@ -9,13 +9,12 @@ import numpy as np
 
 from ros2_memory.analysis.facts import joined_stated, state_of, stated_by
 from ros2_memory.analysis.topic_events import TopicEvents, events_of, joined_events
-from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
 from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan, remembered
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.facts import Stated
     from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -107,10 +106,9 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     """
     reader, columns = view.memory.reader, StatedColumns(view.extractor)
     found: dict[str, list[Stated]] = {}
-    for tables in decoded(reader, bag.path, topics=topics) if topics else ():
+    for tables in decoded(reader, pieces(reader, bag.path, topics=topics)) if topics else ():
         for nth, table in enumerate(tables):
-            whole = with_all_messages(reader, bag.path, table, TimeWindow.everything())
-            rows = Rows(BagUnit(bag, whole, nth), lambda: None)
+            rows = Rows(BagUnit(bag, table, nth), lambda: None)
             stated = _stated(view, columns, rows)
             found.setdefault(table.channel.topic, []).append(stated)
     events = {topic: events_of(joined_stated(parts)) for topic, parts in found.items()}

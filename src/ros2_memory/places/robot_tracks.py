@@ -188,7 +188,7 @@ class RobotTracks:
         whole = _aligned(window, PART_NS)
         moving = [] if self._is_own else self._moving_scans(whole)
         for topic in self._topics:
-            opened = open_scan(self._view, topic, whole)
+            opened = open_scan(self._view, topic, whole, stored=self._view.call.stored)
             yield from joined_back(
                 self._view,
                 opened,

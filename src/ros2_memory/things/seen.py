@@ -467,14 +467,14 @@ class _Parts(NamedTuple):
         heads.sort(key=lambda head: head.first)
         firsts = np.array([head.first for head in heads], np.int64)
         lasts = np.array([head.last for head in heads], np.int64)
-        count = [coverage.among(head.bags).size == head.bags.size for head in heads]
+        counting = coverage.counts([head.bags for head in heads])
         return cls(
             np.fromiter((bag.file in merged for bag in bags), np.bool_, len(bags)),
             firsts,
             lasts,
             np.maximum.accumulate(lasts),
             np.array([head.number for head in heads], np.int64),
-            np.array(count, np.bool_),
+            counting == [head.bags.size for head in heads],
         )
 
     def around(self, window: TimeWindow, bags: Ints) -> tuple[int, ...] | None:

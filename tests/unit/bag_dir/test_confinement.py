@@ -28,7 +28,6 @@ from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, 
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
 from ros2_memory.columns.forget import delete_catalogue
-from ros2_memory.columns.store import TABLES
 from ros2_memory.config import load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
@@ -360,10 +359,10 @@ class TestDeletions:
         for name in ("columns.sqlite", "columns.sqlite-wal", "columns.sqlite-shm"):
             link = bags / "own" / name
             link.symlink_to(outside / "columns.sqlite")
-            refused = open_file([bags / "own" / "columns.sqlite"], TABLES)
+            refused = open_file([bags / "own" / "columns.sqlite"])
             assert "symbolic link" in str(refused)
             link.unlink()
-        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"], TABLES))
+        assert "symbolic link" in str(open_file([bags / ".episodic" / "columns.sqlite"]))
         assert contents(outside) == before
 
     def test_a_catalogue_behind_a_link_is_not_deleted(self, bags: Path, outside: Path) -> None:

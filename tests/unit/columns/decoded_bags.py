@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.decode import GROUP_BYTES, decoded, decoded_together, pieces
+from ros2_memory.columns.decode import decoded, decoded_together, pieces
 from ros2_memory.columns.table import joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -26,10 +26,13 @@ if TYPE_CHECKING:
 EVERYTHING: Final = TimeWindow.everything()
 
 
-def tables_of(reader: BagReader, path: Path, group_bytes: int = GROUP_BYTES) -> list[Table]:
-    """All tables of a bag, those of several groups joined; errors of lost messages are passed."""
+def tables_of(reader: BagReader, path: Path) -> list[Table]:
+    """All tables of a bag, those of several groups joined; errors of lost messages are passed.
+
+    Without the messages that cannot be decoded.
+    """
     parts: dict[object, list[Table]] = {}
-    groups = decoded(reader, path, group_bytes=group_bytes)
+    groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
     while True:
         try:
             group = next(groups)
@@ -73,7 +76,6 @@ def compared(reader: BagReader, path: Path, tables: Sequence[Table]) -> Comparis
                 except UndecodableError:
                     pass
             comparison.table(table, messages)
-        assert table.undecodable == len(found) - len(kept)
         assert table.log_times.tolist() == [record.log_time for record in kept]
         if "" not in table.left_out:
             assert table.publish_times.tolist() == [record.publish_time for record in kept]
@@ -88,7 +90,7 @@ def decoded_alike(reader: BagReader, path: Path) -> Comparison:
 
 def decoded_together_alike(reader: BagReader, paths: Sequence[Path]) -> None:
     """Bags that are decoded together have the rows that they have alone, and none is missing."""
-    found = decoded_together(reader, [(path, [*pieces(reader, path)]) for path in paths])
+    found = decoded_together(reader, [[*pieces(reader, path)] for path in paths])
     for nth, path in enumerate(paths):
         tables = [table.rows(np.flatnonzero(bags == nth)) for table, bags in found]
         comparison = compared(reader, path, [table for table in tables if len(table)])

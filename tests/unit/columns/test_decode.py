@@ -88,7 +88,7 @@ def test_messages_of_any_definition_are_decoded_as_rosbags_does(
 
 @settings(max_examples=examples(75))
 @given(types=drawn_types(), seed=st.integers(0, 2**32))
-def test_damaged_payloads_are_decoded_or_counted_as_rosbags_decides(
+def test_damaged_payloads_are_decoded_or_left_out_as_rosbags_decides(
     types: DrawnTypes, seed: int
 ) -> None:
     chance = random.Random(seed)

@@ -13,7 +13,7 @@ import pytest
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.columns import decode
-from ros2_memory.columns.decode import decoded, with_all_messages
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
@@ -46,7 +46,7 @@ from tests.unit.columns.decoded_bags import (
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from mcap.writer import Writer
 
@@ -72,6 +72,11 @@ def path_message(ns: int, points: int) -> Msg:
     ]
     made = make("nav_msgs/msg/Path", header=header(ns, "map"), poses=poses)
     return Msg("/plan", "nav_msgs/msg/Path", ns, made)
+
+
+def groups_of(path: Path) -> Iterator[list[Table]]:
+    reader = McapReader()
+    return decoded(reader, pieces(reader, path))
 
 
 def numbers(table: Table, path: str) -> list[object]:
@@ -172,15 +177,11 @@ def strings(path: Path, payloads: Sequence[bytes]) -> Table:
         pytest.param(struct.pack("<4sI", b"\0\3\0\0", 2) + b"a\0", id="another encoding"),
     ],
 )
-def test_a_hostile_payload_is_counted_and_changes_no_other_message(
-    tmp_path: Path, bad: bytes
-) -> None:
+def test_a_hostile_payload_changes_no_other_message(tmp_path: Path, bad: bytes) -> None:
     good = [text(nth, f"message {nth}").payload for nth in range(4)]
     table = strings(tmp_path / "a.mcap", [good[0], bad, *good[1:]])
     assert texts(table, "data") == [f"message {nth}" for nth in range(4)]
     assert table.log_times.tolist() == [0, 2, 3, 4]
-    assert table.undecodable == 1
-    assert table.undecodable_reason
 
 
 def test_big_endian_messages_are_decoded(tmp_path: Path) -> None:
@@ -188,7 +189,7 @@ def test_big_endian_messages_are_decoded(tmp_path: Path) -> None:
         tmp_path / "a.mcap",
         [text(0, "little").payload, struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"],
     )
-    assert (texts(table, "data"), table.undecodable) == (["little", "big"], 0)
+    assert texts(table, "data") == ["little", "big"]
 
 
 def test_a_definition_that_changes_between_bags_is_read_with_that_of_each(tmp_path: Path) -> None:
@@ -230,7 +231,7 @@ def two_publishers(path: Path) -> Path:
 
 
 def test_two_publishers_of_one_topic_are_one_table(tmp_path: Path) -> None:
-    [[table]] = decoded(McapReader(), two_publishers(tmp_path / "a.mcap"))
+    [[table]] = groups_of(two_publishers(tmp_path / "a.mcap"))
     assert numbers(table, "level") == list(range(9))
 
 
@@ -251,7 +252,7 @@ def test_bags_that_are_decoded_together_have_the_rows_that_they_have_alone(
 def test_every_one_of_649_topics_has_its_table(tmp_path: Path) -> None:
     messages = [text(nth, f"of {nth % 649}", f"/topic_{nth % 649:03}") for nth in range(1400)]
     path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=5000))
-    [tables] = decoded(McapReader(), path)
+    [tables] = groups_of(path)
     assert len(tables) == 649
     assert compared(McapReader(), path, tables).wrong == []
 
@@ -280,14 +281,14 @@ def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
     messages = [*messages[:50], *messages[90:], *messages[50:90]]
     path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=1500))
     reader = McapReader()
-    [whole] = decoded(reader, path)
-    groups = list(decoded(reader, path, group_bytes=1))
-    assert len(groups) == 1  # one buffer
+    [whole] = groups_of(path)
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decode, "GROUP_BYTES", 1)
+        assert len(list(groups_of(path))) == 1  # one buffer
+        patch.setattr(decode, "GROUP_BYTES", 8000)
         patch.setattr(bulk, "BATCH_BYTES", 4000)
-        groups = list(decoded(reader, path, group_bytes=8000))
-        assert len(groups) > 5
-        tables = tables_of(reader, path, group_bytes=8000)
+        assert len(list(groups_of(path))) > 5
+        tables = tables_of(reader, path)
     assert compared(reader, path, tables).wrong == []
     assert {len(table) for table in tables} == {len(table) for table in whole}
 
@@ -310,8 +311,8 @@ def test_rows_of_a_table_keep_their_elements_and_words(tmp_path: Path) -> None:
 
 
 def test_only_the_window_and_the_topics_asked_for_are_decoded(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", mixed(12))
-    [[table]] = decoded(McapReader(), path, TimeWindow(20, 60), topics=["/chatter"])
+    path, reader = write_mcap(tmp_path / "a.mcap", mixed(12)), McapReader()
+    [[table]] = decoded(reader, pieces(reader, path, TimeWindow(20, 60), topics=["/chatter"]))
     assert table.channel.topic == "/chatter"
     assert table.log_times.tolist() == [22, 32, 42, 52]
 
@@ -323,7 +324,8 @@ def test_payloads_are_hashed_where_that_is_asked_for(tmp_path: Path) -> None:
     def chatter(channel: Channel) -> bool:
         return channel.topic == "/chatter"
 
-    [tables] = decoded(McapReader(), path, hashed=chatter)
+    reader = McapReader()
+    [tables] = decoded(reader, pieces(reader, path, hashed=chatter))
     for table in tables:
         expected = [
             zlib.crc32(each.payload) for each in messages if each.topic == table.channel.topic
@@ -354,7 +356,7 @@ def test_images_have_times_alone_and_their_chunks_are_not_read(tmp_path: Path) -
     messages = [*(image(time) for time in range(10)), *(text(time, "x") for time in range(10, 20))]
     path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=4000))
     spoil_chunk(path, 0)
-    [tables] = decoded(McapReader(), path)
+    [tables] = groups_of(path)
     by_topic = {table.channel.topic: table for table in tables}
     assert by_topic["/camera"].log_times.tolist() == list(range(10))
     assert by_topic["/camera"].columns == {}
@@ -367,10 +369,10 @@ def test_large_messages_of_large_files_have_times_alone(
 ) -> None:
     messages = [text(1, "x" * 100_000, "/long"), text(2, "x", "/short")]
     path = write_mcap(tmp_path / "a.mcap", messages)
-    [tables] = decoded(McapReader(), path)
+    [tables] = groups_of(path)
     assert all(table.columns for table in tables)
     monkeypatch.setattr(decode, "LARGE_FILE_BYTES", 1000)
-    [tables] = decoded(McapReader(), path)
+    [tables] = groups_of(path)
     assert {table.channel.topic: bool(table.columns) for table in tables} == {
         "/long": False,
         "/short": True,
@@ -386,7 +388,7 @@ def test_json_and_unknown_types_have_times_alone_and_say_why(tmp_path: Path) -> 
             writer.add_message(channel, 3, b"{}", 3)
 
     path = raw_mcap(tmp_path / "a.mcap", fill)
-    [tables] = decoded(McapReader(), path)
+    [tables] = groups_of(path)
     reasons = {table.channel.topic: table.left_out[""] for table in tables}
     assert "json" in reasons["/log"]
     assert "no definition" in reasons["/odd"]
@@ -401,7 +403,7 @@ def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None
         channel = writer.register_channel("/endless", "cdr", schema)
         writer.add_message(channel, 3, b"\0\1\0\0\7", 3)
 
-    [[table]] = decoded(McapReader(), raw_mcap(tmp_path / "a.mcap", fill))
+    [[table]] = groups_of(raw_mcap(tmp_path / "a.mcap", fill))
     assert table.log_times.tolist() == [3]
     assert f"endless is an array of {10**18} elements" in table.left_out[""]
 
@@ -409,7 +411,7 @@ def test_an_array_longer_than_any_message_has_no_columns(tmp_path: Path) -> None
 def test_what_a_damaged_chunk_loses_is_raised_and_the_rest_follows(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
     spoil_chunk(path, 1)
-    groups = decoded(McapReader(), path)
+    groups = groups_of(path)
     with pytest.raises(BagError) as caught:
         next(groups)
     assert caught.value.lost is not None
@@ -423,24 +425,24 @@ def test_a_message_that_cannot_be_decoded_costs_no_row_of_a_damaged_bag(tmp_path
     broken = Msg("/chatter", "std_msgs/msg/String", 20, b"\x00\x01\x00\x00\xff\xff\xff\x7f")
     path = write_mcap(tmp_path / "a.mcap", [*chatter(20), broken], SMALL)
     spoil_chunk(path, 1)
-    groups = decoded(McapReader(), path)
+    groups = groups_of(path)
     with pytest.raises(BagError) as caught:
         next(groups)
     assert caught.value.lost is not None
-    [table] = next(groups)
-    whole = with_all_messages(McapReader(), path, table, TimeWindow.everything())
+    [whole] = next(groups)
     first, last = caught.value.lost
+    assert "cannot be decoded" in whole.left_out[""]
     assert set(whole.log_times.tolist()) == set(range(21)) - set(range(first, last + 1))
 
 
 def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) -> None:
-    groups = decoded(McapReader(), tmp_path / "gone.mcap")
+    groups = groups_of(tmp_path / "gone.mcap")
     with pytest.raises(BagVanishedError):
         next(groups)
 
 
 def test_an_empty_bag_has_no_group(tmp_path: Path) -> None:
-    assert list(decoded(McapReader(), write_mcap(tmp_path / "a.mcap", []))) == []
+    assert list(groups_of(write_mcap(tmp_path / "a.mcap", []))) == []
 
 
 def test_messages_that_count_elsewhere_have_no_row(tmp_path: Path) -> None:

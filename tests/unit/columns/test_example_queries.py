@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.columns.fill import StoreLimits
-from ros2_memory.columns.store import TABLES
+from ros2_memory.columns.schema import TABLES
 from tests.support.bags import battery, odom, write_mcap
 from tests.support.column_worlds import World, store_file
 from tests.support.memories import ROOT
@@ -98,7 +98,7 @@ def test_bytes_of_a_topic(file: Path) -> None:
 
 def test_all_tables_and_their_columns_are_described(file: Path) -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", section(), re.MULTILINE))
-    assert {*rows} == {*TABLES.names}
+    assert {*rows} == {*TABLES}
     with closing(sqlite3.connect(file)) as base:
         for table, described in rows.items():
             names = {row[1] for row in base.execute(f"PRAGMA table_info({table})")} - {"id", "part"}

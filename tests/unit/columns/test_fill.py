@@ -14,7 +14,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import fill
-from ros2_memory.columns.decode import decoded_groups, pieces
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
@@ -344,13 +344,13 @@ def in_groups(reader: BagReader, read: Iterator[Piece]) -> Iterator[list[Table]]
             for inside in [(piece.batch.log_times - start) // step == 0]
             if inside.any()
         ]
-        yield from decoded_groups(reader, iter(part))
+        yield from decoded(reader, iter(part))
 
 
 @pytest.fixture
 def small_groups(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bags are decoded in several goes, however small they are."""
-    monkeypatch.setattr(fill, "decoded_groups", in_groups)
+    monkeypatch.setattr(fill, "decoded", in_groups)
     monkeypatch.setattr(fill, "LARGE_BYTES", 0)
 
 
@@ -468,7 +468,7 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
                 (tmp_path / ERASING_FILE).write_text("{}")
             yield group
 
-    monkeypatch.setattr(fill, "decoded_groups", with_fault)
+    monkeypatch.setattr(fill, "decoded", with_fault)
     world.fill()
     assert halves[0] > 0
     assert (count(world, "part"), count(world, "part_column"), count(world, "bag")) == (0, 0, 0)

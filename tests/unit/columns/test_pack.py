@@ -20,7 +20,6 @@ from ros2_memory.columns.pack import (
     compressed,
     decompressed,
     pack,
-    pack_columns,
     unpack,
 )
 from ros2_memory.columns.steps import (
@@ -33,6 +32,7 @@ from ros2_memory.columns.steps import (
     Step,
 )
 from ros2_memory.columns.table import Texts
+from ros2_memory.columns.zones import Zones
 from tests.support.examples import examples
 
 if TYPE_CHECKING:
@@ -113,12 +113,6 @@ def test_zones_are_exact(column: Values) -> None:
     assert zone.greatest == max(there, default=None)
     assert zone.nulls == len(column) - len(there)
     assert zone.words is None
-
-
-@settings(max_examples=examples(100), deadline=None)
-@given(st.lists(st.tuples(st.one_of(integers, floats), st.sampled_from(STEPS)), max_size=6))
-def test_columns_packed_together_are_as_each_alone(columns: list[tuple[Values, Step]]) -> None:
-    assert pack_columns(columns) == [pack(column, step) for column, step in columns]
 
 
 @pytest.mark.parametrize("name", [*INTEGERS, *FLOATS])
@@ -231,12 +225,11 @@ def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
     texts = [f'{{"label": "Größe {number}", "score": 0.{number}}}' for number in range(1000)]
     zone = pack(Texts.of(texts)).zone
     assert zone.words == "LETTERS\ngrösse\nlabel\nscore"
-    assert zone.may_be_json
+    zones = Zones.of([1], [zone])
+    assert zones.may_be_json.all()
     found = ["label", "abel", "größe 7".casefold(), '"score": 0.5', "12345"]
-    assert [zone.may_have(text) for text in found] == [True] * 5
-    assert [zone.may_have(text) for text in ("labels", "cup", "letters", "score cup")] == [
-        False
-    ] * 4
+    assert all(zones.may_have(text).all() for text in found)
+    assert not any(zones.may_have(text).any() for text in ("labels", "cup", "letters", "score cup"))
 
 
 def test_a_zone_of_too_many_different_words_keeps_none() -> None:
@@ -251,7 +244,7 @@ def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], tex
     for padding in ([], [f"{number} " * 900 for number in range(3)]):
         zone = pack(Texts.of([*values, *padding])).zone
         if any(asked in value.casefold() for value in values):
-            assert zone.may_have(asked)
+            assert Zones.of([1], [zone]).may_have(asked).all()
 
 
 def test_two_threads_unpack_at_once() -> None:

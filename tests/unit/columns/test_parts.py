@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import decompressed, folded, unpack
 from ros2_memory.columns.parts import packed_part, part_table
@@ -178,7 +178,7 @@ def test_columns_are_unpacked_once_by_whoever_asks_first() -> None:
 )
 def test_tables_of_shared_bags_come_back(path: Path) -> None:
     reader = McapReader()
-    groups = decoded(reader, path)
+    groups = decoded(reader, pieces(reader, path))
     while True:
         try:
             tables = next(groups, None)

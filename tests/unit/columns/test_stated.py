@@ -3,26 +3,19 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import LABEL, state_of, stated_by
-from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, goals, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, shipped_extractor
+from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import drawn_tables, stored
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from ros2_memory.analysis.facts import Facts, State, Word
     from ros2_memory.columns.table import Table
     from tests.unit.columns.drawn_tables import Drawn
@@ -94,28 +87,3 @@ def test_rounded_columns_have_messages_read_rather_than_state_what_is_wrong(
     drawn: Drawn, step: float
 ) -> None:
     compared(stored(drawn.table, step), drawn)
-
-
-def listing(ns: int, statuses: dict[int, int]) -> Msg:
-    """As an action server lists goals: each with when it was accepted."""
-    return replace(goals(T0, statuses), log_time=ns)
-
-
-@pytest.mark.parametrize("second", [{1: 2, 2: 2}, {1: 4}, {2: 2}, {}])
-def test_of_goals_only_messages_that_list_something_else_are_read(
-    tmp_path: Path, second: dict[int, int]
-) -> None:
-    listed = [{1: 2}, {1: 2}, second, second]
-    path = tmp_path / "bag.mcap"
-    write_mcap(path, [listing(T0 + nth * NS_PER_S, each) for nth, each in enumerate(listed)])
-    memory = memory_of(tmp_path)
-    [bag] = memory.index.snapshot().bags
-    [[table]] = decoded(memory.reader, bag.path)
-    found = StatedColumns(memory.extractor).of(table)
-    assert found is not None
-    assert found.to_read(None).tolist() == [0, 2]
-    # Of those in a window the first, and what changes after it.
-    assert found.to_read(np.array([1, 2, 3])).tolist() == [0, 1]
-    assert found.to_read(np.array([3])).tolist() == [0]
-    assert not found.stated.facts.rows.size
-    assert np.array_equal(found.stated.times, table.log_times)

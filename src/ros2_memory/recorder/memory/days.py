@@ -21,7 +21,7 @@ import structlog
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import ERASING_FILE, MEMORY_FOLDER, memory_file, utc_day
 from ros2_memory.bag_dir.state_files import SUPERSEDED, Superseded, read_superseded
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -430,7 +430,7 @@ def _is_named(topic: str, globs: Sequence[str]) -> bool:
 
 def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
     """Yields the messages of a bag as tables; what is lost of it is left out."""
-    groups = decoded(reader, path)
+    groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
     while True:
         try:
             tables = next(groups, None)

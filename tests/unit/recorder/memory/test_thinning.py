@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.recorder.memory.rounding import rounded
 from ros2_memory.recorder.memory.thinning import (
@@ -34,10 +34,11 @@ def times_that_stay(
     folder: Path, bags: Sequence[Sequence[Msg]], *, numbers_ns: int = THINNED_NS
 ) -> list[int]:
     """The log times that stay of one topic in some bags, in ns since `T0`."""
+    reader = McapReader()
     thinned = TopicThinning(DetectionColumns(shipped_extractor()), numbers_ns)
     for nth, messages in enumerate(bags):
         path = write_mcap(folder / f"{nth}.mcap", messages)
-        for tables in decoded(McapReader(), path):
+        for tables in decoded(reader, pieces(reader, path)):
             for table in tables:
                 thinned.add(table)
         path.unlink()
@@ -141,7 +142,9 @@ def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path)
 def test_messages_say_something_if_a_text_names_nothing(
     tmp_path: Path, make: Callable[[], Msg], said: bool
 ) -> None:
-    [[table]] = decoded(McapReader(), write_mcap(tmp_path / "a.mcap", [make()]))
+    reader = McapReader()
+    path = write_mcap(tmp_path / "a.mcap", [make()])
+    [[table]] = decoded(reader, pieces(reader, path))
     assert is_said(table) is said
 
 
