@@ -4,7 +4,6 @@ Typer reads annotations at run time, so modules with commands do without `annota
 `__future__`.
 """
 
-import json
 import os
 import re
 import sys
@@ -24,7 +23,7 @@ import typer
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
-from ros2_memory.cli.output import print_line, spinner, with_local_times
+from ros2_memory.cli.output import print_json, spinner, with_local_times
 from ros2_memory.config import (
     NullRecorderNode,
     Settings,
@@ -542,4 +541,4 @@ def lines_as_json(as_json: bool, *, is_answered: bool) -> Iterator[None]:
         lines = printed.getvalue().splitlines()
         stays = [line.removeprefix(STAYS) for line in lines if line.startswith(STAYS)]
         others = [line for line in lines if not line.startswith(STAYS)]
-        print_line(json.dumps({"lines": others, "stays": stays}))
+        print_json({"lines": others, "stays": stays})

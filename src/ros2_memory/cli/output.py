@@ -5,6 +5,7 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -68,10 +69,9 @@ def print_line(line: str) -> None:
     print(line, flush=True)
 
 
-def print_done(line: str, notes: Iterable[str] = ()) -> None:
-    """Prints what a command did as a line on stdout, and notes on stderr."""
-    print_line(line)
-    print_notes(notes)
+def print_json(value: object) -> None:
+    """Prints a value for programs, as a line on stdout."""
+    print_line(json.dumps(value))
 
 
 def print_notes(notes: Iterable[str]) -> None:

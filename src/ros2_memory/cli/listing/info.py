@@ -15,7 +15,7 @@ from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools
 from ros2_memory.cli.options import MB, AsJson, Bags, open_memory
-from ros2_memory.cli.output import format_value, print_line, print_reply, stdout_console
+from ros2_memory.cli.output import format_value, print_json, print_line, print_reply, stdout_console
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import NoDataError, RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
@@ -147,7 +147,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
         if not as_json:
             _show(memory, report)
     if as_json:
-        print_line(json.dumps(reports if robots else reports[""]))
+        print_json(reports if robots else reports[""])
     return not are_bags
 
 
@@ -342,7 +342,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     snapshot, root = memory.index.snapshot(), memory.index.bag_dir
     rows, empty = [*_rows(snapshot, root)], [*_empty_rows(snapshot, root)]
     if as_json:
-        print_line(json.dumps([*rows, *empty]))
+        print_json([*rows, *empty])
     elif not rows:
         print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
     else:

@@ -1,6 +1,5 @@
 """`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
-import json
 import os
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -14,7 +13,7 @@ from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
-from ros2_memory.cli.output import print_line
+from ros2_memory.cli.output import print_json, print_line
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
@@ -58,7 +57,7 @@ def adopt(
     if as_json:
         keys = ("directory", "bags", "size_mb")
         rows = [dict(zip(keys, row, strict=True)) for row in adopted]
-        print_line(json.dumps({"adopted": rows, "already": already}))
+        print_json({"adopted": rows, "already": already})
         return not found
     for name, files, size_mb in adopted:
         print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size_mb:.1f} MB)")

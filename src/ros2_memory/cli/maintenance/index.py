@@ -6,7 +6,6 @@ from the process that answers.
 
 import ctypes
 import gc
-import json
 import os
 import signal
 import sys
@@ -28,7 +27,7 @@ from ros2_memory.cli.options import (
     load_given,
     open_memory,
 )
-from ros2_memory.cli.output import print_line, progress_bar
+from ros2_memory.cli.output import print_json, progress_bar
 from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
@@ -83,7 +82,7 @@ def index(
             of = f" of {name}" if robots else ""
             print(f"{describe_progress(progress)}{of}", file=sys.stderr)
     if as_json:
-        print_line(json.dumps(done if robots else done[""]))
+        print_json(done if robots else done[""])
     if problems:
         raise RecorderError("; ".join(problems))
 
