@@ -25,7 +25,7 @@ from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.doctor_lake import check_lake, check_shipping
 from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
-from ros2_memory.cli.listing.info import assumed_active
+from ros2_memory.cli.info import assumed_active
 from ros2_memory.cli.options import AsJson, Bags, open_memory
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import (

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.cli.listing.info import usual_rate
+from ros2_memory.cli.info import usual_rate
 from ros2_memory.cli.options import AsJson, Bags
 from ros2_memory.cli.output import (
     escape,

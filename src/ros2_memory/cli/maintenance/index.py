@@ -113,19 +113,15 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
+    """Fills the store at a low priority, until it is done or the server ends."""
     if not _end_with_parent(server):
         raise typer.Exit(EXIT_CANNOT_RUN)
     logged = settings.logging
     configure_logging(logged.level, logged.format, arguments=logged.arguments)
-    _filled(_low_priority_backfill(settings))
-
-
-def _low_priority_backfill(settings: Settings) -> Backfill:
-    """Returns what fills the store in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
     shared = shared_parts(settings, cache_mb=_cache_mb(settings))
-    return build_backfill(settings, build_memory(settings, shared))
+    _filled(build_backfill(settings, build_memory(settings, shared)))
 
 
 def _cache_mb(settings: Settings) -> int:
