@@ -81,7 +81,7 @@ def run_demo(
     """
     _check(options)
     port = free_port(options.port)
-    tell = _say_nothing if options.as_json else say
+    tell: Callable[[str], object] = str if options.as_json else say
     with ExitStack() as stack:
         bag_dir = _bag_dir(options, stack)
         recorder = stack.enter_context(_recorder(bag_dir, options.duration_s))
@@ -91,7 +91,14 @@ def run_demo(
             )
         )
         url = f"http://{HOST}:{port}"
-        tell(_heading(recorder, options, url))
+        tell(
+            "A simulated robot drives through a flat and records what it does. A client asks the "
+            "real\nquery server about it, and each answer is held against the robot's closed form."
+            f"\n\n  bags     {recorder.directory}\n"
+            f"           {options.duration_s:g} s of history in {recorder.splits} files of "
+            f"{SPLIT_DURATION_S:g} s, the last one being written\n"
+            f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
+        )
         show = exchange_as_json if options.as_json else format_exchange
         wrong = _count_wrong(f"{url}/sse", recorder, lambda *each: say(show(*each)), questions)
         total = len(questions)
@@ -100,10 +107,6 @@ def run_demo(
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return 1 if wrong else 0
-
-
-def _say_nothing(_: str) -> None:
-    return
 
 
 def _check(options: DemoOptions) -> None:
@@ -138,17 +141,6 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
     recorder.write_until(now)
     recorder.start()
     return recorder
-
-
-def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
-    return (
-        "A simulated robot drives through a flat and records what it does. A client asks the real\n"
-        "query server about it, and each answer is held against the robot's closed form.\n\n"
-        f"  bags     {recorder.directory}\n"
-        f"           {options.duration_s:g} s of history in {recorder.splits} files of "
-        f"{SPLIT_DURATION_S:g} s, the last one being written\n"
-        f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
-    )
 
 
 def _count_wrong(
