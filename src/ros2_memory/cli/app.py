@@ -303,7 +303,14 @@ def demo(
     """
     # Imported here, so that no other command waits for the demo's libraries.
     from ros2_memory.cli.output import print_line  # noqa: PLC0415
-    from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
+    from ros2_memory.demo.run import run_demo  # noqa: PLC0415
 
-    options = DemoOptions(once, port, bag_dir, duration, verbose, as_json)
-    return run_demo(options, print_line)
+    return run_demo(
+        print_line,
+        once=once,
+        port=port,
+        bag_dir=bag_dir,
+        duration_s=duration,
+        verbose=verbose,
+        as_json=as_json,
+    )

@@ -325,16 +325,12 @@ def open_memory(
     with spinner(f"looking through {settings.recording.bag_dir}"):
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:
-        raise InvalidArgumentsError(
-            f"{snapshot.problem}; {_recordings_like(settings.data.recording, memory.index.bag_dir)}"
-        )
+        bag_dir = memory.index.bag_dir
+        there = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
+        near = get_close_matches(settings.data.recording, there, n=3)
+        which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
+        raise InvalidArgumentsError(f"{snapshot.problem}; {which}")
     return memory
-
-
-def _recordings_like(name: str, bag_dir: Path) -> str:
-    there = [str(each.relative_to(bag_dir)) for each in folders_with_bags(bag_dir)]
-    near = get_close_matches(name, there, n=3)
-    return f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
 
 
 def present(memory: "Memory") -> Ns:
