@@ -18,7 +18,7 @@ from mcp.types import TextContent
 from rosbags.rosbag2 import Reader
 
 from ros2_memory.demo.questions import QUESTIONS
-from ros2_memory.demo.run import DemoOptions, run_demo
+from ros2_memory.demo.run import run_demo
 from tests.support.processes import PATIENCE_S, until
 
 PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
@@ -60,7 +60,7 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     position = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
     falsified = replace(position, arguments={"seconds_ago": 20})
     output: list[str] = []
-    code = run_demo(DemoOptions(once=True, port=0), output.append, [position, falsified])
+    code = run_demo(output.append, [position, falsified], once=True, port=0)
     assert code == 1
     assert "WRONG: expected the message of" in output[-2]
     assert output[-1] == "1 of 2 answers are right."

@@ -202,11 +202,11 @@ def documented_settings() -> str:
     folder = ROOT / "config"
     rows = []
     for key, default, meaning in (
-        *_keys(folder / "config.yaml", ""),
+        *keys_of(folder / "config.yaml", ""),
         *(
             key
             for option, (group, _, _) in OPTIONS.items()
-            for key in _keys(folder / option, f"{group}.")
+            for key in keys_of(folder / option, f"{group}.")
         ),
     ):
         told = meaning.replace(" | ", ", ")
@@ -214,7 +214,7 @@ def documented_settings() -> str:
     return table(("key", "holds", "default", "meaning"), rows)
 
 
-def _keys(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
+def keys_of(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
     """Key, default and meaning of each line that has one; links to other keys are passed over."""
     group = ""
     for line in path.read_text(encoding="utf-8").splitlines():

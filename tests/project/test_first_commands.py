@@ -13,15 +13,12 @@ import subprocess
 import sys
 import sysconfig
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 
 from tests.support.examples import LONG
 from tests.support.memories import ROOT
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
 
 pytestmark = pytest.mark.skipif(
     not LONG,
@@ -49,17 +46,14 @@ SPARING: Final = {"PIP_NO_COMPILE": "1"}
 BOUND_S: Final = 600
 
 
-def debian_like(folder: Path, *, without: Iterable[str] = ()) -> Path:
-    """A Python that its distribution manages; returns the folder of its program.
-
-    It has the files of this one, but for modules that the distribution has in another package.
-    """
+def debian_like(folder: Path) -> Path:
+    """A Python that its distribution manages; returns the folder of its program."""
     library = Path(sysconfig.get_path("stdlib"))
     own = folder / "lib" / library.name
     for path, target in ((own.parent, library.parent), (own, library)):
         path.mkdir(parents=True)
         for each in target.iterdir():
-            if each != library and each.name not in {*without, "EXTERNALLY-MANAGED"}:
+            if each != library and each.name != "EXTERNALLY-MANAGED":
                 (path / each.name).symlink_to(each)
     (own / "EXTERNALLY-MANAGED").write_text(MANAGED, encoding="utf-8")
     (folder / "bin").mkdir()
@@ -99,18 +93,6 @@ def test_readmes_first_line_works_where_the_distribution_manages_python(
     done = ran(f"{FIRST[0]} --once --port 0", clone, programs)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "15 of 15 answers are right" in done.stdout
-
-
-def test_without_the_package_for_environments_readme_says_what_to_install(
-    clone: Path, tmp_path: Path
-) -> None:
-    programs = debian_like(tmp_path / "debian", without=("ensurepip",))
-    refused = ran("python3 -m venv .venv", clone, programs)
-    assert refused.returncode != 0
-    assert "ensurepip" in refused.stdout + refused.stderr
-    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
-    assert "If `python3 -m venv` fails on Debian or Ubuntu" in readme
-    assert "sudo apt install python3-venv" in readme
 
 
 def older_python(folder: Path) -> Path:

@@ -17,6 +17,7 @@ ENVIRONMENT = "etc/ros2-memory/environment"
 RECORDER = "etc/systemd/system/ros2-memory-recorder.service"
 SERVER = "etc/systemd/system/ros2-memory-server.service"
 BAGS = "var/lib/ros2-memory/bags"
+OF_BAGS = ("", ".episodic", ".episodic/requests")
 
 
 def install(root: Path, *options: str, script: Path = SCRIPT) -> subprocess.CompletedProcess[str]:
@@ -31,28 +32,24 @@ def installed(root: Path, *options: str, script: Path = SCRIPT) -> str:
     return ran.stdout
 
 
-def tree(root: Path) -> dict[str, tuple[int, int, int, int, bytes]]:
-    """Mode, owner, group, change and content of all below a folder."""
-    found = {}
-    for path in sorted(root.rglob("*")):
-        stat = path.lstat()
-        content = path.read_bytes() if path.is_file() else b""
-        found[str(path.relative_to(root))] = (
-            stat.st_mode,
-            stat.st_uid,
-            stat.st_gid,
-            stat.st_ctime_ns,
-            content,
+def tree(*roots: Path) -> dict[Path, tuple[object, ...]]:
+    """Mode, owner, group, change and content of some folders, and of all below them."""
+    return {
+        path: (
+            *(stat.st_mode, stat.st_uid, stat.st_gid, stat.st_ctime_ns),
+            path.read_bytes() if path.is_file() else b"",
         )
-    return found
+        for root in roots
+        for path in (root, *sorted(root.rglob("*")))
+        for stat in [path.lstat()]
+    }
 
 
 def release(folder: Path, unit: str) -> Path:
-    """The script of another release, in which a unit is another one."""
-    for part in ("deploy", "config"):
-        (folder / part).mkdir(parents=True)
+    """The script of another release, in which a file is another one."""
     for source in (*DEPLOY.iterdir(), ROOT / "config/topics.yaml"):
         copy = folder / source.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
         copy.write_bytes(source.read_bytes())
     (folder / "deploy" / unit).write_text("[Service]\nExecStart=/bin/newer\n")
     return folder / "deploy/install.sh"
@@ -63,36 +60,27 @@ def test_a_clean_root_has_all_that_the_units_need(tmp_path: Path) -> None:
     for name in (ENVIRONMENT, RECORDER, SERVER):
         assert (tmp_path / name).read_bytes() == (DEPLOY / Path(name).name).read_bytes()
         assert (tmp_path / name).stat().st_mode & 0o777 == 0o644
+        lines = (tmp_path / name).read_text().splitlines()
+        named = [re.sub(r"^\w+=-?", "", line) for line in lines if re.match("Read.*Paths=", line)]
+        assert [path for path in named if not (tmp_path / path.lstrip("/")).is_dir()] == []
     topics = tmp_path / "etc/ros2-memory/topics.yaml"
     assert topics.read_bytes() == (ROOT / "config/topics.yaml").read_bytes()
-    for folder in ("", ".episodic", ".episodic/requests"):
+    for folder in OF_BAGS:
         assert (tmp_path / BAGS / folder).stat().st_mode & 0o777 == 0o750
     assert (tmp_path / "etc/ros2-memory").stat().st_mode & 0o777 == 0o755
 
 
 def test_a_list_of_topics_that_is_given_is_installed_and_replaces_none(tmp_path: Path) -> None:
     mine, root = tmp_path / "mine.yaml", tmp_path / "root"
-    mine.write_text("topics: [/odom]\n")
-    installed(root, "--topics", str(mine))
     listed = root / "etc/ros2-memory/topics.yaml"
-    assert listed.read_text() == "topics: [/odom]\n"
-    assert (root / ENVIRONMENT).read_bytes() == (DEPLOY / "environment").read_bytes()
-    mine.write_text("topics: [/tf]\n")
-    installed(root, "--topics", str(mine))
-    assert listed.read_text() == "topics: [/odom]\n"
+    for topic in ("/odom", "/tf"):
+        mine.write_text(f"topics: [{topic}]\n")
+        installed(root, "--topics", str(mine))
+        assert listed.read_text() == "topics: [/odom]\n"
     assert listed.with_name("topics.yaml.new").read_text() == "topics: [/tf]\n"
     refused = install(tmp_path / "other", "--topics", str(tmp_path / "missing"))
     assert (refused.returncode, refused.stderr) == (1, "install.sh: --topics needs a file\n")
     assert not (tmp_path / "other").exists()
-
-
-def test_every_folder_that_the_units_name_is_made(tmp_path: Path) -> None:
-    installed(tmp_path)
-    for unit in (RECORDER, SERVER):
-        lines = (tmp_path / unit).read_text().splitlines()
-        named = [re.sub(r"^\w+=-?", "", line) for line in lines if re.match("Read.*Paths=", line)]
-        assert named
-        assert [path for path in named if not (tmp_path / path.lstrip("/")).is_dir()] == []
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
@@ -101,66 +89,50 @@ def test_bags_belong_to_the_user_and_the_folder_above_to_root(tmp_path: Path) ->
     passwd = tmp_path / "etc/passwd"
     if not passwd.exists():
         pytest.skip("systemd-sysusers is not on this machine")
-    [line] = [line for line in passwd.read_text().splitlines() if line.startswith("ros2-memory:")]
-    uid, gid = map(int, line.split(":")[2:4])
-    for folder in ("", ".episodic", ".episodic/requests"):
+    [ids] = re.findall(r"^ros2-memory:[^:]*:(\d+):(\d+):", passwd.read_text(), re.MULTILINE)
+    for folder in OF_BAGS:
         stat = (tmp_path / BAGS / folder).stat()
-        assert (stat.st_uid, stat.st_gid) == (uid, gid)
+        assert (stat.st_uid, stat.st_gid) == (*map(int, ids),)
     above = (tmp_path / BAGS).parent.stat()
     assert (above.st_uid, above.st_mode & 0o777) == (0, 0o755)
 
 
 def test_run_again_it_changes_nothing_and_names_nothing(tmp_path: Path) -> None:
     installed(tmp_path)
-    before = tree(tmp_path / "var") | tree(tmp_path / "etc/ros2-memory")
-    said = installed(tmp_path)
-    assert tree(tmp_path / "var") | tree(tmp_path / "etc/ros2-memory") == before
-    assert "NAME.new" not in said
+    folders = tmp_path / "var", tmp_path / "etc/ros2-memory"
+    before = tree(*folders)
+    assert "NAME.new" not in installed(tmp_path)
+    assert tree(*folders) == before
     assert not [*tmp_path.rglob("*.new"), *tmp_path.rglob("*.part")]
 
 
-@pytest.mark.parametrize("name", [ENVIRONMENT, RECORDER])
-def test_what_was_edited_stays_and_ours_is_put_beside_it_and_named(
-    tmp_path: Path, name: str
+@pytest.mark.parametrize(
+    ("name", "is_edited", "is_replaced"),
+    [
+        (ENVIRONMENT, True, False),
+        (ENVIRONMENT, False, False),  # a configuration is somebody's, also when nobody edited it
+        (SERVER, True, False),
+        (SERVER, False, True),
+    ],
+)
+def test_a_newer_release_replaces_only_a_unit_that_nobody_changed(
+    tmp_path: Path, name: str, is_edited: bool, is_replaced: bool
 ) -> None:
-    installed(tmp_path)
-    (tmp_path / name).write_text("# mine\n")
-    for _ in range(2):
-        said = installed(tmp_path)
-        assert (tmp_path / name).read_text() == "# mine\n"
-        beside = tmp_path / f"{name}.new"
-        assert beside.read_bytes() == (DEPLOY / Path(name).name).read_bytes()
-        assert f"  /{name}\n" in said
-
-
-def test_a_newer_unit_replaces_the_one_that_nobody_changed(tmp_path: Path) -> None:
-    newer = release(tmp_path / "newer", "ros2-memory-server.service")
-    root = tmp_path / "root"
+    newer, root = release(tmp_path / "newer", Path(name).name), tmp_path / "root"
     installed(root)
-    said = installed(root, script=newer)
-    assert "ExecStart=/bin/newer" in (root / SERVER).read_text()
-    assert f"replaced /{SERVER}" in said
-    assert not [*root.rglob("*.new")]
-
-
-def test_a_newer_unit_does_not_replace_one_that_was_changed(tmp_path: Path) -> None:
-    newer = release(tmp_path / "newer", "ros2-memory-server.service")
-    root = tmp_path / "root"
-    installed(root)
-    (root / SERVER).write_text("# mine\n")
-    for _ in range(2):
-        assert f"  /{SERVER}\n" in installed(root, script=newer)
-        assert (root / SERVER).read_text() == "# mine\n"
-        assert "ExecStart=/bin/newer" in (root / f"{SERVER}.new").read_text()
-
-
-def test_a_newer_configuration_never_replaces_the_one_in_use(tmp_path: Path) -> None:
-    newer = release(tmp_path / "newer", "environment")
-    root = tmp_path / "root"
-    installed(root)
-    before = (root / ENVIRONMENT).read_bytes()
-    assert f"  /{ENVIRONMENT}\n" in installed(root, script=newer)
-    assert (root / ENVIRONMENT).read_bytes() == before
+    if is_edited:
+        (root / name).write_text("# mine\n")
+    before = (root / name).read_bytes()
+    for _ in range(1 if is_replaced else 2):
+        said = installed(root, script=newer)
+        if is_replaced:
+            assert "ExecStart=/bin/newer" in (root / name).read_text()
+            assert f"replaced /{name}" in said
+            assert not [*root.rglob("*.new")]
+        else:
+            assert (root / name).read_bytes() == before
+            assert "ExecStart=/bin/newer" in (root / f"{name}.new").read_text()
+            assert f"  /{name}\n" in said
 
 
 def test_existing_bags_keep_their_owner_and_mode(tmp_path: Path) -> None:
@@ -168,9 +140,9 @@ def test_existing_bags_keep_their_owner_and_mode(tmp_path: Path) -> None:
     recording.mkdir(parents=True, mode=0o777)
     (recording / "rec_1_0.mcap").write_bytes(b"kept")
     (tmp_path / BAGS).chmod(0o777)
-    before = tree(tmp_path / BAGS), (tmp_path / BAGS).stat().st_ctime_ns
+    before = tree(tmp_path / BAGS)
     installed(tmp_path)
-    assert (tree(tmp_path / BAGS), (tmp_path / BAGS).stat().st_ctime_ns) == before
+    assert tree(tmp_path / BAGS) == before
 
 
 @pytest.mark.parametrize(
@@ -192,20 +164,20 @@ def test_a_link_on_the_way_is_named_and_nothing_is_installed(tmp_path: Path, lin
     elsewhere.mkdir()
     (root / link).parent.mkdir(parents=True)
     (root / link).symlink_to(elsewhere)
-    before = tree(root)
+    before = tree(root, elsewhere)
     ran = install(root)
     assert ran.returncode == 1
     assert str(root / link) in ran.stderr
-    assert tree(root) == before
-    assert [*elsewhere.iterdir()] == []
+    assert tree(root, elsewhere) == before
 
 
 def test_the_query_server_alone_comes_without_a_recorder(tmp_path: Path) -> None:
     said = installed(tmp_path, "--query-only")
-    assert {path.name for path in (tmp_path / "etc/systemd/system").iterdir()} == {
-        "ros2-memory-query.service"
-    }
-    assert {path.name for path in (tmp_path / "etc/ros2-memory").iterdir()} == {"query-environment"}
+    for folder, names in (
+        ("etc/systemd/system", ["ros2-memory-query.service"]),
+        ("etc/ros2-memory", ["query-environment"]),
+    ):
+        assert [path.name for path in (tmp_path / folder).iterdir()] == names
     assert not (tmp_path / BAGS).exists()
     assert "systemctl enable --now ros2-memory-query\n" in said
 
@@ -224,11 +196,3 @@ def test_what_it_does_not_know_is_refused(options: list[str]) -> None:
     ran = subprocess.run(["sh", SCRIPT, *options], check=False, capture_output=True, text=True)
     assert ran.returncode in {1, 2}
     assert ran.stderr
-
-
-def test_no_service_is_started_stopped_or_restarted() -> None:
-    calls = re.findall(r"^ *(?:if )?systemctl (.+)$", SCRIPT.read_text(), re.MULTILINE)
-    assert [call.split()[0] for call in calls] == ["daemon-reload", "is-active"]
-    assert SCRIPT.read_text().startswith("#!/bin/sh\n")
-    assert "\nset -eu\n" in SCRIPT.read_text()
-    assert os.access(SCRIPT, os.X_OK)

@@ -37,12 +37,9 @@ def test_it_is_valid_by_the_schema_that_it_names() -> None:
     assert [each.message for each in VALID.iter_errors(SERVER)] == []
 
 
-def test_it_names_this_release_of_this_package_on_pypi() -> None:
+def test_it_names_this_release_of_this_package_on_pypi_whose_readme_names_it() -> None:
     assert (PACKAGE["registryType"], PACKAGE["identifier"]) == ("pypi", PROJECT["name"])
     assert SERVER["version"] == PACKAGE["version"] == PROJECT["version"]
-
-
-def test_the_readme_that_pypi_shows_proves_whose_the_package_is() -> None:
     readme = (ROOT / PROJECT["readme"]).read_text(encoding="utf-8")
     assert re.findall(r"mcp-name: (\S+)", readme) == [SERVER["name"]]
 

@@ -63,9 +63,8 @@ def forked_commands(folder: Path) -> Iterator[Path]:
 
 def _serve(listener: socket.socket) -> None:
     from ros2_memory import bootstrap  # noqa: F401, PLC0415
-    from ros2_memory.cli import ask, doctor, export  # noqa: F401, PLC0415
+    from ros2_memory.cli import ask, cat, doctor, export, info  # noqa: F401, PLC0415  # noqa: F401, PLC0415
     from ros2_memory.cli.__main__ import run  # noqa: PLC0415
-    from ros2_memory.cli.listing import cat, info  # noqa: F401, PLC0415
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)
     while True:

@@ -373,7 +373,7 @@ class OwnRecordings:
         """Returns the line of a directory that is adopted."""
         row = self._row(name, identity)
         with suppress(OSError):
-            return row.with_bags(path.name for path in _bags_in(self._bag_dir / name))
+            return row.with_bags(path.name for path in bags_in(self._bag_dir / name))
         return row
 
     def _row(self, name: str, identity: Identity) -> ListRow:
@@ -428,7 +428,7 @@ class OwnRecordings:
                 identity = identity_of(self._bag_dir / name)
                 if identity is None:
                     continue
-                files = [path for path in _bags_in(self._bag_dir / name) if path.stat().st_size]
+                files = [path for path in bags_in(self._bag_dir / name) if path.stat().st_size]
                 embedded = [custom_data(path) or {} for path in files]
                 is_ours = all(ours.items() <= data.items() for data in embedded)
                 if embedded and (is_ours or (name in named and not any(embedded))):
@@ -441,7 +441,7 @@ class OwnRecordings:
         for name, row in self._list.entries.items():
             if row.identity is not None and row.splits is not None and not row.ended:
                 with suppress(OSError):
-                    files = {path.name for path in _bags_in(self._bag_dir / name)}
+                    files = {path.name for path in bags_in(self._bag_dir / name)}
                     found.append(replace(row, splits=row.counted(files), ended=True))
         return found
 
@@ -623,7 +623,7 @@ def _named_as_own(bag_dir: Path) -> list[str]:
     return sorted(filter(has_own_name, names))
 
 
-def _bags_in(folder: Path) -> list[Path]:
+def bags_in(folder: Path) -> list[Path]:
     """Returns the bag files in a directory.
 
     Raises:

@@ -48,22 +48,22 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         },
     ),
     "topics": CommandEntry(
-        "listing.info.topics",
+        "info.topics",
         "every recorded topic, with its rate",
         {0: "topics are listed", 1: "nothing is recorded"},
     ),
     "info": CommandEntry(
-        "listing.info.info",
+        "info.info",
         "what is recorded: size, time range, gaps, damage, budget",
         {0: "there are bags", 1: "there are none"},
     ),
     "recordings": CommandEntry(
-        "listing.info.recordings",
+        "info.recordings",
         "every recording: start, length, size, storage, maker",
         {0: "recordings are listed", 1: "there are none"},
     ),
     "cat": CommandEntry(
-        "listing.cat.cat",
+        "cat.cat",
         "the messages of a topic, as text, CSV or JSON lines",
         {
             0: "all messages were printed",
@@ -303,7 +303,14 @@ def demo(
     """
     # Imported here, so that no other command waits for the demo's libraries.
     from ros2_memory.cli.output import print_line  # noqa: PLC0415
-    from ros2_memory.demo.run import DemoOptions, run_demo  # noqa: PLC0415
+    from ros2_memory.demo.run import run_demo  # noqa: PLC0415
 
-    options = DemoOptions(once, port, bag_dir, duration, verbose, as_json)
-    return run_demo(options, print_line)
+    return run_demo(
+        print_line,
+        once=once,
+        port=port,
+        bag_dir=bag_dir,
+        duration_s=duration,
+        verbose=verbose,
+        as_json=as_json,
+    )

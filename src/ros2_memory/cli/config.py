@@ -13,7 +13,7 @@ import yaml
 
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_given
-from ros2_memory.cli.output import leaves, print_line
+from ros2_memory.cli.output import leaves, print_json, print_line
 from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.errors import ConfigError
@@ -44,7 +44,7 @@ def config_show(
     values = _chosen(dict(leaves(plain_values(settings))), named)
     if as_json:
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
-        print_line(json.dumps(rows if sources else values))
+        print_json(rows if sources else values)
     elif sources:
         _print_sources(values, source, () if named else GROUPS)
     else:

@@ -26,9 +26,9 @@ from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.doctor_lake import check_lake, check_shipping
 from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
-from ros2_memory.cli.listing.info import assumed_active
+from ros2_memory.cli.info import assumed_active
 from ros2_memory.cli.options import AsJson, Bags, open_memory
-from ros2_memory.cli.output import escape, print_line, spinner, stdout_console
+from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import (
     NullRecorderNode,
     Settings,
@@ -90,7 +90,7 @@ def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
             {"level": level.name.lower(), "about": about, "seen": seen, "do": do}
             for level, seen, do, about in findings
         ]
-        print_line(json.dumps({"status": worst.name.lower(), "findings": rows}))
+        print_json({"status": worst.name.lower(), "findings": rows})
         return worst
     console = stdout_console()
     for level, seen, do, about in findings:

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-    from ros2_memory.cli.plot import DrawnPath, Signal, Stop, TimelineRow
+    from ros2_memory.cli.plot import DrawnPath, Signal, TimelineRow
     from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
@@ -98,7 +98,10 @@ def picture(path: Path, title: str, subtitle: str, size: tuple[float, float]) ->
 
 
 def draw_path(
-    axes: Axes, path: DrawnPath, places: Sequence[Place] = (), stops: Sequence[Stop] = ()
+    axes: Axes,
+    path: DrawnPath,
+    places: Sequence[Place],
+    stops: Sequence[tuple[float, float, float]],
 ) -> None:
     """Draws a path, coloured by time, with named places and standstills of the same frame."""
     for place in places:
@@ -187,30 +190,26 @@ def draw_signals(figure: Figure, signals: Sequence[Signal], span: tuple[float, f
 
 
 def draw_recap(
-    figure: Figure,
-    path: tuple[DrawnPath, Sequence[Place], Sequence[Stop]] | str,
-    rows: Sequence[TimelineRow],
-    span: tuple[float, float],
-    lines: Iterable[str],
-) -> None:
-    """Draws a path, or why there is none, beside lines of text, and a timeline below."""
+    figure: Figure, rows: Sequence[TimelineRow], span: tuple[float, float], lines: Iterable[str]
+) -> Axes:
+    """Draws lines of text, and a timeline below; returns the free part beside, for the path."""
     height = 0.35 + 0.3 * len(rows)
     grid = figure.add_gridspec(
         2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
     )
-    plane = figure.add_subplot(grid[0, 0])
-    if isinstance(path, str):
-        plane.set_axis_off()
-        shown = textwrap.fill(path, 50)
-        plane.text(0.5, 0.5, shown, ha="center", va="center", color="#6b7280")
-    else:
-        draw_path(plane, *path)
-        plane.set_adjustable("datalim")  # it fills its part of the picture
-    beside = figure.add_subplot(grid[0, 1])
+    plane, beside = figure.add_subplot(grid[0, 0]), figure.add_subplot(grid[0, 1])
     beside.set_axis_off()
     wrapped = "\n".join(textwrap.fill(each, 62, subsequent_indent="            ") for each in lines)
     beside.text(0, 1, wrapped, ha="left", va="top", fontsize=8.5, linespacing=1.5)
     draw_rows(figure.add_subplot(grid[1, :]), rows, span)
+    return plane
+
+
+def write_instead(axes: Axes, reason: str) -> None:
+    """Writes why a part of a picture has nothing to show."""
+    axes.set_axis_off()
+    wrapped = textwrap.fill(reason, 50)
+    axes.text(0.5, 0.5, wrapped, ha="center", va="center", color="#6b7280")
 
 
 def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:

@@ -1,6 +1,5 @@
 """`ros2-memory export`: a time window as an MCAP file, or as rows of Parquet."""
 
-import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -12,7 +11,7 @@ from typing import Annotated, Final
 import typer
 
 from ros2_memory.cli.options import AsJson, Bags, Times
-from ros2_memory.cli.output import print_done, progress_bar
+from ros2_memory.cli.output import print_json, print_line, print_notes, progress_bar
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,
@@ -109,8 +108,12 @@ def export(
     if lacking:
         view.notes.add(lacking)
     notes = view.notes.sentences()
-    done = {"path": str(mcap or parquet), "messages": count, "files": files, "notes": [*notes]}
-    print_done(json.dumps(done) if as_json else f"{counted(count, 'message')} {where}", notes)
+    if as_json:
+        path = str(mcap or parquet)
+        print_json({"path": path, "messages": count, "files": files, "notes": [*notes]})
+    else:
+        print_line(f"{counted(count, 'message')} {where}")
+    print_notes(notes)
     return bool(lacking or not view.notes.complete or lost_in(view.snapshot, window))
 
 

@@ -4,7 +4,6 @@ Typer reads annotations at run time, so modules with commands do without `annota
 `__future__`.
 """
 
-import json
 import os
 import re
 import sys
@@ -24,7 +23,7 @@ import typer
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
-from ros2_memory.cli.output import print_line, spinner, with_local_times
+from ros2_memory.cli.output import print_json, spinner, with_local_times
 from ros2_memory.config import (
     NullRecorderNode,
     Settings,
@@ -326,16 +325,12 @@ def open_memory(
     with spinner(f"looking through {settings.recording.bag_dir}"):
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:
-        raise InvalidArgumentsError(
-            f"{snapshot.problem}; {_recordings_like(settings.data.recording, memory.index.bag_dir)}"
-        )
+        bag_dir = memory.index.bag_dir
+        there = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
+        near = get_close_matches(settings.data.recording, there, n=3)
+        which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
+        raise InvalidArgumentsError(f"{snapshot.problem}; {which}")
     return memory
-
-
-def _recordings_like(name: str, bag_dir: Path) -> str:
-    there = [str(each.relative_to(bag_dir)) for each in folders_with_bags(bag_dir)]
-    near = get_close_matches(name, there, n=3)
-    return f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
 
 
 def present(memory: "Memory") -> Ns:
@@ -550,4 +545,4 @@ def lines_as_json(as_json: bool, *, is_answered: bool) -> Iterator[None]:
         lines = printed.getvalue().splitlines()
         stays = [line.removeprefix(STAYS) for line in lines if line.startswith(STAYS)]
         others = [line for line in lines if not line.startswith(STAYS)]
-        print_line(json.dumps({"lines": others, "stays": stays}))
+        print_json({"lines": others, "stays": stays})

@@ -5,6 +5,7 @@ Recorded text comes from elsewhere: control characters in it never reach the ter
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
@@ -68,10 +69,9 @@ def print_line(line: str) -> None:
     print(line, flush=True)
 
 
-def print_done(line: str, notes: Iterable[str] = ()) -> None:
-    """Prints what a command did as a line on stdout, and notes on stderr."""
-    print_line(line)
-    print_notes(notes)
+def print_json(value: object) -> None:
+    """Prints a value for programs, as a line on stdout."""
+    print_line(json.dumps(value))
 
 
 def print_notes(notes: Iterable[str]) -> None:
@@ -296,20 +296,16 @@ def format_value(value: JsonValue) -> str:
     """Formats one value as text; a time as local time, an absent or empty one as `-`."""
     if value is None:
         return "-"
-    if isinstance(value, bool):
-        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(value).lower()  # a boolean as in JSON
     if isinstance(value, float):
         return format_time(value) if _is_time(value) else f"{value:,.10g}".replace(",", "")
     if isinstance(value, str):
         return escape(value)
-    if isinstance(value, int):
-        return str(value)
-    return (_format_list(value) if isinstance(value, list) else _format_object(value)) or "-"
-
-
-def _format_list(values: Sequence[JsonValue]) -> str:
-    is_simple = all(isinstance(each, str | int | float) for each in values)
-    return (", " if is_simple else " | ").join(format_value(each) for each in values)
+    if isinstance(value, dict):
+        return _format_object(value) or "-"
+    is_simple = all(isinstance(item, str | int | float) for item in value)
+    return (", " if is_simple else " | ").join(map(format_value, value)) or "-"
 
 
 def _format_object(value: Mapping[str, JsonValue]) -> str:

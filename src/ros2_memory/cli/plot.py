@@ -3,10 +3,8 @@
 Times are Unix seconds.
 """
 
-import json
 import math
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from importlib.util import find_spec
@@ -19,7 +17,14 @@ from numpy.typing import NDArray
 
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
-from ros2_memory.cli.output import format_duration, leaves, print_done, spinner
+from ros2_memory.cli.output import (
+    format_duration,
+    leaves,
+    print_json,
+    print_line,
+    print_notes,
+    spinner,
+)
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place
@@ -102,14 +107,6 @@ class Signal(NamedTuple):
     values: NDArray[np.float64]
 
 
-class Stop(NamedTuple):
-    """A place where the robot stood, and for how long (s)."""
-
-    x: float
-    y: float
-    length: float
-
-
 class DrawnPath(NamedTuple):
     """A path in a frame: where (m) and when, which points the robot jumped to; a line on it."""
 
@@ -121,15 +118,16 @@ class DrawnPath(NamedTuple):
     line: str
     notes: Sequence[str]
 
-    def stops(self, found: Recap | None) -> list[Stop]:
-        """Returns where the robot stood, by the path at that time."""
-        stops: list[Stop] = []
-        for event in () if found is None else found.events:
-            if event.kind == "stop" and event.end is not None:
-                middle = unix_from_ns((event.start + event.end) // 2)
-                x, y = (float(np.interp(middle, self.times, axis)) for axis in (self.xs, self.ys))
-                stops.append(Stop(x, y, unix_from_ns(event.end - event.start)))
-        return stops
+    def stops(self, found: Recap) -> list[tuple[float, float, float]]:
+        """Returns where the robot stood (x, y in m), by the path at that time; and how long (s)."""
+        stops = [
+            (event.start, event.end)
+            for event in found.events
+            if event.kind == "stop" and event.end is not None
+        ]
+        middles = [unix_from_ns((start + end) // 2) for start, end in stops]
+        xs, ys = (np.interp(middles, self.times, axis).tolist() for axis in (self.xs, self.ys))
+        return [*zip(xs, ys, [unix_from_ns(end - start) for start, end in stops], strict=True)]
 
 
 class Asked(NamedTuple):
@@ -151,11 +149,9 @@ class Asked(NamedTuple):
         until = f"{end:%H:%M:%S}" if end.date() == start.date() else f"{end:%Y-%m-%d %H:%M:%S}"
         return f"{start:%Y-%m-%d %H:%M:%S} - {until} {end:%Z}"
 
-    def recap(self) -> Recap | None:
-        """Returns what happened; None where the window has no length."""
-        with suppress(InvalidArgumentsError):
-            return recap(self.memory, Call(), TimeRange.over(self.window))
-        return None
+    def recap(self) -> Recap:
+        """Returns what happened."""
+        return recap(self.memory, Call(), TimeRange.over(self.window))
 
     def places(self, frame: str) -> list[Place]:
         """Returns the named places of a frame."""
@@ -241,7 +237,7 @@ def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags
     size = (11.0, 1.3 + 0.27 * len(rows))
     with drawing.picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
         drawing.draw_rows(figure.add_subplot(), rows, asked.span)
-    _finish(out, () if found is None else found.notes, as_json=as_json)
+    _finish(out, found.notes, as_json=as_json)
 
 
 @plot.command("recap", epilog=epilog("plot"))
@@ -268,15 +264,19 @@ def plot_recap(
     with spinner("recalling the day"):
         found = asked.recap()
         rows = event_rows(asked, found)
-        path: tuple[DrawnPath, Sequence[Place], Sequence[Stop]] | str
+        path: DrawnPath | str
         try:
-            drawn = path_in(asked, None, None)
-            path = drawn, asked.places(drawn.frame), drawn.stops(found)
+            path = path_in(asked, None, None)
         except (InvalidArgumentsError, NoDataError) as error:
             path = f"the path is unknown: {error}"
     with drawing.picture(out, f"Recap, {asked.title}", _totals(found), (12.0, 8.0)) as figure:
-        drawing.draw_recap(figure, path, rows, asked.span, _event_lines(found))
-    _finish(out, () if found is None else found.notes, as_json=as_json)
+        plane = drawing.draw_recap(figure, rows, asked.span, _event_lines(found))
+        if isinstance(path, str):
+            drawing.write_instead(plane, path)
+        else:
+            drawing.draw_path(plane, path, asked.places(path.frame), path.stops(found))
+            plane.set_adjustable("datalim")  # it fills its part of the picture
+    _finish(out, found.notes, as_json=as_json)
 
 
 def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
@@ -298,8 +298,11 @@ def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
 
 
 def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
-    done = json.dumps({"path": str(out), "notes": [*notes]})
-    print_done(done if as_json else str(out), () if as_json else notes)
+    if as_json:
+        print_json({"path": str(out), "notes": [*notes]})
+    else:
+        print_line(str(out))
+        print_notes(notes)
 
 
 def opened(memory: Memory, window: TimeWindow) -> Asked:
@@ -465,14 +468,15 @@ def _with_breaks(
     return shown, np.insert(np.array(values), broken, math.nan)
 
 
-def event_rows(asked: Asked, found: Recap | None) -> list[TimelineRow]:
+def event_rows(asked: Asked, found: Recap) -> list[TimelineRow]:
     """Returns a row of what was recorded, and one for each kind of event that occurs."""
     span = asked.window.start, asked.window.stop - 1
     recorded = without([span], [*recording_gaps(asked.view, asked.window)])
     rows = [TimelineRow("recorded", [*map(_unix, recorded)], _RECORDED)]
     for kind, (name, color) in _ROWS.items():
-        events = () if found is None else found.events
-        stretches = [_unix((event.start, _until(event))) for event in events if event.kind == kind]
+        stretches = [
+            _unix((event.start, _until(event))) for event in found.events if event.kind == kind
+        ]
         if stretches:
             rows.append(TimelineRow(name, stretches, color))
     return rows
@@ -500,10 +504,8 @@ def topic_rows(asked: Asked) -> Iterator[TimelineRow]:
         yield TimelineRow(topic, [*map(_unix, united(extents, joined))], _TOPIC)
 
 
-def _totals(found: Recap | None) -> str:
+def _totals(found: Recap) -> str:
     """Returns distance, speed and time of standing in a line, as far as they are known."""
-    if found is None:
-        return ""
     parts: list[str] = []
     if found.distance_m is not None and found.max_speed is not None:
         parts = [f"{found.distance_m:.1f} m driven", f"at most {found.max_speed:.2f} m/s"]
@@ -512,11 +514,10 @@ def _totals(found: Recap | None) -> str:
     return ", ".join([*parts, *(f"{count} {name}" for name, count in found.counts)])
 
 
-def _event_lines(found: Recap | None) -> Iterator[str]:
+def _event_lines(found: Recap) -> Iterator[str]:
     """Yields each event in a line, with the time of day, and how long it took."""
-    if found is None or not found.events:
+    if not found.events:
         yield "no events"
-        return
     for event in found.events:
         at = datetime.fromtimestamp(unix_from_ns(event.start)).astimezone()
         length = unix_from_ns(_until(event) - event.start)

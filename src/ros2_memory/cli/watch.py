@@ -1,7 +1,6 @@
 """`ros2-memory watch`: what is being recorded, compared with what is usual."""
 
 import itertools
-import json
 import time
 from collections.abc import Iterator
 from contextlib import nullcontext, suppress
@@ -16,12 +15,13 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.cli.listing.info import usual_rate
+from ros2_memory.cli.info import usual_rate
 from ros2_memory.cli.options import AsJson, Bags
 from ros2_memory.cli.output import (
     escape,
     format_duration,
     format_time,
+    print_json,
     print_line,
     stdout_console,
     with_commands,
@@ -146,10 +146,12 @@ def watch(
     with suppress(KeyboardInterrupt), screen as live:
         for number in itertools.count(1):
             seen = _observed(memory)
-            if live is not None:
+            if as_json:
+                print_json(_as_object(seen))
+            elif live is not None:
                 live.update(_screen(seen), refresh=True)
             else:
-                print_line(json.dumps(_as_object(seen)) if as_json else _line(seen))
+                print_line(_line(seen))
             if number == count:
                 break
             time.sleep(every)

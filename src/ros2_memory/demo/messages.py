@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
     from ros2_memory.core.model import Vector3
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.demo.published_topics import Message
     from ros2_memory.demo.robot import Planar, SimulatedThing
 
@@ -86,12 +85,10 @@ def _make(type_name: str, **fields: object) -> object:
     return cast("_Build", _typestore().types[type_name])(**fields)
 
 
-def _stamp(ns: Ns) -> object:
-    return _make("builtin_interfaces/msg/Time", sec=ns // NS_PER_S, nanosec=ns % NS_PER_S)
-
-
 def _header(message: Message, frame_id: str) -> object:
-    return _make("std_msgs/msg/Header", stamp=_stamp(message.publish_time), frame_id=frame_id)
+    seconds, nanoseconds = divmod(message.publish_time, NS_PER_S)
+    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
+    return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 
 
 def _point(xyz: Vector3) -> object:
@@ -134,10 +131,6 @@ def _odometry(message: Message) -> object:
     )
 
 
-def _command(message: Message) -> object:
-    return _twist(message.t)
-
-
 def _transform(message: Message, parent: str, child: str, at: Planar, z: float = 0.0) -> object:
     return _make(
         "geometry_msgs/msg/TransformStamped",
@@ -177,10 +170,6 @@ def _scan(message: Message) -> object:
         ranges=robot.scan(message.t).astype(np.float32),
         intensities=np.zeros(0, dtype=np.float32),
     )
-
-
-def _path_clear(message: Message) -> object:
-    return _make("std_msgs/msg/Bool", data=robot.path_clear(message.t))
 
 
 def _battery(message: Message) -> object:
@@ -238,10 +227,6 @@ def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) 
     )
 
 
-def _scene_objects(message: Message) -> object:
-    return _detections(message, "scene", robot.seen(message.t))
-
-
 def _found(message: Message) -> object:
     wanted = [thing for thing in robot.seen(message.t) if thing.label == "scissors"]
     return _detections(message, "find_object", wanted)
@@ -259,11 +244,15 @@ _BODIES: Final[Mapping[str, Callable[[Message], object]]] = {
     published_topics.ODOM: _odometry,
     published_topics.TF: _moving_frames,
     published_topics.TF_STATIC: _fixed_frames,
-    published_topics.CMD_VEL: _command,
+    published_topics.CMD_VEL: lambda message: _twist(message.t),
     published_topics.SCAN: _scan,
-    published_topics.PATH_CLEAR: _path_clear,
+    published_topics.PATH_CLEAR: lambda message: _make(
+        "std_msgs/msg/Bool", data=robot.path_clear(message.t)
+    ),
     published_topics.BATTERY: _battery,
-    published_topics.SCENE_OBJECTS: _scene_objects,
+    published_topics.SCENE_OBJECTS: lambda message: _detections(
+        message, "scene", robot.seen(message.t)
+    ),
     published_topics.FOUND: _found,
     published_topics.SCENE_DESCRIPTION: _described,
 }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.demo.questions import Exchange, Question
+    from ros2_memory.demo.questions import Exchange
 
 WIDTH: Final = 96
 _INDENT: Final = "    "
@@ -22,7 +22,17 @@ def format_exchange(number: int, exchange: Exchange) -> str:
 
     An empty line follows.
     """
-    mark = "" if exchange.right else "WRONG: "
+    question, mark = exchange.question, "" if exchange.right else "WRONG: "
+    arguments = ", ".join(
+        f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
+    )
+    call = textwrap.wrap(
+        f"{question.tool}({arguments})",
+        WIDTH,
+        initial_indent=_INDENT,
+        subsequent_indent=_INDENT * 2,
+        break_on_hyphens=False,
+    )
     answer = textwrap.fill(
         f"{mark}{exchange.sentence}",
         WIDTH,
@@ -30,8 +40,8 @@ def format_exchange(number: int, exchange: Exchange) -> str:
         subsequent_indent=f"{_INDENT}   ",
         break_on_hyphens=False,
     )
-    lines = [f"{number:>2}. {exchange.question.words}", *_call(exchange.question), answer]
-    return "\n".join([*lines, *_reply(exchange.reply), ""])
+    lines = [f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""]
+    return "\n".join(lines)
 
 
 def exchange_as_json(number: int, exchange: Exchange) -> str:
@@ -64,19 +74,6 @@ def connection_hints(url: str) -> str:
             "      transport: sse",
             f'      url: "{url}/sse"',
         ]
-    )
-
-
-def _call(question: Question) -> list[str]:
-    arguments = ", ".join(
-        f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
-    )
-    return textwrap.wrap(
-        f"{question.tool}({arguments})",
-        WIDTH,
-        initial_indent=_INDENT,
-        subsequent_indent=_INDENT * 2,
-        break_on_hyphens=False,
     )
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import time
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.demo.questions import Question
 
-    _Show: TypeAlias = Callable[[int, Exchange], None]
+    _Show: TypeAlias = Callable[[int, Exchange], object]
 
 SPLIT_DURATION_S: Final = 5.0
 SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
@@ -42,34 +41,31 @@ _KNOWN_WITHIN_NS: Final = 3 * NS_PER_S
 """The server knows a closed split within this time: the index refresh, with some room."""
 
 
-@dataclass(frozen=True, slots=True)
-class DemoOptions:
-    """The options of the command line.
+_CONNECTED_WITHIN_S: Final = 60.0
 
-    Attributes:
+
+def run_demo(
+    say: Callable[[str], object],
+    questions: Sequence[Question] = QUESTIONS,
+    *,
+    once: bool = False,
+    port: int = 9203,
+    bag_dir: Path | None = None,
+    duration_s: float = 120.0,
+    verbose: bool = False,
+    as_json: bool = False,
+) -> int:
+    """Records, serves, asks, and (unless `once`) continues until it is interrupted.
+
+    Args:
+        say: prints.
+        questions: what is asked.
         once: leave after the answers.
         port: where the server listens; 0 for any that is free.
         bag_dir: an empty or new folder for the bags, kept; None for a temporary one.
         duration_s: length of the history that exists when the questions are asked.
         verbose: the server's log goes to stderr.
         as_json: a line of JSON for each question, and nothing else.
-    """
-
-    once: bool = False
-    port: int = 9203
-    bag_dir: Path | None = None
-    duration_s: float = 120.0
-    verbose: bool = False
-    as_json: bool = False
-
-
-_CONNECTED_WITHIN_S: Final = 60.0
-
-
-def run_demo(
-    options: DemoOptions, say: Callable[[str], None], questions: Sequence[Question] = QUESTIONS
-) -> int:
-    """Records, serves, asks, and (unless `once`) continues until it is interrupted.
 
     Returns:
         0 where every answer was right, otherwise 1.
@@ -79,53 +75,54 @@ def run_demo(
         EpisodicError: the server or the recording did not last.
         KeyboardInterrupt: it was interrupted before all answers were there.
     """
-    _check(options)
-    port = free_port(options.port)
-    tell = _say_nothing if options.as_json else say
+    if not SHORTEST_S <= duration_s <= LONGEST_S:
+        raise ConfigError(
+            f"--duration {duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
+            "the shortest is a lap of the robot and two bag files"
+        )
+    if bag_dir is not None and bag_dir.exists() and not _is_empty(bag_dir):
+        raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
+    port = free_port(port)
+    tell: Callable[[str], object] = str if as_json else say
     with ExitStack() as stack:
-        bag_dir = _bag_dir(options, stack)
-        recorder = stack.enter_context(_recorder(bag_dir, options.duration_s))
+        folder = _made(bag_dir, stack)
+        recorder = stack.enter_context(_recorder(folder, duration_s))
         server = stack.enter_context(
-            running_server(
-                bag_dir, port, tell, split_duration_s=SPLIT_DURATION_S, verbose=options.verbose
-            )
+            running_server(folder, port, tell, split_duration_s=SPLIT_DURATION_S, verbose=verbose)
         )
         url = f"http://{HOST}:{port}"
-        tell(_heading(recorder, options, url))
-        show = exchange_as_json if options.as_json else format_exchange
+        tell(
+            "A simulated robot drives through a flat and records what it does. A client asks the "
+            "real\nquery server about it, and each answer is held against the robot's closed form."
+            f"\n\n  bags     {recorder.directory}\n"
+            f"           {duration_s:g} s of history in {recorder.splits} files of "
+            f"{SPLIT_DURATION_S:g} s, the last one being written\n"
+            f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
+        )
+        show = exchange_as_json if as_json else format_exchange
         wrong = _count_wrong(f"{url}/sse", recorder, lambda *each: say(show(*each)), questions)
         total = len(questions)
         tell(f"{total - wrong} of {total} answers are right.")
-        if not options.once:
+        if not once:
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return 1 if wrong else 0
 
 
-def _say_nothing(_: str) -> None:
-    return
+def _is_empty(folder: Path) -> bool:
+    return folder.is_dir() and not any(folder.iterdir())
 
 
-def _check(options: DemoOptions) -> None:
-    if not SHORTEST_S <= options.duration_s <= LONGEST_S:
-        raise ConfigError(
-            f"--duration {options.duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
-            "the shortest is a lap of the robot and two bag files"
-        )
-    folder = options.bag_dir
-    if folder is not None and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"--bag-dir {folder} is not an empty folder; give a new or an empty one")
-
-
-def _bag_dir(options: DemoOptions, stack: ExitStack) -> Path:
-    if options.bag_dir is None:
+def _made(bag_dir: Path | None, stack: ExitStack) -> Path:
+    """Returns the folder of the bags; without a name one that is removed at the end."""
+    if bag_dir is None:
         temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
         return Path(stack.enter_context(temporary))
     try:
-        options.bag_dir.mkdir(parents=True, exist_ok=True)
+        bag_dir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"--bag-dir {options.bag_dir} cannot be made: {error}") from error
-    return options.bag_dir.resolve()
+        raise ConfigError(f"--bag-dir {bag_dir} cannot be made: {error}") from error
+    return bag_dir.resolve()
 
 
 def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
@@ -138,17 +135,6 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
     recorder.write_until(now)
     recorder.start()
     return recorder
-
-
-def _heading(recorder: DemoRecorder, options: DemoOptions, url: str) -> str:
-    return (
-        "A simulated robot drives through a flat and records what it does. A client asks the real\n"
-        "query server about it, and each answer is held against the robot's closed form.\n\n"
-        f"  bags     {recorder.directory}\n"
-        f"           {options.duration_s:g} s of history in {recorder.splits} files of "
-        f"{SPLIT_DURATION_S:g} s, the last one being written\n"
-        f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
-    )
 
 
 def _count_wrong(

@@ -83,7 +83,7 @@ def server_environment(
 def running_server(
     bag_dir: Path,
     port: int,
-    say: Callable[[str], None],
+    say: Callable[[str], object],
     *,
     split_duration_s: float,
     verbose: bool = False,
@@ -99,8 +99,11 @@ def running_server(
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
     """
     log_path = bag_dir / LOG_NAME
-    places_path = bag_dir / PLACES_NAME
-    places_path.write_text(yaml.safe_dump({"places": _places()}, sort_keys=False))
+    places = {
+        name: {"x": [from_x, to_x], "y": [from_y, to_y]}
+        for name, (from_x, to_x, from_y, to_y) in ROOMS.items()
+    }
+    (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
         environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
         with log_path.open("wb") as log:
@@ -123,19 +126,16 @@ def running_server(
             _wait_until_up(process, port, log_path, say)
             yield process
         finally:
-            _end(process)
-
-
-def _places() -> dict[str, object]:
-    """Returns the rooms of the flat as a file of places has them."""
-    return {
-        name: {"x": [from_x, to_x], "y": [from_y, to_y]}
-        for name, (from_x, to_x, from_y, to_y) in ROOMS.items()
-    }
+            process.terminate()
+            try:
+                process.wait(_DOWN_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
 
 def _wait_until_up(
-    process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], None]
+    process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], object]
 ) -> None:
     begun = time.monotonic()
     has_said = False
@@ -179,12 +179,3 @@ def _answering(port: int) -> int | None:
 def _last_words(log_path: Path) -> str:
     lines = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
     return "".join(f"\n  {line}" for line in (": its last words are", *lines)) if lines else ""
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.terminate()
-    try:
-        process.wait(_DOWN_WITHIN_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()

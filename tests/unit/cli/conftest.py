@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import time
+from contextlib import closing
 from typing import TYPE_CHECKING
 
+from ros2_memory.columns.pack import decompressed
 from tests.support.program import exits
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 __all__ = ["exits"]
@@ -19,3 +23,10 @@ def left(path: Path) -> Path:
     hour_ago = time.time() - 3600
     os.utime(path, (hour_ago, hour_ago))
     return path
+
+
+def columns_in(store: Path) -> Iterator[bytes]:
+    """All that a store of columns packs, unpacked."""
+    with closing(sqlite3.connect(store)) as base:
+        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
+    yield from (decompressed(blob) for (blob,) in columns)

@@ -16,7 +16,7 @@ import yaml
 from ros2_memory import cli
 from ros2_memory.cli.app import COMMANDS, epilog
 from ros2_memory.cli.ask import complete
-from ros2_memory.cli.listing.info import describe_budget
+from ros2_memory.cli.info import describe_budget
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import odom, text, write_mcap
 from tests.support.housekeepers import later, recording_now
@@ -46,10 +46,6 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 class TestAsk:
-    def test_with_json_the_reply_is_what_a_client_receives(self, exits: Program) -> None:
-        reply = exits(0, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json").json
-        assert (reply["x"], reply["topic"]) == (1.0, "/odom")
-
     def test_an_object_is_taken_as_it_is(self, exits: Program) -> None:
         asked = '{"topic": "/chatter", "seconds": 4000}'
         assert exits(0, "ask", "get_topic_in_last", asked, "--json").json["total"] == 2
@@ -172,13 +168,6 @@ class TestTopics:
         assert rows["/odom"]["count"] == 200
         assert rows["/chatter"]["rate_hz"] is None
 
-    def test_they_are_a_table(self, exits: Program) -> None:
-        assert "nav_msgs/msg/Odometry" in exits(0, "topics").out
-
-    def test_of_an_empty_memory_the_exit_code_is_1(self, tmp_path: Path, exits: Program) -> None:
-        (tmp_path / "none").mkdir()
-        assert "nothing is recorded in" in exits(1, "topics", "--bag-dir", tmp_path / "none").out
-
 
 class TestInfo:
     def test_it_shows_the_range_the_gaps_and_the_bags(self, bag_dir: Path, exits: Program) -> None:
@@ -192,14 +181,8 @@ class TestInfo:
         assert len(output["data_time_range"]["gaps"]) == 1
         assert output["memory_status"]["budget"]["max_gb"] is None
 
-    @pytest.mark.parametrize("there", [True, False])
-    def test_of_a_memory_without_bags_the_exit_code_is_1(
-        self, there: bool, tmp_path: Path, exits: Program
-    ) -> None:
-        folder = tmp_path / "none"
-        if there:
-            folder.mkdir()
-        assert "bags" in exits(1, "info", "--bag-dir", folder).out
+    def test_of_a_missing_folder_the_exit_code_is_1(self, tmp_path: Path, exits: Program) -> None:
+        assert "does not exist" in exits(1, "info", "--bag-dir", tmp_path / "none").out
 
     def test_where_nothing_is_recorded_there_is_no_budget(self, exits: Program) -> None:
         shown = exits(0, "info").out
@@ -301,9 +284,6 @@ class TestConfig:
         (row,) = [each for each in rows if each.partition(" ")[0] == key]
         assert row.partition(" ")[2].lstrip().startswith(who)
 
-    def test_a_wrong_key_is_named_and_the_exit_code_is_2(self, exits: Program) -> None:
-        assert "server.prot" in exits(2, "config", "show", "server.prot=1").err
-
 
 class TestTheProgram:
     def test_a_command_that_there_is_not_ends_with_2(self, exits: Program) -> None:
@@ -329,13 +309,11 @@ class TestTheProgram:
     ) -> None:
         assert " ".join(exits(0, command, "--help").out.split()).endswith(epilog(command))
 
-    def test_it_prints_its_version(self, exits: Program) -> None:
-        assert exits(0, "--version").out.startswith("ros2-memory ")
-
     def test_it_runs_as_a_module_and_a_pipe_gets_whole_lines(self, bag_dir: Path) -> None:
         program = [sys.executable, "-m", "ros2_memory.cli", "topics", "--bag-dir", str(bag_dir)]
         done = subprocess.run(program, capture_output=True, text=True, check=True, timeout=60)
         assert "/chatter" in done.stdout
+        assert "nav_msgs/msg/Odometry" in done.stdout
         assert done.stderr == ""
         assert "\x1b" not in done.stdout
 

@@ -17,14 +17,13 @@ from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.columns.pack import decompressed
 from ros2_memory.columns.store import CATALOGUE, FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
 from tests.support.housekeepers import OURS, embedding, made_moment, own_all, recording_now
-from tests.unit.cli.conftest import left
+from tests.unit.cli.conftest import columns_in, left
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -231,10 +230,7 @@ def test_a_dry_run_leaves_the_columns(bag_dir: Path, forget: Forget) -> None:
 
 
 def unpacked(store: Path) -> bytes:
-    """All that is packed in a store of columns."""
-    with closing(sqlite3.connect(store)) as base:
-        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    return b"".join(decompressed(blob) for (blob,) in columns)
+    return b"".join(columns_in(store))
 
 
 def all_bytes(folder: Path) -> bytes:

@@ -32,7 +32,6 @@ from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.cli.maintenance import forget as cli_forget
-from ros2_memory.columns.pack import decompressed
 from ros2_memory.columns.store import FILE
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.retention import eraser
@@ -50,11 +49,11 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import made_moment, own_all
-from tests.unit.cli.conftest import left
+from tests.unit.cli.conftest import columns_in, left
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
 S = NS_PER_S
 T0 = 1_700_000_000 * S
@@ -154,13 +153,6 @@ def traces(root: Path, needle: str) -> list[str]:
         if any(needle.encode() in part for part in parts):
             found.append(str(path.relative_to(root)))
     return found
-
-
-def columns_in(store: Path) -> Iterator[bytes]:
-    """All that a store of columns packs, unpacked."""
-    with closing(sqlite3.connect(store)) as base:
-        columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
-    yield from (decompressed(blob) for (blob,) in columns)
 
 
 def indexed() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.cli.listing.info import usual_rate
+from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns

@@ -1,6 +1,5 @@
 """`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
-import json
 import os
 from collections.abc import Iterable, Iterator
 from itertools import islice
@@ -11,11 +10,16 @@ import typer
 
 from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
+from ros2_memory.bag_dir.own_recordings import (
+    OwnRecordings,
+    bags_in,
+    folders_with_bags,
+    is_regular,
+)
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
-from ros2_memory.cli.output import print_line
-from ros2_memory.core.directories import Identity, identity_of
+from ros2_memory.cli.output import print_json, print_line
+from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.retention.delete import size_of
@@ -45,20 +49,29 @@ def adopt(
     own = OwnRecordings(root)
     given = [_below(root, directory) for directory in directories]
     found = {
-        name: _bags_in(path)
+        name: [*filter(is_regular, bags_in(path))]
         for directory in given
         for path in folders_with_bags(directory)
         if (name := own.name_of(path))
     }
-    _require_list(root, own)
+    if not own.exists():  # as the recorder does when it starts
+        lock = BagDirLock.acquire(root, patience_s=0.0)
+        try:
+            claim(own)
+        finally:
+            lock.release()
     new = {name: bags for name, bags in found.items() if not all(map(own.owns_bag, bags))}
-    own.adopt({name: _identity(root / name) for name in new})
+    identities = {name: identity_of(root / name) for name in new}
+    for name, identity in identities.items():
+        if identity is None:
+            raise RecorderError(f"{root / name} is not there any more")
+    own.adopt({name: identity for name, identity in identities.items() if identity})
     adopted = [(name, len(bags), sum(map(size_of, bags)) / MB) for name, bags in new.items()]
     already = len(found) - len(new)
     if as_json:
         keys = ("directory", "bags", "size_mb")
         rows = [dict(zip(keys, row, strict=True)) for row in adopted]
-        print_line(json.dumps({"adopted": rows, "already": already}))
+        print_json({"adopted": rows, "already": already})
         return not found
     for name, files, size_mb in adopted:
         print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size_mb:.1f} MB)")
@@ -106,29 +119,3 @@ def _links(directories: Iterable[Path]) -> Iterator[Path]:
                 path = Path(folder, name)
                 if path.is_symlink() and not name.startswith("."):
                     yield path
-
-
-def _require_list(root: Path, own: OwnRecordings) -> None:
-    """Writes the list of own recordings if there is none, as the recorder does when it starts.
-
-    Raises:
-        RecorderError: a recorder of a version without lists is recording, or writing fails.
-    """
-    if own.exists():
-        return
-    lock = BagDirLock.acquire(root, patience_s=0.0)
-    try:
-        claim(own)
-    finally:
-        lock.release()
-
-
-def _identity(path: Path) -> Identity:
-    identity = identity_of(path)
-    if identity is None:
-        raise RecorderError(f"{path} is not there any more")
-    return identity
-
-
-def _bags_in(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if bag_kind(path.name) and is_regular(path)]

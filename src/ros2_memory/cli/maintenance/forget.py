@@ -374,13 +374,9 @@ class _Forget:
     def _delete(self, planned: Sequence[BagFile]) -> None:
         """Deletes the planned bags that are still there, and prints which stay.
 
-        A live recorder carries latched messages itself, and two programs must not do so at a time.
-        Bags with such messages are kept then.
-
         Raises:
             BagError: latched messages cannot be carried; nothing is deleted then.
         """
-        kept: list[str] = []
         with spinner("deleting"), _recorder_locked_out(self._bag_dir) as recorder:
             snapshot = self._memory.index.refresh()
             present = {bag[:3] for bag in self._raw_bags(snapshot)}
@@ -389,34 +385,13 @@ class _Forget:
                 for bag in planned
                 if bag[:3] in present and (self._own is None or self._own.owns_bag(bag.path))
             ]
-            paths, also = {bag.path for bag in bags}, ""
+            kept, carried = list[str](), None
             if recorder is None:
+                paths = {bag.path for bag in bags}
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
-                if carried is not None:
-                    messages = counted(carried, "latched message is", "latched messages are")
-                    also = f"; {messages} carried on"
             else:
-                latched = self._carrier.with_latched(snapshot, paths)
-                paths -= {bag.path for bag in latched}
-                bags = [bag for bag in bags if bag.path in paths]
-                kept = [
-                    f"{self._name(bag)}: it has latched messages, which only the recorder may copy "
-                    f"forward while it runs: {recorder}; stop the recorder, and forget again"
-                    for bag in sorted(latched)
-                ]
-            kept += [
-                f"what a lake has of {self._name(bag)}, which cannot be read"
-                for bag in bags
-                if bag.path in self._unread
-            ]
-            if known := [bag for bag in bags if bag.path not in self._unread]:
-                forgotten = [
-                    ForgottenBag(bag.recording.name, bag.path.name, bag.summary.start)
-                    for bag in known
-                ]
-                start = min(min(bag.summary.start, bag.start) for bag in known)
-                stop = max(bag.end for bag in known) + 1
-                kept += self._request_of_lake([Forgetting(start, stop, bags=tuple(forgotten))])
+                bags, kept = self._without_latched(bags, snapshot, recorder)
+            kept += self._ask_lake(bags)
             self._note_deletions(bags, kept)
             deleted, freed = self._delete_files(bags, kept)
             open_recordings = {
@@ -432,10 +407,46 @@ class _Forget:
             except BagError as error:
                 kept.append(error.reason)
             notes = [*self._correct_metadata(deleted, open_recordings)]
+        also = ""
+        if carried is not None:
+            messages = counted(carried, "latched message is", "latched messages are")
+            also = f"; {messages} carried on"
         print_line(f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB{also}")
         self._stays(kept)
         for note in notes:
             print_line(note)
+
+    def _without_latched(
+        self, bags: Sequence[BagFile], snapshot: Snapshot, recorder: str
+    ) -> tuple[list[BagFile], list[str]]:
+        """Returns the bags that may go beside a recorder, and a line for each other one.
+
+        A live recorder carries latched messages itself, and two programs must not do so at a time.
+        """
+        latched = sorted(self._carrier.with_latched(snapshot, {bag.path for bag in bags}))
+        stay = {bag.path for bag in latched}
+        return [bag for bag in bags if bag.path not in stay], [
+            f"{self._name(bag)}: it has latched messages, which only the recorder may copy forward "
+            f"while it runs: {recorder}; stop the recorder, and forget again"
+            for bag in latched
+        ]
+
+    def _ask_lake(self, bags: Sequence[BagFile]) -> list[str]:
+        """Has a lake forget what it has of bags; returns a line on each thing that it keeps."""
+        known = [bag for bag in bags if bag.path not in self._unread]
+        kept = [
+            f"what a lake has of {self._name(bag)}, which cannot be read"
+            for bag in bags
+            if bag.path in self._unread
+        ]
+        if not known:
+            return kept
+        start = min(min(bag.summary.start, bag.start) for bag in known)
+        stop = max(bag.end for bag in known) + 1
+        forgotten = [
+            ForgottenBag(bag.recording.name, bag.path.name, bag.summary.start) for bag in known
+        ]
+        return kept + self._request_of_lake([Forgetting(start, stop, bags=tuple(forgotten))])
 
     def _note_deletions(self, bags: Sequence[BagFile], kept: list[str]) -> None:
         """Writes down what is about to be deleted, so that answers do not call it unrecorded."""

@@ -6,7 +6,6 @@ from the process that answers.
 
 import ctypes
 import gc
-import json
 import os
 import signal
 import sys
@@ -28,7 +27,7 @@ from ros2_memory.cli.options import (
     load_given,
     open_memory,
 )
-from ros2_memory.cli.output import print_line, progress_bar
+from ros2_memory.cli.output import print_json, progress_bar
 from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
@@ -83,7 +82,7 @@ def index(
             of = f" of {name}" if robots else ""
             print(f"{describe_progress(progress)}{of}", file=sys.stderr)
     if as_json:
-        print_line(json.dumps(done if robots else done[""]))
+        print_json(done if robots else done[""])
     if problems:
         raise RecorderError("; ".join(problems))
 
@@ -114,19 +113,15 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
+    """Fills the store at a low priority, until it is done or the server ends."""
     if not _end_with_parent(server):
         raise typer.Exit(EXIT_CANNOT_RUN)
     logged = settings.logging
     configure_logging(logged.level, logged.format, arguments=logged.arguments)
-    _filled(_low_priority_backfill(settings))
-
-
-def _low_priority_backfill(settings: Settings) -> Backfill:
-    """Returns what fills the store in a process that other programs go before."""
     with suppress(OSError):  # some sandboxes forbid it
         os.nice(NICENESS)
     shared = shared_parts(settings, cache_mb=_cache_mb(settings))
-    return build_backfill(settings, build_memory(settings, shared))
+    _filled(build_backfill(settings, build_memory(settings, shared)))
 
 
 def _cache_mb(settings: Settings) -> int:

@@ -4,7 +4,6 @@ A recorder does the same when it starts. The command is for files that it does n
 that another recorder wrote, copies on a laptop, files so large that a recorder would start late.
 """
 
-import json
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -22,7 +21,7 @@ from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import AsJson
-from ros2_memory.cli.output import print_line, progress_bar
+from ros2_memory.cli.output import print_json, print_line, progress_bar
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted, listed
@@ -75,7 +74,7 @@ def recover(
     report = lines.append if as_json else print_line
     outcome = recover_files(path, report, force=force, dry_run=dry_run)
     if as_json:
-        print_line(json.dumps({**asdict(outcome), "lines": lines[:-1]}))
+        print_json({**asdict(outcome), "lines": lines[:-1]})
     return outcome.failed > 0
 
 

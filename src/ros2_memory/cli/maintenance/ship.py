@@ -1,10 +1,9 @@
 """`ros2-memory ship`: ships the closed bags of many robots into a lake, for as long as it runs."""
 
-import json
 import math
 import time
 from contextlib import closing, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
@@ -14,14 +13,14 @@ from ros2_memory.bootstrap import shared_parts
 from ros2_memory.bootstrap_fleet import build_robots
 from ros2_memory.bootstrap_lake import lake_location
 from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
-from ros2_memory.cli.output import print_line, print_notes
+from ros2_memory.cli.output import print_json, print_line, print_notes
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeError
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
 from ros2_memory.core.text import abbreviate, counted, listed
-from ros2_memory.core.timebase import WallClock, ns_from_unix, rest_of_end_s
+from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, rest_of_end_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -70,23 +69,22 @@ def ship(
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
-    pace = _pace(settings.lake.commit_interval_s)
     alone = writing_alone(location.state_dir)
     with alone, closing(WarehouseLease(location, WallClock())) as lease:
+        shipping = _Shipping(settings, location, lease, robots)
         if forget is None and not once:
-            new = partial(_new_robots, overrides, shared)
-            _ship_on(settings, location, robots, pace, lease, new_robots=new)
+            shipping.go_on(partial(_new_robots, overrides, shared))
         lease.renew()
         if forget is not None and window is not None:
             return _forget(location, forget, window, robots, as_json=as_json)
-        with _shipper(settings, location, robots, pace, lease) as shipper:
+        with shipping.shipper() as shipper:
             done = shipper.run()
-            shipper.keep_up(ns_from_unix(settings.lake.grace_h * 3600))
+            shipper.keep_up(shipping.grace)
     rows, bags = counted(done.rows, "row"), counted(done.bags, "bag")
     waiting = f"; {counted(done.waiting, 'bag waits', 'bags wait')}" if done.waiting else ""
     keys = ("bags", "rows", "forgotten", "waiting", "problems")
     if as_json:
-        print_line(json.dumps({key: getattr(done, key) for key in keys}))
+        print_json({key: getattr(done, key) for key in keys})
     else:
         print_line(f"shipped {bags} ({rows}){waiting}")
         if done.forgotten:
@@ -144,7 +142,7 @@ def _forget(
         gone = forget_in_lake(lake, tombstone)
     kept_by = [*gone.kept_by]
     if as_json:
-        print_line(json.dumps({"bags": gone.bags, "files": gone.files, "kept_by": kept_by}))
+        print_json({"bags": gone.bags, "files": gone.files, "kept_by": kept_by})
     else:
         bags = counted(gone.bags, "bag")
         print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
@@ -159,18 +157,6 @@ def _note_versions(location: "LakeLocation") -> None:
         print_notes(["where the bucket keeps versions of deleted objects, those are not erased"])
 
 
-def _pace(interval_s: float) -> "Callable[[], None]":
-    """Returns what waits before a commit until enough time has passed since the one before."""
-    last_s = -math.inf
-
-    def wait() -> None:
-        nonlocal last_s
-        _wait(last_s + interval_s - time.monotonic())
-        last_s = time.monotonic()
-
-    return wait
-
-
 def _wait(seconds: float) -> None:
     """Waits, and notifies the service manager meanwhile."""
     until_s = time.monotonic() + seconds
@@ -179,81 +165,88 @@ def _wait(seconds: float) -> None:
         time.sleep(min(left_s, _STEP_S))
 
 
-@contextmanager
-def _shipper(
-    settings: Settings,
-    location: "LakeLocation",
-    robots: "Sequence[RobotBags]",
-    pace: "Callable[[], None]",
-    lease: "WarehouseLease",
-) -> "Iterator[Shipper]":
-    from ros2_memory.lake.forgetting import forget_in_lake, read_tombstones  # noqa: PLC0415
-    from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
+@dataclass
+class _Shipping:
+    """What ships the bags of robots while it has the lease.
 
-    def alive() -> None:
-        notify(WATCHDOG)
-        lease.renew()
-
-    def pause() -> None:
-        pace()
-        lease.confirm()
-
-    with location.writable() as lake:
-        tombstones = read_tombstones(location.state_dir)
-        for tombstone, is_done in tombstones.items():
-            if not is_done:
-                forget_in_lake(lake, tombstone)
-        yield Shipper(
-            lake,
-            robots,
-            WallClock(),
-            messages=settings.lake.messages,
-            tombstones=tombstones,
-            pause=pause,
-            alive=alive,
-        )
-
-
-def _ship_on(
-    settings: Settings,
-    location: "LakeLocation",
-    robots: "Sequence[RobotBags]",
-    pace: "Callable[[], None]",
-    lease: "WarehouseLease",
-    *,
-    new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]",
-) -> NoReturn:
-    """Ships until the process is stopped; a lake that fails is tried again.
-
-    `new_robots` returns those that are in the settings now, besides the ones that it is given.
+    `committed_s` is when it last began a commit, by the monotonic clock.
     """
-    notify(READY)
-    log.info("shipping", robots=len(robots), warehouse=location.warehouse)
-    known: list[str] = []
-    kept_up_s = -math.inf
-    grace = ns_from_unix(settings.lake.grace_h * 3600)
-    while True:
-        try:
-            lease.renew()
-            with _shipper(settings, location, robots, pace, lease) as shipper:
-                while True:
-                    lease.renew()
-                    problems = shipper.run().problems
-                    is_due = time.monotonic() - kept_up_s >= _UPKEEP_S
-                    if is_due:
-                        shipper.keep_up(grace)
-                        kept_up_s = time.monotonic()
-                    for problem in problems:
-                        if problem not in known:
-                            log.warning("not_shipped", reason=problem)
-                    known = problems
-                    if is_due and (new := new_robots(robots)):
-                        robots = [*robots, *new]
-                        break
-                    _wait(settings.reader.index_refresh_s)
-        except LakeError as error:
-            log.warning("lake_failed", reason=str(error))
-            _wait(_RETRY_S)
+
+    settings: Settings
+    location: "LakeLocation"
+    lease: "WarehouseLease"
+    robots: "Sequence[RobotBags]"
+    committed_s: float = -math.inf
+
+    @property
+    def grace(self) -> Ns:
+        """How long files that no table names stay."""
+        return ns_from_unix(self.settings.lake.grace_h * 3600)
+
+    @contextmanager
+    def shipper(self) -> "Iterator[Shipper]":
+        """Yields what ships, after what was forgotten is gone."""
+        from ros2_memory.lake.forgetting import forget_in_lake, read_tombstones  # noqa: PLC0415
+        from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
+
+        with self.location.writable() as lake:
+            tombstones = read_tombstones(self.location.state_dir)
+            for tombstone, is_done in tombstones.items():
+                if not is_done:
+                    forget_in_lake(lake, tombstone)
+            yield Shipper(
+                lake,
+                self.robots,
+                WallClock(),
+                messages=self.settings.lake.messages,
+                tombstones=tombstones,
+                pause=self._pause,
+                alive=self._alive,
+            )
+
+    def _alive(self) -> None:
+        notify(WATCHDOG)
+        self.lease.renew()
+
+    def _pause(self) -> None:
+        """Waits before a commit until enough time has passed since the one before."""
+        _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
+        self.committed_s = time.monotonic()
+        self.lease.confirm()
+
+    def go_on(self, new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]") -> NoReturn:
+        """Ships until the process is stopped; a lake that fails is tried again.
+
+        `new_robots` returns those that are in the settings now, besides the ones that it is given.
+        """
+        notify(READY)
+        log.info("shipping", robots=len(self.robots), warehouse=self.location.warehouse)
+        known: list[str] = []
+        kept_up_s = -math.inf
+        while True:
+            try:
+                self.lease.renew()
+                with self.shipper() as shipper:
+                    new: Sequence[RobotBags] = ()
+                    while not new:
+                        self.lease.renew()
+                        problems = shipper.run().problems
+                        is_due = time.monotonic() - kept_up_s >= _UPKEEP_S
+                        if is_due:
+                            shipper.keep_up(self.grace)
+                            kept_up_s = time.monotonic()
+                        for problem in problems:
+                            if problem not in known:
+                                log.warning("not_shipped", reason=problem)
+                        known = problems
+                        if is_due:
+                            new = new_robots(self.robots)
+                        if not new:
+                            _wait(self.settings.reader.index_refresh_s)
+                    self.robots = [*self.robots, *new]
+            except LakeError as error:
+                log.warning("lake_failed", reason=str(error))
+                _wait(_RETRY_S)
 
 
 def _new_robots(

@@ -15,7 +15,7 @@ from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools
 from ros2_memory.cli.options import MB, AsJson, Bags, open_memory
-from ros2_memory.cli.output import format_value, print_line, print_reply, stdout_console
+from ros2_memory.cli.output import format_value, print_json, print_line, print_reply, stdout_console
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import NoDataError, RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
@@ -54,18 +54,20 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     latched topics and logs have none.
     """
     memory = bags.memory()
+    known: Sequence[TopicRow] = ()
     rows: list[JsonObject] = []
     try:
-        rows += [_topic_row(memory, known) for known in list_recorded_topics(memory, Call())]
+        known = list_recorded_topics(memory, Call())
+        rows = [_topic_row(memory, topic) for topic in known]
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
     if as_json:
         print_line(text)
     elif rows:
-        listed_topics, notes = _notes_apart(rows)
-        print_reply(stdout_console(), listed_topics)
-        if notes:
+        without = [{key: row[key] for key in row if key != "notes"} for row in rows]
+        print_reply(stdout_console(), [*without])
+        if notes := _notes_of(known):
             print_reply(stdout_console(), {"notes": notes})
     elif text != "[]":
         print_reply(stdout_console(), json.loads(text))
@@ -88,19 +90,13 @@ def _topic_row(memory: Memory, known: TopicRow) -> JsonObject:
     return row
 
 
-def _notes_apart(rows: Sequence[JsonObject]) -> tuple[list[JsonValue], list[JsonValue]]:
-    """Returns the rows without their notes, and the notes, each once with how many topics it is on.
-
-    What is wrong with one bag is noted on each topic in it.
-    """
+def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
+    """Returns each note once: what is wrong with one bag is noted on each topic in it."""
     on: dict[str, list[str]] = {}
-    others: list[JsonValue] = []
     for row in rows:
-        notes = row.get("notes")
-        for note in notes if isinstance(notes, list) else []:
-            on.setdefault(str(note), []).append(str(row["topic"]))
-        others.append({key: value for key, value in row.items() if key != "notes"})
-    return others, [
+        for note in row.notes:
+            on.setdefault(note, []).append(row.topic)
+    return [
         f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
         for note, topics in on.items()
     ]
@@ -134,7 +130,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     # A planner's context is short; a person's screen scrolls.
     settings = bags.settings("server.max_reply_chars=1000000000", "server.tools=all")
     robots = settings.fleet.robots
-    reports: dict[str, JsonValue] = {}
+    reports: dict[str, JsonObject] = {}
     are_bags = False
     for name in robots or ("",):
         own = robot_settings(settings, name) if robots else settings
@@ -147,7 +143,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
         if not as_json:
             _show(memory, report)
     if as_json:
-        print_line(json.dumps(reports if robots else reports[""]))
+        print_json(reports if robots else reports[""])
     return not are_bags
 
 
@@ -342,7 +338,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     snapshot, root = memory.index.snapshot(), memory.index.bag_dir
     rows, empty = [*_rows(snapshot, root)], [*_empty_rows(snapshot, root)]
     if as_json:
-        print_line(json.dumps([*rows, *empty]))
+        print_json([*rows, *empty])
     elif not rows:
         print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
     else:

@@ -1,1 +1,0 @@
-"""Commands that list what is recorded: topics, recordings, and messages one by one."""
