@@ -23,12 +23,16 @@ _SETTINGS: Final = {
     "autoload_known_extensions": "false",
     "python_enable_replacements": "false",
 }
+_LOCAL: Final = (
+    " UNION ALL BY NAME SELECT * FROM"
+    " read_parquet(${}_files, union_by_name = true, hive_partitioning = false)"
+)
 
 log = get_logger(__name__)
 
 
 class DuckdbEngine(LakeEngine):
-    """Reads files through Arrow, wherever they are.
+    """Reads local files itself, within its limits, and those of a store through Arrow.
 
     Args:
         memory_mb: how much memory it may use.
@@ -46,11 +50,20 @@ class DuckdbEngine(LakeEngine):
 
     def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
         """Runs the select in a cursor of its own, which alone knows the tables."""
+        sources: list[str] = []
+        bound: dict[str, object] = {**parameters}
         try:
             with self._connection.cursor() as cursor:
                 for name, files in tables.items():
-                    cursor.register(name, _rows_of(files))
-                return cursor.sql(sql, params=dict(parameters)).to_arrow_table()
+                    source = f"SELECT * FROM {name}_rows"  # noqa: S608 - a table of the lake
+                    rows, local = _opened(files)
+                    cursor.register(f"{name}_rows", rows)
+                    if local:
+                        source += _LOCAL.format(name)
+                        bound[f"{name}_files"] = local
+                    sources.append(f"{name} AS ({source})")
+                query = f"WITH {', '.join(sources)} {sql}"
+                return cursor.sql(query, params=bound).to_arrow_table()
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             # Its sentence alone: a traceback with variables would show the keys of a store.
             log.warning("lake_engine_failed", reason=f"{type(error).__name__}: {error}")
@@ -64,11 +77,14 @@ class DuckdbEngine(LakeEngine):
         self._connection.close()
 
 
-def _rows_of(files: DataFiles) -> ds.Dataset | pa.Table:
-    if not files.locations:
-        return files.schema.empty_table()
-    found = [PyArrowFileIO.parse_location(location) for location in files.locations]
-    scheme, netloc, _ = found[0]
-    store = PyArrowFileIO(dict(files.store)).fs_by_scheme(scheme, netloc)
-    paths = [path for *_, path in found]
-    return ds.dataset(paths, schema=files.schema, format="parquet", filesystem=store)
+def _opened(files: DataFiles) -> tuple[pa.Table | ds.Dataset, list[str]]:
+    """Returns the rows of files that are in a store, and the paths of those that are not.
+
+    All columns of the table are in the former, also where no file is in a store.
+    """
+    places = [PyArrowFileIO.parse_location(location) for location in files.locations]
+    paths = [path for *_, path in places]
+    if {scheme for scheme, *_ in places} <= {"file"}:
+        return files.schema.empty_table(), paths
+    store = PyArrowFileIO(dict(files.store)).fs_by_scheme(*places[0][:2])
+    return ds.dataset(paths, schema=files.schema, format="parquet", filesystem=store), []
