@@ -103,7 +103,7 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
     bag_dir = settings.fleet.robots.get(name)
     if lake is None:
         return Robot(name, own.recording.bag_dir, mounted)
-    from ros2_memory.lake.memory import lake_memory
+    from ros2_memory.lake.reader import lake_memory
 
     shipped = lake_memory(
         lake,

@@ -18,7 +18,7 @@ from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
 from ros2_memory.lake.index import MOST_BAGS
-from ros2_memory.lake.memory import lake_memory
+from ros2_memory.lake.reader import lake_memory
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
 from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
 from ros2_memory.serving.backfill import make_fragments

@@ -6,8 +6,8 @@ import contextvars
 import threading
 import time
 from collections import deque
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import replace
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.core.errors import BusyError, EpisodicError, QueryTimeoutError
@@ -42,7 +42,7 @@ class FanOut:
 
     def __init__(self, at_once: int = AT_ONCE) -> None:
         self._at_once = at_once
-        self._stuck: dict[str, threading.Thread] = {}
+        self._is_done: dict[str, Callable[[], bool]] = {}
 
     def ask(
         self, robots: Sequence[Robot], work: Callable[[Robot, Call], T], call: Call
@@ -51,111 +51,84 @@ class FanOut:
 
         Every robot is in it. Takes 0.95 of the time that is left of the call, at most.
         """
-        left_s = call.deadline.left_s()
+        left_s, begun_s = call.deadline.left_s(), time.monotonic()
         limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
-        end_s = time.monotonic() + left_s * _OF_ALL
         waiting = deque(robots)
-        running: dict[str, tuple[threading.Thread, Call, float]] = {}
+        running: dict[str, tuple[Future[T | EpisodicError], Call, float]] = {}
         done: dict[str, T | EpisodicError] = {}
-        answers: SimpleQueue[tuple[str, T | EpisodicError]] = SimpleQueue()
         while waiting or running:
+            now_s = time.monotonic()
             while waiting and len(running) < self._at_once:
                 robot = waiting.popleft()
-                now_s = time.monotonic()
-                refused = self._refused(robot, call, is_over=now_s >= end_s)
+                own_s = min(limit_s, begun_s + left_s * _OF_ALL - now_s)
+                refused = self._refused(robot, call, own_s)
                 if refused is not None:
                     done[robot.name] = refused
                     continue
-                own_s = min(limit_s, end_s - now_s)
-                deadline = call.deadline.within(own_s)
                 own = replace(
                     call,
-                    deadline=deadline,
+                    deadline=call.deadline.within(own_s),
                     stages=Stages(),
                     used_active=False,
                     used_thinned=False,
                 )
-                thread = _started(robot, work, own, answers)
-                running[robot.name] = thread, own, now_s + own_s + left_s * _GRACE
-            if running:
-                first_s = min(until_s for *_, until_s in running.values())
-                try:
-                    # Without a deadline there is nothing to wake up for but an answer.
-                    wait_s = max(first_s - time.monotonic(), 0)
-                    name, answer = answers.get(
-                        timeout=wait_s if wait_s < threading.TIMEOUT_MAX else None
-                    )
-                except Empty:
-                    pass
+                until_s = now_s + own_s + left_s * _GRACE
+                running[robot.name] = _asked(robot, work, own), own, until_s
+            # Without a deadline there is nothing to wake up for but an answer.
+            first_s = min((until_s for *_, until_s in running.values()), default=now_s)
+            futures = [future for future, *_ in running.values()]
+            wait(futures, min(max(first_s - now_s, 0), threading.TIMEOUT_MAX), FIRST_COMPLETED)
+            for name, (future, own, until_s) in [*running.items()]:
+                if future.done():
+                    done[name] = future.result()
+                elif time.monotonic() >= until_s:
+                    self._is_done[name] = future.done
+                    do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
+                    text = f"no answer in {limit_s:.3g} s; {do} a shorter window"
+                    done[name] = QueryTimeoutError(text)
                 else:
-                    # Where it was given up meanwhile, its answer comes too late.
-                    if name in running:
-                        _, own, _ = running.pop(name)
-                        _add_costs(own, call)
-                        done[name] = answer
-            now_s = time.monotonic()
-            for name, (thread, own, until_s) in [*running.items()]:
-                if now_s >= until_s and answers.empty():
-                    del running[name]
-                    _add_costs(own, call)
-                    self._stuck[name] = thread
-                    done[name] = _too_slow(limit_s, alone=len(robots) == 1)
+                    continue
+                del running[name]
+                for stage, spent in [*own.stages.spent.items()]:
+                    call.stages.add(stage, spent)
+                call.used_active |= own.used_active
+                call.used_thinned |= own.used_thinned
         return {robot.name: done[robot.name] for robot in robots}
 
-    def _refused(self, robot: Robot, call: Call, *, is_over: bool) -> EpisodicError | None:
+    def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
         """Returns why a robot is not asked: it is stuck, or no time is left."""
-        stuck = self._stuck.get(robot.name)
-        if stuck is not None and stuck.is_alive():
+        if robot.name in self._is_done and not self._is_done[robot.name]():
             return BusyError(
                 "still busy with an earlier question that it did not finish in time: is its disk "
                 "reachable?"
             )
-        if is_over or call.deadline.expired():
+        if own_s <= 0 or call.deadline.expired():
             return QueryTimeoutError(
                 "not asked: the time of the call was up; ask about fewer robots, or a shorter time"
             )
-        self._stuck.pop(robot.name, None)
+        self._is_done.pop(robot.name, None)
         return None
 
 
-def _started(
-    robot: Robot,
-    work: Callable[[Robot, Call], T],
-    call: Call,
-    answers: SimpleQueue[tuple[str, T | EpisodicError]],
-) -> threading.Thread:
-    """Returns the thread that asks a robot; its answer goes into the queue."""
+def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:
+    """Returns what a robot will answer, in a thread of its own."""
+    answer: Future[T | EpisodicError] = Future()
 
     def run() -> None:
-        answer: T | EpisodicError
         try:
-            answer = work(robot, call)
+            answer.set_result(work(robot, call))
         except EpisodicError as error:
-            answer = error
+            answer.set_result(error)
         except Exception:
             log.exception("robot_failed", robot=robot.name)
-            answer = EpisodicError("failed through a fault in this server; its log has the cause")
-        answers.put((robot.name, answer))
+            fault = "failed through a fault in this server; its log has the cause"
+            answer.set_result(EpisodicError(fault))
 
     # A daemon: one that hangs must not keep the program from ending.
-    thread = threading.Thread(
+    threading.Thread(
         target=contextvars.copy_context().run,
         args=(run,),
         name=f"robot-{robot.name}",
         daemon=True,
-    )
-    thread.start()
-    return thread
-
-
-def _add_costs(own: Call, call: Call) -> None:
-    """Adds what a robot's answer took to what the whole call did."""
-    for stage, spent in [*own.stages.spent.items()]:
-        call.stages.add(stage, spent)
-    call.used_active |= own.used_active
-    call.used_thinned |= own.used_thinned
-
-
-def _too_slow(limit_s: float, *, alone: bool) -> QueryTimeoutError:
-    do = "ask about" if alone else "ask about it alone, or about"
-    return QueryTimeoutError(f"no answer in {limit_s:.3g} s; {do} a shorter window")
+    ).start()
+    return answer

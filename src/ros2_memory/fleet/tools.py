@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -82,7 +82,7 @@ def fleet_tools(
             describe=partial(_described, tool),
             # One robot that is slow must not keep a quick tool's thread.
             blocking=tool.blocking or tool.name in ANSWER_FOR_ALL | TABLE_FOR_ALL,
-            question=_FleetQuestions(tool, fleet, fan_out, max_chars),
+            question=partial(_asking, tool, fleet, fan_out, max_chars),
         )
         for tool in tools
         if not tool.writes
@@ -109,46 +109,45 @@ def _described(tool: Tool) -> tuple[str, JsonObject]:
     return text, {**tool.schema, "properties": {ROBOT: argument, **known}}
 
 
-class _Asked(NamedTuple):
-    """A question to one robot, and its arguments as they were given."""
-
-    question: Question
-    given: Mapping[str, object]
+def _asking(
+    tool: Tool, fleet: Fleet, fan_out: FanOut, max_chars: int, given: Mapping[str, object]
+) -> Question:
+    """Checks the arguments of a call, and returns what asks one robot or several."""
+    own = {name: value for name, value in given.items() if name != ROBOT}
+    asked = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
+    return lambda _, call: asked.ask(given.get(ROBOT), call)
 
 
 @dataclass(frozen=True, slots=True)
-class _FleetQuestions:
-    """Checks the arguments of a call, and returns what asks one robot or several."""
+class _FleetQuestion:
+    """A question to robots of a fleet: what asks one of them, and its arguments."""
 
     tool: Tool
     fleet: Fleet
     fan_out: FanOut
     max_chars: int
+    question: Question
+    given: Mapping[str, object]
 
-    def __call__(self, given: Mapping[str, object]) -> Question:
-        own = {name: value for name, value in given.items() if name != ROBOT}
-        asked, named = _Asked(self.tool.question(own), own), given.get(ROBOT)
-        is_table = self.tool.name in TABLE_FOR_ALL and given.get("by") is not None
-        is_of_all = self.tool.name in ANSWER_FOR_ALL or is_table
-        several = named.split(",") if isinstance(named, str) and "," in named else None
+    def ask(self, named: object, call: Call) -> OfRobot | OfFleet:
+        """Returns the answer of the robot of a name, of several (a, b), or where it is None of all.
 
-        def ask(_: Memory, call: Call) -> OfRobot | OfFleet:
-            if named is not None and several is None:
-                return self._of_one(self.fleet.named(named, call), asked, call)
-            robots = (
-                self.fleet.allowed(call)
-                if several is None
-                else [
-                    self.fleet.named(name, call) for name in dict.fromkeys(map(str.strip, several))
-                ]
-            )
-            if is_of_all and given.get("between") is None:
-                return self._of_all(robots, asked, call)
-            return self._of_one(_only_one(self.tool.name, robots), asked, call)
+        Raises:
+            EpisodicError: there is none.
+        """
+        if isinstance(named, str) and "," in named:
+            names = dict.fromkeys(map(str.strip, named.split(",")))
+            robots = [self.fleet.named(name, call) for name in names]
+        elif named is not None:
+            return self._of_one(self.fleet.named(named, call), call)
+        else:
+            robots = self.fleet.allowed(call)
+        is_table = self.tool.name in TABLE_FOR_ALL and self.given.get("by") is not None
+        if (self.tool.name in ANSWER_FOR_ALL or is_table) and self.given.get("between") is None:
+            return self._of_all(robots, call)
+        return self._of_one(_only_one(self.tool.name, robots), call)
 
-        return ask
-
-    def _of_one(self, robot: Robot, asked: _Asked, call: Call) -> OfRobot:
+    def _of_one(self, robot: Robot, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
 
         Raises:
@@ -156,8 +155,8 @@ class _FleetQuestions:
         """
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
-            question, lake_first = partial(_answer, asked.question), self.tool.name in OF_LAKE
-            answer, lake = robot.asked(question, own, lake_first=lake_first)
+            one = partial(_answer, self.question)
+            answer, lake = robot.asked(one, own, lake_first=self.tool.name in OF_LAKE)
             return answer, lake, own.now
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
@@ -166,12 +165,12 @@ class _FleetQuestions:
         answer, lake, now = found
         notes: tuple[str, ...] = ()
         if lake is not None:
-            unseen = lake.since(_begin_of(asked.given, answer, lake.latest)).notes
+            unseen = lake.since(_begin_of(self.given, answer, lake.latest)).notes
             notes = (*shipped_to({robot.name: lake.latest}), *unseen)
         return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
 
-    def _of_all(self, robots: list[Robot], asked: _Asked, call: Call) -> OfFleet:
-        given = asked.given
+    def _of_all(self, robots: list[Robot], call: Call) -> OfFleet:
+        given = self.given
         if not robots:
             raise RefusedError("there is no robot that this token may ask about")
         if len(robots) > 1 and not self.fleet.shared_map and (name := _coordinates_in(given)):
@@ -181,9 +180,9 @@ class _FleetQuestions:
             )
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        limit, oldest_first = self._limit(given.get("limit")), given.get("oldest_first") is True
+        limit, oldest_first = self._limit(), given.get("oldest_first") is True
         page = Page(limit, oldest_first=oldest_first)
-        found = self.fan_out.ask(robots, partial(self._reply, asked, now, page), call)
+        found = self.fan_out.ask(robots, partial(self._reply, now, page), call)
         replies = [reply for reply in found.values() if isinstance(reply, RobotReply)]
         errors = {name: error for name, error in found.items() if isinstance(error, EpisodicError)}
         if not replies:
@@ -199,9 +198,7 @@ class _FleetQuestions:
             )
         )
 
-    def _reply(
-        self, asked: _Asked, now: StoppedClock, page: Page, robot: Robot, call: Call
-    ) -> RobotReply:
+    def _reply(self, now: StoppedClock, page: Page, robot: Robot, call: Call) -> RobotReply:
         """Returns a robot's reply; runs in a thread of its own.
 
         Raises:
@@ -217,7 +214,7 @@ class _FleetQuestions:
             is_ahead = latest is not None and latest > now.at + _AHEAD_NS
             # Rows of those whose clock is ahead come last, whenever they are.
             own.rows_in = None if is_ahead else page.window()
-            answer = _answer(asked.question, replace(memory, clock=now), own)
+            answer = _answer(self.question, replace(memory, clock=now), own)
             if isinstance(answer, Sightings) and not is_ahead:
                 page.add(sighting.last for sighting in answer.sightings)
                 page.add(episode.until for episode in answer.episodes)
@@ -227,17 +224,17 @@ class _FleetQuestions:
             return RobotReply(robot.name, value, latest, is_ahead), answer
 
         (reply, answer), lake = robot.asked(ask, call, lake_first=self.tool.name in OF_LAKE)
-        begin = None if lake is None else _begin_of(asked.given, answer, lake.latest)
+        begin = None if lake is None else _begin_of(self.given, answer, lake.latest)
         return replace(reply, lake=lake and lake.since(begin))
 
-    def _limit(self, given: object) -> int | None:
+    def _limit(self) -> int | None:
         """Returns how many rows a call wants, all robots together."""
-        if isinstance(given, int | float):
-            return int(given)
         properties = self.tool.schema.get("properties")
         schema = properties.get("limit") if isinstance(properties, dict) else None
         default = schema.get("default") if isinstance(schema, dict) else None
-        return default if isinstance(default, int) else None
+        given = self.given.get("limit")
+        limit = default if given is None else given
+        return int(limit) if isinstance(limit, int | float) else None
 
 
 def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None) -> Ns | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 import time
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from datetime import date, timedelta
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -24,13 +24,12 @@ from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from contextlib import AbstractContextManager
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.manifest import ManifestFile
-    from pyiceberg.partitioning import PartitionSpec
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.lake.engines.base import LakeEngine, Parameters
@@ -56,8 +55,6 @@ class LakeFile(NamedTuple):
 
 Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
 """The files of one robot in one table by day, in order of the days."""
-_Files: TypeAlias = "Mapping[tuple[str, date], Sequence[LakeFile]]"
-"""Files by robot and day."""
 
 
 class Partitions:
@@ -65,8 +62,8 @@ class Partitions:
 
     def __init__(self) -> None:
         self._snapshot: int | None = None
-        self._read: dict[str, _Files] = {}
-        self._robots: dict[str, dict[date, Sequence[LakeFile]]] = {}
+        self._read: dict[str, Sequence[tuple[str, date, LakeFile]]] = {}
+        self._robots: dict[str, dict[date, list[LakeFile]]] = {}
 
     def look(self, table: IcebergTable) -> Mapping[str, Days]:
         """Returns the files of a table's current version, by robot.
@@ -77,57 +74,46 @@ class Partitions:
         snapshot = table.current_snapshot()
         if snapshot is None or snapshot.snapshot_id == self._snapshot:
             return self._robots
-        read: dict[str, _Files] = {}
+        read = {}
         for manifest in snapshot.manifests(table.io):
             path = manifest.manifest_path
-            read[path] = self._read.get(path) or _files(table, manifest)
-        found: dict[tuple[str, date], list[LakeFile]] = {}
-        for part, files in chain.from_iterable(some.items() for some in read.values()):
-            found.setdefault(part, []).extend(files)
-        self._robots = {}
-        for robot, day in sorted(found):
-            self._robots.setdefault(robot, {})[day] = found[robot, day]
-        self._read, self._snapshot = read, snapshot.snapshot_id
-        return self._robots
+            read[path] = self._read.get(path) or [*_files(table, manifest)]
+        robots: dict[str, dict[date, list[LakeFile]]] = {}
+        for robot, day, file in sorted(chain.from_iterable(read.values())):
+            robots.setdefault(robot, {}).setdefault(day, []).append(file)
+        self._read, self._robots, self._snapshot = read, robots, snapshot.snapshot_id
+        return robots
 
 
-def _files(table: IcebergTable, manifest: ManifestFile) -> _Files:
+def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
     entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
     if entries and manifest.content is ManifestContent.DELETES:
         raise RefusedError(
             f"the lake's table {table.name()[-1]} has delete files, which another program "
             "wrote: rewrite them into its data files first (copy-on-write)"
         )
-    spec = table.specs()[manifest.partition_spec_id]
-    robot, day = (_position(table, spec, column) for column in ("robot", "day"))
-    bag_id = table.schema().find_field("bag_id").field_id
-    found: dict[tuple[str, date], list[LakeFile]] = {}
+    spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
+    positions = {
+        schema.find_column_name(part.source_id): position
+        for position, part in enumerate(spec.fields)
+        if isinstance(part.transform, IdentityTransform)
+    }
+    for column in ("robot", "day"):
+        if column not in positions:
+            raise RefusedError(
+                f"the lake's table {table.name()[-1]} has files that are not of one {column}, "
+                "which another program wrote: partition it by robot and day again"
+            )
+    bag_id = schema.find_field("bag_id").field_id
     for data in (entry.data_file for entry in entries):
-        when = _EPOCH + timedelta(days=data.partition[day])
+        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
         first, last = (
-            bytes(bounds.get(bag_id) or b"").decode()
-            for bounds in (data.lower_bounds or {}, data.upper_bounds or {})
+            bytes((bounds or {}).get(bag_id) or b"").decode()
+            for bounds in (data.lower_bounds, data.upper_bounds)
         )
-        file = LakeFile(
-            data.file_path, data.record_count, data.file_size_in_bytes, first, last or _LAST
-        )
-        found.setdefault((str(data.partition[robot]), when), []).append(file)
-    return found
-
-
-def _position(table: IcebergTable, spec: PartitionSpec, column: str) -> int:
-    source = table.schema().find_field(column).field_id
-    for position, part in enumerate(spec.fields):
-        if part.source_id == source and isinstance(part.transform, IdentityTransform):
-            return position
-    raise RefusedError(
-        f"the lake's table {table.name()[-1]} has files that are not of one {column}, which "
-        "another program wrote: partition it by robot and day again"
-    )
-
-
-def _as_they_are(_: str) -> AbstractContextManager[None]:
-    return nullcontext()
+        size = data.file_size_in_bytes
+        file = LakeFile(data.file_path, data.record_count, size, first, last or _LAST)
+        yield str(data.partition[positions["robot"]]), day, file
 
 
 class Lake:
@@ -148,7 +134,7 @@ class Lake:
         catalog: IcebergCatalog,
         engine: LakeEngine,
         namespace: str = NAMESPACE,
-        translated: Callable[[str], AbstractContextManager[None]] = _as_they_are,
+        translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext(),
     ) -> None:
         self.messages: ByteLru[bytes] = ByteLru(_MESSAGE_BYTES)
         self._translated = translated
@@ -168,13 +154,12 @@ class Lake:
         Raises:
             RefusedError: the lake cannot be read; so do all others.
         """
-        with self._lock, self._translated("looking into the lake"):
-            if time.monotonic() - self._looked_at < within_s:
-                return
-            # Other tables are looked up later, and have the rows of these bags by then.
-            self._tables = {}
-            self._table("bags")
-            self._looked_at = time.monotonic()
+        with self._looking():
+            if time.monotonic() - self._looked_at >= within_s:
+                # Other tables are looked up later, and have the rows of these bags by then.
+                self._tables = {}
+                self._table("bags")
+                self._looked_at = time.monotonic()
 
     def robots(self) -> list[str]:
         """Returns the names of all robots that have bags, in order; no file of rows is read."""
@@ -188,7 +173,7 @@ class Lake:
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
     ) -> pa.Table:
         """Returns the rows of a select (see `LakeEngine`) over some files of a table."""
-        with self._lock, self._translated("looking into the lake"):
+        with self._looking():
             table = self._table(name)
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(file.location for file in files)
@@ -196,9 +181,14 @@ class Lake:
         return self._engine.select(sql, {name: found}, parameters or {})
 
     def _days(self, name: str) -> Mapping[str, Days]:
-        with self._lock, self._translated("looking into the lake"):
+        with self._looking():
             table = self._table(name)
             return {} if table is None else self._partitions[name].look(table)
+
+    @contextmanager
+    def _looking(self) -> Iterator[None]:
+        with self._lock, self._translated("looking into the lake"):
+            yield
 
     def _table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:

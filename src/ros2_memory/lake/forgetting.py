@@ -12,16 +12,13 @@ from __future__ import annotations
 from dataclasses import astuple, dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
-from pyiceberg.expressions import And
-
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.lake.conditions import of_bags, of_ids, of_topics, overlapping
 from ros2_memory.lake.rows import id_of_file
-from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.tables import TABLES, of_bags, of_ids, overlapping
 from ros2_memory.lake.upkeep import expire
 
 if TYPE_CHECKING:
@@ -55,6 +52,11 @@ class Tombstone:
     bags: tuple[str, ...] = ()
     done: bool = field(default=False, compare=False)
 
+    @property
+    def window(self) -> TimeWindow:
+        """The time that is forgotten."""
+        return TimeWindow(self.start, self.stop)
+
     @classmethod
     def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
         """Returns what a robot's bag directory asks for."""
@@ -67,14 +69,15 @@ class Tombstone:
         Raises:
             BagError: it cannot be read.
         """
-        window = TimeWindow(self.start, self.stop)
+        if robot != self.robot:
+            return False
         if self.bags:
-            return robot == self.robot and bag_id in self.bags
-        if robot != self.robot or not window.overlaps(bag.start, bag.end):
+            return bag_id in self.bags
+        if not self.window.overlaps(bag.start, bag.end):
             return False
         topics = {known.topic for known in bag.summary.topics}
-        wanted = tuple(topics.intersection(self.topics) if self.topics else topics)
-        return any(True for _ in reader.records(bag.path, wanted, window))
+        wanted = topics.intersection(self.topics) if self.topics else topics
+        return any(True for _ in reader.records(bag.path, tuple(wanted), self.window))
 
 
 TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
@@ -139,7 +142,13 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
         lake.delete(name, of_bags(bags))
     # The versions before have what was deleted, so they go whatever their age, and the clock says.
     files = expire(lake, MAX_NS)
-    kept_by = lake.older_versions()
+    kept_by = tuple(
+        f"{name}: {ref}"
+        for name in TABLES
+        for metadata in [lake.current(name).metadata]
+        for ref, version in metadata.refs.items()
+        if version.snapshot_id != metadata.current_snapshot_id
+    )
     append_tombstone(lake.location.state_dir, tombstone, done=True)
     log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
     return Forgotten(len(bags), files, kept_by)
@@ -156,5 +165,4 @@ def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
     """Returns the condition on rows of what is forgotten; the columns have their span."""
     if tombstone.bags:
         return of_ids(tombstone.robot, tombstone.bags)
-    reaching = overlapping(tombstone.robot, (first, last), tombstone.start, tombstone.stop)
-    return And(reaching, of_topics(tombstone.topics)) if tombstone.topics else reaching
+    return overlapping(tombstone.robot, (first, last), tombstone.window, tombstone.topics)

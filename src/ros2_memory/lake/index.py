@@ -54,11 +54,6 @@ class _Row(NamedTuple):
     summary: str
     counts: bytes
 
-    @property
-    def state(self) -> int:
-        """Tells states of a bag apart: one as large and as old may have other messages."""
-        return crc32(f"{self.bag_id} {self.sha256} {self.made_of}".encode())
-
 
 _BAGS: Final = f"SELECT {', '.join(_Row._fields)} FROM bags ORDER BY start_ns, end_ns, bag_id"  # noqa: S608 - constants
 
@@ -69,30 +64,21 @@ class LakeBag(NamedTuple):
     Attributes:
         bag_id: its id there.
         day: the day that its rows are under.
-        together: the bags of that day that are read together, by their ids: tells the state of each
-            apart from others, in which it was another time.
+        file: the bag, by the path that it had on the robot.
+        together: the states by id of the bags of that day that are read together.
     """
 
     bag_id: str
     day: date
-    together: Mapping[str, int]
-
-    @property
-    def state(self) -> int:
-        """Tells its state apart from others."""
-        return self.together[self.bag_id]
+    file: BagFile
+    together: dict[str, int]
 
 
 class _Day(NamedTuple):
-    """What the lake has of one day of a robot.
-
-    Attributes:
-        made_of: the files of its rows.
-        bags: its bags, as what they are there, and as files.
-    """
+    """What the lake has of one day of a robot: its bags, made of the rows of some files."""
 
     made_of: Sequence[LakeFile]
-    bags: Sequence[tuple[LakeBag, BagFile]]
+    bags: list[LakeBag]
 
 
 @dataclass(frozen=True)
@@ -103,13 +89,13 @@ class _Window:
         older: the end of the newest day before them, as a log time; None where there is none.
         days: what is known of each.
         timeline: the bags of all.
-        files: these by their paths, and what they are in the lake.
+        bags: these by their paths.
     """
 
     older: Ns | None = None
     days: Mapping[date, _Day] = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
-    files: Mapping[str, tuple[LakeBag, BagFile]] = field(default_factory=dict)
+    bags: Mapping[str, LakeBag] = field(default_factory=dict)
 
 
 def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
@@ -167,8 +153,7 @@ class LakeIndex:
         self._fewest_days = days
         self._most_bags = most_bags
         self._lock = threading.Lock()
-        self._newest = _Window()
-        self._older: dict[date, _Window] = {}
+        self._windows: dict[date, _Window] = {}
         self._snapshot: Snapshot | None = None
 
     @property
@@ -187,23 +172,25 @@ class LakeIndex:
         known = self._snapshot
         if known is None or self._clock.now() - known.scanned_at > self._refresh_s * 1e9:
             known = self.refresh()
-        if reach is not None and known.older is not None and reach <= known.older:
-            window = self._window_before(day_of(reach))
-            known = replace(known, timeline=window.timeline, older=window.older)
-        return known
+        if reach is None or known.older is None or reach > known.older:
+            return known
+        with self._lock:
+            # With the next day, in which what lies across midnight goes on.
+            window = self._window(day_of(reach) + timedelta(days=1), _FEWEST_DAYS)
+        return replace(known, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:
         """Looks into the lake now; what was just seen there for another robot is not old."""
         with self._lock:
             self._lake.refresh(self._refresh_s / _LOOKS)
-            self._newest = self._window(date.max, self._fewest_days, self._newest)
-            timeline = self._newest.timeline
+            window = self._window(date.max, self._fewest_days)
+            timeline = window.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
                 timeline,
                 silent_topics=frozenset(silent.difference(timeline.topics())),
                 scanned_at=self._clock.now(),
-                older=self._newest.older,
+                older=window.older,
             )
             return self._snapshot
 
@@ -216,104 +203,74 @@ class LakeIndex:
         del snapshot
         return None
 
-    def bag(self, path: Path) -> tuple[LakeBag, BagFile]:
+    def bag(self, path: Path) -> LakeBag:
         """Returns the bag of a snapshot that has a path there.
 
         Raises:
             BagVanishedError: it is not in the lake any more.
         """
-        for window in (self._newest, *self._older.values()):
-            found = window.files.get(str(path))
-            if found is not None:
+        for window in self._windows.values():
+            if found := window.bags.get(str(path)):
                 return found
         raise BagVanishedError(str(path), "it is not in the lake any more")
 
-    def _window_before(self, day: date) -> _Window:
-        """Returns the days up to one, with the next, in which what lies across midnight goes on."""
-        with self._lock:
-            known = self._older.get(day, _Window())
-            window = self._window(day + timedelta(days=1), _FEWEST_DAYS, known)
-            # A new dict: other threads look for the bags of their answers in the old one.
-            others = [each for each in self._older.items() if each[0] != day]
-            self._older = dict([*others[1 - _MOST_WINDOWS :], (day, window)])
-            return window
-
-    def _window(self, until: date, fewest: int, known: _Window) -> _Window:
+    def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
+        window = known = self._windows.get(until, _Window())
         of_robot = self._lake.days("bags", self._robot)
         made_of, day_before = newest(of_robot, until, self._most_bags, fewest)
-        older = None if day_before is None else end_of(day_before)
         days = {
             day: known.days[day]
             for day, files in made_of.items()
             if day in known.days and known.days[day].made_of == files
         }
-        if days.keys() == made_of.keys() == known.days.keys():
-            return replace(known, older=older)
-        paths = _Paths(known.files)
-        days |= self._read({day: made_of[day] for day in made_of if day not in days}, paths)
-        files = {bag.file: (here, bag) for day in made_of for here, bag in days[day].bags}
-        before = {file: bag for file, (_, bag) in known.files.items()}
-        now = {file: bag for file, (_, bag) in files.items()}
-        gone = [bag for file, bag in before.items() if now.get(file) is not bag]
-        new = [bag for file, bag in now.items() if before.get(file) is not bag]
-        return _Window(older, days, known.timeline.changed(gone, new), files)
+        if not days.keys() == made_of.keys() == known.days.keys():
+            unread = {day: files for day, files in made_of.items() if day not in days}
+            days |= self._read(unread, known.bags)
+            bags = {bag.file.file: bag for day in made_of for bag in days[day].bags}
+            timeline = known.timeline.changed(
+                _missing(known.bags, bags), _missing(bags, known.bags)
+            )
+            window = _Window(None, days, timeline, bags)
+        window = replace(window, older=None if day_before is None else end_of(day_before))
+        # A new dict: other threads look for the bags of their answers in the old one.
+        windows = {day: one for day, one in self._windows.items() if day != until} | {until: window}
+        dated = [day for day in windows if day != date.max]
+        self._windows = {day: windows[day] for day in (date.max, *dated[-_MOST_WINDOWS:])}
+        return window
 
-    def _read(self, made_of: Days, paths: _Paths) -> dict[date, _Day]:
-        """Returns what the lake has of some days; known bags stay."""
+    def _read(self, made_of: Days, known: Mapping[str, LakeBag]) -> dict[date, _Day]:
+        """Returns what the lake has of some days; bags that are known keep path and object."""
         found = self._lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
-        rows: dict[date, list[_Row]] = {day: [] for day in made_of}
-        for row in (_Row(**each) for each in found.to_pylist()):
-            rows[row.day].append(row)
+        owners = {path: bag.bag_id for path, bag in known.items()}
         schemas: dict[str, SummarySchema] = {}
-        days: dict[date, _Day] = {}
-        for day, of_day in rows.items():
-            bags: list[tuple[LakeBag, BagFile]] = []
-            for begin in range(0, len(of_day), _TOGETHER):
-                some = of_day[begin : begin + _TOGETHER]
-                states = {row.bag_id: row.state for row in some}
-                for row in some:
-                    name = row.file.removesuffix(COMPRESSED)
-                    path = paths.of(f"{self.bag_dir}/{name}", row.bag_id)
-                    bag = paths.known(_file(path, row, schemas))
-                    bags.append((LakeBag(row.bag_id, day, states), bag))
-            days[day] = _Day(made_of[day], bags)
+        days = {day: _Day(files, []) for day, files in made_of.items()}
+        for row in (_Row(**row) for row in found.to_pylist()):
+            path = f"{self.bag_dir}/{row.file.removesuffix(COMPRESSED)}"
+            # Another bag may have it, whose name was used again.
+            if owners.setdefault(path, row.bag_id) != row.bag_id:
+                path = f"{path}-{row.bag_id}"
+            if row.summary not in schemas:
+                schemas[row.summary] = SummarySchema.from_json(row.summary)
+            summary = BagSummary.decoded(schemas[row.summary], row.counts)
+            # One as large and as old may have other messages.
+            state = crc32(f"{row.bag_id} {row.sha256} {row.made_of}".encode())
+            span = row.start_ns, row.end_ns
+            file = BagFile(path, row.size, row.mtime_ns, BagState.CLOSED, summary, *span, state)
+            before = known.get(path)
+            if before is not None and before.file == file:
+                file = before.file  # what was remembered of it stays
+            bags = days[row.day].bags
+            together = bags[-1].together if len(bags) % _TOGETHER else {}
+            together[row.bag_id] = state
+            bags.append(LakeBag(row.bag_id, row.day, file, together))
         return days
 
 
-class _Paths:
-    """Gives each bag a path of its own, and bags that are known their objects.
-
-    Args:
-        files: those that are known, by their paths.
-    """
-
-    def __init__(self, files: Mapping[str, tuple[LakeBag, BagFile]]) -> None:
-        self._files = files
-        self._taken: dict[str, str] = {}
-
-    def of(self, path: str, bag_id: str) -> str:
-        """Returns a path; another one where another bag has it, whose name was used again."""
-        known = self._files.get(path)
-        first = self._taken.setdefault(path, bag_id if known is None else known[0].bag_id)
-        return path if first == bag_id else f"{path}-{bag_id}"
-
-    def known(self, bag: BagFile) -> BagFile:
-        """Returns the object that is known of a bag: what was remembered of it stays."""
-        known = self._files.get(bag.file)
-        return known[1] if known is not None and known[1] == bag else bag
-
-
-def _file(path: str, row: _Row, schemas: dict[str, SummarySchema]) -> BagFile:
-    if row.summary not in schemas:
-        schemas[row.summary] = SummarySchema.from_json(row.summary)
-    return BagFile(
-        path,
-        row.size,
-        row.mtime_ns,
-        BagState.CLOSED,
-        BagSummary.decoded(schemas[row.summary], row.counts),
-        row.start_ns,
-        row.end_ns,
-        row.state,
-    )
+def _missing(bags: Mapping[str, LakeBag], others: Mapping[str, LakeBag]) -> list[BagFile]:
+    """Returns the files of bags that are not, or not the same, among others."""
+    return [
+        bag.file
+        for path, bag in bags.items()
+        if path not in others or others[path].file is not bag.file
+    ]

@@ -76,7 +76,7 @@ def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str |
         FileNotFoundError: there is none, and it is not to be made.
         LakeError: it cannot be opened, or not be locked.
     """
-    path = state_dir / LEASE_FILE
+    path, holder = state_dir / LEASE_FILE, None
     try:
         if flags & os.O_CREAT:
             state_dir.mkdir(parents=True, exist_ok=True)
@@ -86,17 +86,17 @@ def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str |
     except OSError as error:
         raise LakeError(f"{path} cannot be opened: {error.strerror}") from error
     try:
-        holder = None
-        try:
-            fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
-        except BlockingIOError:
-            pid, host = read_holder(descriptor)
-            holder = "another process" if pid is None else f"process {pid} on {host}"
-        except OSError as error:
-            raise LakeError(
-                f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file "
-                "system that supports locks"
-            ) from error
+        fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+    except BlockingIOError:
+        pid, host = read_holder(descriptor)
+        holder = "another process" if pid is None else f"process {pid} on {host}"
+    except OSError as error:
+        os.close(descriptor)
+        raise LakeError(
+            f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file system "
+            "that supports locks"
+        ) from error
+    try:
         yield descriptor, holder
     finally:
         os.close(descriptor)
@@ -128,14 +128,12 @@ class WarehouseLease:
             LakeError: another state directory has it, or the warehouse cannot be reached.
         """
         now = self._clock.now()
-        if self._until - now > TERM_NS - _RENEWED_NS:
-            return
-        self._until = 0
-        with self._location.translated("taking the lease of the lake"):
-            self._require_mine(now)
-            self._write(now + TERM_NS)
-            self._require_mine(now)
-        self._until = now + TERM_NS
+        if self._until - now <= TERM_NS - _RENEWED_NS:
+            self._until = 0
+            with self._location.translated("taking the lease of the lake"):
+                self._write(now, now + TERM_NS)
+                self._require_mine(now)
+            self._until = now + TERM_NS
 
     def confirm(self) -> None:
         """Looks whether the lease is still held, and renews it: before each commit.
@@ -143,37 +141,33 @@ class WarehouseLease:
         Raises:
             LakeError: as `renew`.
         """
-        with self._location.translated("looking at the lease of the lake"):
-            self._require_mine(self._clock.now())
+        self._until = 0
         self.renew()
 
     def close(self) -> None:
         """Ends the lease, if it is held; one that cannot be ended is over with its term."""
         if self._until:
             with suppress(LakeError), self._location.translated("ending the lease of the lake"):
-                self._require_mine(self._clock.now())
-                self._write(0)
+                self._write(self._clock.now(), 0)
 
     def _require_mine(self, now: Ns) -> None:
-        known = self._read()
+        known: object = None
+        file = self._store.new_input(self._file)
+        if file.exists():
+            with file.open() as stream, suppress(ValueError):
+                known = json.loads(stream.read(_MAX_TEXT))
+        if not isinstance(known, dict) or known.get("id") == self._id:
+            return
         until = known.get("until")
-        if known.get("id") != self._id and isinstance(until, int) and until > now:
+        if isinstance(until, int) and until > now:
             raise LakeError(
                 f"process {known.get('pid')} on {known.get('host')} writes into this lake, with "
                 f"another lake.state_dir, until {iso_local(until)}: a lake has one writer, and one "
                 "state_dir"
             )
 
-    def _read(self) -> dict[str, object]:
-        given = self._store.new_input(self._file)
-        if not given.exists():
-            return {}
-        with given.open() as stream, suppress(ValueError):
-            value: object = json.loads(stream.read(_MAX_TEXT))
-            return value if isinstance(value, dict) else {}
-        return {}
-
-    def _write(self, until: Ns) -> None:
+    def _write(self, now: Ns, until: Ns) -> None:
+        self._require_mine(now)
         known = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
         with closing(self._store.new_output(self._file).create(overwrite=True)) as stream:
             stream.write(json.dumps(known).encode())

@@ -27,24 +27,23 @@ from ros2_memory.storage.base import Batch, Channel
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.storage.base import IntArray
 
 _FORMAT: Final = 1
 _HEAD: Final = struct.Struct("<BBI")
 
 
 def packed_messages(
-    log_times: Sequence[int], publish_times: Sequence[int], payloads: Sequence[bytes] | None
+    log_times: IntArray, publish_times: IntArray, payloads: Sequence[bytes] | None
 ) -> bytes:
     """Returns messages in order of their log times as bytes; without payloads where there are none.
 
     `payloads` are of messages in the same order.
     """
-    logged = np.array(log_times, np.int64)
-    published = np.array(publish_times, np.int64)
     parts = [
-        _HEAD.pack(_FORMAT, payloads is not None, len(logged)),
-        byte_planes(np.diff(logged, prepend=np.int64(0)), 8),
-        byte_planes(published - logged, 8),
+        _HEAD.pack(_FORMAT, payloads is not None, len(log_times)),
+        byte_planes(np.diff(log_times, prepend=np.int64(0)), 8),
+        byte_planes(publish_times - log_times, 8),
     ]
     if payloads is not None:
         sizes = np.array([len(payload) for payload in payloads], np.int64)

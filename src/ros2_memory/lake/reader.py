@@ -1,16 +1,19 @@
-"""Reads the messages of one robot's bags from the channels of a lake."""
+"""Reads the messages of one robot's bags from the channels of a lake, as its memory does."""
 
 from __future__ import annotations
 
 import heapq
 import json
+from dataclasses import replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.columns.pack import is_large
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import BagError, NotInLakeError
+from ros2_memory.history.context import Memory
+from ros2_memory.lake.index import MOST_BAGS, LakeIndex
 from ros2_memory.lake.packed_messages import unpacked_messages
-from ros2_memory.lake.tables import topic_key
 from ros2_memory.storage.base import BagReader, Channel, Closing, Schema
 from ros2_memory.storage.cache import ByteLru, shared
 
@@ -20,11 +23,15 @@ if TYPE_CHECKING:
 
     import pyarrow as pa
 
+    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Clock
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.history.context import QuerySettings
     from ros2_memory.lake.files import Lake
-    from ros2_memory.lake.index import LakeBag, LakeIndex
+    from ros2_memory.lake.index import LakeBag
     from ros2_memory.storage.base import Batch, Definition, Record
 
 _HEAD_BYTES: Final = 200
@@ -35,7 +42,7 @@ _HEADS: Final = (
     " WHERE bag_id IN $bags AND bag_id >= $first AND bag_id <= $last ORDER BY bag_id, channel"
 )
 _PACKED: Final = (
-    "SELECT bag_id, channel, packed FROM channels WHERE topic_key IN $keys AND topic IN $topics"
+    "SELECT bag_id, channel, packed FROM channels WHERE topic IN $topics"
     " AND bag_id IN $bags AND bag_id >= $first AND bag_id <= $last"
 )
 
@@ -84,7 +91,7 @@ class LakeReader(BagReader):
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns the summary of a bag of the index."""
-        return self._index.bag(path)[1].summary
+        return self._index.bag(path).file.summary
 
     def records(
         self,
@@ -117,9 +124,9 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        here, _ = self._index.bag(path)
-        wanted = [each for each in self._heads_of(here) if each.channel.topic in topics]
-        names = sorted({each.channel.topic for each in wanted})
+        here = self._index.bag(path)
+        wanted = [head for head in self._heads_of(here) if head.channel.topic in topics]
+        names = sorted({head.channel.topic for head in wanted})
         for head in wanted:
             topic = head.channel.topic
             if not head.has_payloads and topic not in bare:
@@ -128,7 +135,7 @@ class LakeReader(BagReader):
                     "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's "
                     "own memory"
                 )
-            data = self._packed_of(here, head, names)
+            data = self._packed_of(here, head.number, names)
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
             if is_large(data):
@@ -143,12 +150,12 @@ class LakeReader(BagReader):
 
     def times_alone(self, path: Path) -> Collection[str]:
         """Returns the topics whose payloads were not shipped: their messages are large."""
-        heads = self._heads_of(self._index.bag(path)[0])
-        return {each.channel.topic for each in heads if not each.has_payloads}
+        heads = self._heads_of(self._index.bag(path))
+        return {head.channel.topic for head in heads if not head.has_payloads}
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels of which the bag has messages."""
-        return [each.channel for each in self._heads_of(self._index.bag(path)[0])]
+        return [head.channel for head in self._heads_of(self._index.bag(path))]
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded; None if its type is known."""
@@ -163,53 +170,87 @@ class LakeReader(BagReader):
         return self._decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
-        known = self._heads.get((bag.bag_id, bag.state))
+        known = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
         if known is not None:
             return known
-        found: dict[str, list[_Head]] = {each: [] for each in bag.together}
-        rows = self._select(_HEADS, bag, [*bag.together])
-        columns = (column.to_pylist() for column in rows.columns)
-        for bag_id, number, has_payloads, metadata, *schema, topic, encoding, latched in zip(
-            *columns, strict=True
-        ):
-            more = tuple((key, value) for key, value in json.loads(metadata))
-            channel = Channel(topic, encoding, Schema(*schema), latched, more)
-            found[bag_id].append(_Head(number, shared(channel), has_payloads))
+        found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+            more = tuple((key, value) for key, value in json.loads(row["metadata"]))
+            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
+            head = _Head(row["channel"], shared(channel), row["has_payloads"])
+            found[row["bag_id"]].append(head)
         for bag_id, heads in found.items():
             size = _HEAD_BYTES * (1 + len(heads))
             self._heads.put((bag_id, bag.together[bag_id]), heads, size)
         return found[bag.bag_id]
 
-    def _packed_of(self, bag: LakeBag, head: _Head, topics: Sequence[str]) -> bytes | None:
+    def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
         """Returns the packed messages of a channel; None where they are gone.
 
-        With it those of other `topics` are read, which are asked for next.
+        With it those of other `topics` are read, which are asked for next. Who has read one bag
+        and goes on, reads those beside it, too.
         """
-        key = (bag.bag_id, bag.state, head.number)
-        known = self._lake.messages.get(key)
-        if known is not None:
-            return known
-        # Who has read one bag and goes on, reads those beside it, too.
-        is_second = any(
-            self._lake.messages.get((bag_id, state, head.number)) is not None
-            for bag_id, state in bag.together.items()
-        )
-        bags = [*bag.together] if is_second else [bag.bag_id]
-        rows = self._select(_PACKED, bag, bags, topics)
-        columns = (column.to_pylist() for column in rows.columns)
-        for bag_id, number, packed in zip(*columns, strict=True):
-            found = (bag_id, bag.together[bag_id], number)
-            self._lake.messages.put(found, packed, len(packed))
-            if found == key:
-                known = packed
+        messages = self._lake.messages
+        known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
+        if known is None:
+            beside = [messages.get((*state, number)) for state in bag.together.items()]
+            bags = [*bag.together] if any(beside) else [bag.bag_id]
+            for row in self._select(_PACKED, bag, bags, topics=topics).to_pylist():
+                key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
+                messages.put(key, row["packed"], len(row["packed"]))
+                if key == (bag.bag_id, bag.file.sidecar_ns, number):
+                    known = row["packed"]
         return known
 
-    def _select(
-        self, sql: str, bag: LakeBag, bags: list[str], topics: Sequence[str] = ()
-    ) -> pa.Table:
+    def _select(self, sql: str, bag: LakeBag, bags: list[str], **more: Sequence[str]) -> pa.Table:
+        """Returns the rows of a select over the channels of some bags of a day."""
         first, last = min(bags), max(bags)
         of_day = self._lake.days("channels", self._robot).get(bag.day, ())
-        files = [each for each in of_day if each.first <= last and first <= each.last]
-        keys = [*map(topic_key, topics)]
-        asked = {"bags": bags, "first": first, "last": last, "topics": topics, "keys": keys}
+        files = [file for file in of_day if file.first <= last and first <= file.last]
+        asked = {"bags": bags, "first": first, "last": last, **more}
         return self._lake.select(sql, "channels", files, asked)
+
+
+def lake_memory(
+    lake: Lake,
+    name: str,
+    clock: Clock,
+    limits: QuerySettings,
+    *,
+    extractor: SchemaExtractor,
+    decoder: BagReader,
+    large: LargeReads,
+    store: ColumnStore | None = None,
+    settings: str = "",
+    refresh_s: float = 60.0,
+    days: int = 31,
+    most_bags: int = MOST_BAGS,
+) -> Memory:
+    """Returns what a bag directory's memory is, but for the index and what reads bags.
+
+    Args:
+        lake: the lake.
+        name: of the robot there.
+        clock: the wall clock.
+        limits: the settings of queries.
+        extractor: knows the types of messages.
+        decoder: decodes messages.
+        large: the turn to hold much of a bag.
+        store: of the columns of its bags, which are made again from the lake; None for none.
+        settings: what follows from bags depends on, as a text.
+        refresh_s: how old (s) the index may be.
+        days: how many days are looked at together, at least; see `LakeIndex`.
+        most_bags: likewise, and of how many bags.
+    """
+    index = LakeIndex(lake, name, clock, refresh_s=refresh_s, days=days, most_bags=most_bags)
+    return Memory(
+        index,
+        LakeReader(lake, name, index, decoder, large),
+        extractor,
+        clock,
+        # Nothing is recorded here, and nothing deleted.
+        replace(limits, kept=None, recording="", screened=False),
+        Scanner(store, index.bag_dir, settings, large),
+        large=large,
+    )

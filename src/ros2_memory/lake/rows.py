@@ -11,8 +11,10 @@ import hashlib
 import json
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
+
+import numpy as np
 
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.frames import static_at
@@ -51,7 +53,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.tables import Row
     from ros2_memory.messages.detections import Detection
-    from ros2_memory.storage.base import Channel, Record
+    from ros2_memory.storage.base import Batch, Channel, Record
 
 _MOST_OF_MESSAGE: Final = 512
 """Packed bytes of each message on average; of a channel with more the lake has the times alone."""
@@ -155,16 +157,17 @@ def rows_of(
         BagError: the bag, or a part of it, cannot be read.
     """
     keys = {"robot": shipped.robot, "bag_id": shipped.bag_id, "day": shipped.day}
-    found = _BagRows(memory, bag).rows(shipped, messages)
-    return {name: [{**keys, **row} for row in found[name]] for name in TABLES}
+    found = _BagRows(memory, bag, messages).rows(shipped)
+    return {name: [{**keys, **row} for row in rows] for name, rows in found.items()}
 
 
 class _BagRows:
-    """Makes the rows of one bag."""
+    """Makes the rows of one bag; the messages of the topics `whole` are among them."""
 
-    def __init__(self, memory: Memory, bag: BagFile) -> None:
+    def __init__(self, memory: Memory, bag: BagFile, whole: Collection[str]) -> None:
         self._memory = memory
         self._bag = bag
+        self._whole = whole
         view = View(memory, Call())
         self._pose_topic = view.pose_topic
         self._poses = poses_of_bag(view, bag, self._pose_topic)
@@ -175,8 +178,8 @@ class _BagRows:
         self._undecodable = 0
         self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
-    def rows(self, shipped: ShippedBag, whole: Collection[str]) -> dict[str, list[Row]]:
-        """Returns the rows without the keys of the bag; `whole` are topics to ship whole."""
+    def rows(self, shipped: ShippedBag) -> dict[str, list[Row]]:
+        """Returns the rows without the keys of the bag."""
         tracks, events = self._tracks(), self._events()
         for frame, track in tracks:
             self._rows["poses"] += self._vertices(frame, track)
@@ -192,7 +195,8 @@ class _BagRows:
             and any(map(may_have_detections, self._types[topic]))
         }
         first = tracks[0] if tracks else (None, empty_track())
-        self._rows["channels"] += self._add_messages(whole, seen, *first)
+        self._add_messages(seen, *first)
+        self._rows["channels"] += self._channels()
         self._rows["bags"].append(
             {
                 **shipped._asdict(),
@@ -225,18 +229,11 @@ class _BagRows:
         return [(frame, track) for frame, track in within if len(track.times)]
 
     def _vertices(self, frame: str, track: RobotTrack) -> Iterator[Row]:
+        same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
         columns = (track.times, track.x, track.y, track.heading, track.begins)
         for time, x, y, heading, begins in zip(*(one.tolist() for one in columns), strict=True):
-            yield {
-                "topic": self._pose_topic,
-                "frame_id": frame,
-                "error_m": TOLERANCE_M,
-                "time_ns": time,
-                "x": x,
-                "y": y,
-                "heading": None if math.isnan(heading) else heading,
-                "begins": begins,
-            }
+            known = None if math.isnan(heading) else heading
+            yield {**same, "time_ns": time, "x": x, "y": y, "heading": known, "begins": begins}
 
     def _things(self) -> Iterator[Row]:
         for one in Watching(View(self._memory, Call())).in_bag(self._bag):
@@ -289,49 +286,77 @@ class _BagRows:
         stood_ns = sum(stop.end - stop.start for stop in standstills)
         return {**driven, "stood_s": unix_from_ns(stood_ns)}
 
-    def _add_messages(
-        self, whole: Collection[str], seen: Collection[str], frame: str | None, track: RobotTrack
-    ) -> Iterator[Row]:
-        """Adds whole messages and detections, and returns the channels: the bag is read once."""
-        channels, numbers = _Channels(whole), Counter[str]()
-        # Of all topics: a bag with damage anywhere is not shipped as if it were whole.
+    def _channels(self) -> Iterator[Row]:
+        """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
+        # By identity, since hashing a channel hashes its definition.
+        found: dict[int, _Messages] = {}
+        size = 0
         every, window = tuple(self._types), TimeWindow.everything()
-        for record in self._memory.reader.records(self._bag.path, every, window):
-            channels.add(record)
+        for batch in self._memory.reader.batches(self._bag.path, every, window):
+            channel = batch.channel
+            if id(channel) not in found:
+                is_whole = channel.topic in self._whole
+                payloads: list[bytes] | None = (
+                    [] if is_whole or channel.type not in BULKY_TYPES else None
+                )
+                found[id(channel)] = _Messages(channel, is_whole, payloads)
+            size += found[id(channel)].add(batch)
+            droppable = [messages for messages in found.values() if not messages.is_whole]
+            while size > _MOST_BYTES and droppable:
+                largest = max(droppable, key=lambda messages: messages.size)
+                size -= largest.size
+                largest.payloads, largest.size = None, 0
+                droppable.remove(largest)
+        order = sorted(found.values(), key=lambda one: (one.channel.topic, one.channel.type))
+        for number, messages in enumerate(order):
+            yield messages.row(number)
+
+    def _add_messages(self, seen: Collection[str], frame: str | None, track: RobotTrack) -> None:
+        """Adds whole messages, and the detections of the topics `seen`."""
+        numbers = Counter[str]()
+        topics, window = {*self._whole, *seen}, TimeWindow.everything()
+        for record in self._memory.reader.records(self._bag.path, topics, window):
             topic = record.channel.topic
-            number = numbers[topic]
-            numbers[topic] += 1
-            if topic not in whole and topic not in seen:
-                continue
             row = {
                 "topic": topic,
                 "type": record.channel.type,
                 "time_ns": record.log_time,
-                "message": number,
+                "message": numbers[topic],
             }
-            value: Row
-            found: Sequence[Detection]
-            try:
-                message = self._memory.reader.decode(record)
-                shown = self._memory.extractor.exact(message, record.channel.type)
-            except UndecodableError as error:
-                self._undecodable += topic in seen
-                value, found = {"undecodable": error.reason}, ()
-            else:
-                value = taken_apart(shown) if topic in whole else {}
-                of_frame = self._memory.extractor.frame(message)
-                found = detections_of(shown, of_frame) if topic in seen else ()
-            if topic in whole:
-                self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
+            numbers[topic] += 1
+            found = self._decoded(record, row, is_seen=topic in seen)
             at = place_at(track, record.log_time) if found else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
             for detection in found:
-                place = dict(zip("xyz", detection.place or (), strict=False))
-                more = {name: getattr(detection, name) for name in ("label", "score", "frame_id")}
-                thing = self._thing(detection.label)
-                self._rows["sightings"].append({**row, **more, "thing": thing, **place})
-        return channels.rows()
+                self._rows["sightings"].append(
+                    {
+                        **row,
+                        "label": detection.label,
+                        "thing": self._thing(detection.label),
+                        "score": detection.score,
+                        "frame_id": detection.frame_id,
+                        **dict(zip("xyz", detection.place or (), strict=False)),
+                    }
+                )
+
+    def _decoded(self, record: Record, row: Row, *, is_seen: bool) -> Sequence[Detection]:
+        """Returns the detections of a message, which is added whole if it is to be."""
+        is_whole = record.channel.topic in self._whole
+        found: Sequence[Detection] = ()
+        try:
+            message = self._memory.reader.decode(record)
+            shown = self._memory.extractor.exact(message, record.channel.type)
+        except UndecodableError as error:
+            self._undecodable += is_seen
+            value: Row = {"undecodable": error.reason}
+        else:
+            value = taken_apart(shown) if is_whole else {}
+            of_frame = self._memory.extractor.frame(message)
+            found = detections_of(shown, of_frame) if is_seen else ()
+        if is_whole:
+            self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
+        return found
 
     def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
         for seen in found.visible.intervals():
@@ -379,82 +404,51 @@ def taken_apart(value: JsonValue) -> Row:
 class _Messages:
     """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
 
-    `is_whole`: they are shipped whatever they take.
+    `is_whole`: they are shipped whatever they take; of other images, clouds, scans and the like,
+    the times alone are.
     """
 
     channel: Channel
     is_whole: bool
     payloads: list[bytes] | None
-    log_times: list[int] = field(default_factory=list)
-    publish_times: list[int] = field(default_factory=list)
+    parts: list[Batch] = field(default_factory=list)
     size: int = 0
 
-    def packed(self) -> bytes:
-        """Returns them packed; without payloads where these would take too much."""
-        packed = packed_messages(self.log_times, self.publish_times, self.payloads)
-        most = max(_MOST_OF_MESSAGE * len(self.log_times), _LEAST_OF_CHANNEL)
-        if self.payloads is None or self.is_whole or len(packed) <= most:
-            return packed
-        self.payloads = None
-        return packed_messages(self.log_times, self.publish_times, None)
+    def add(self, batch: Batch) -> int:
+        """Takes more messages; returns how many bytes of payloads they have."""
+        # Without the buffer, in which are those of other channels.
+        self.parts.append(replace(batch, buffer=b""))
+        if self.payloads is None:
+            return 0
+        self.payloads += map(batch.payload, range(batch.sizes.size))
+        size = int(batch.sizes.sum())
+        self.size += size
+        return size
 
-
-class _Channels:
-    """Takes the messages of a bag in order of their log times, and returns its channels as rows.
-
-    Images, clouds, scans and the like have times alone, but for topics that are `whole`.
-    """
-
-    def __init__(self, whole: Collection[str]) -> None:
-        self._whole = whole
-        # By identity, since hashing a channel hashes its definition.
-        self._of: dict[int, _Messages] = {}
-        self._size = 0
-
-    def add(self, record: Record) -> None:
-        """Takes the next message."""
-        channel = record.channel
-        found = self._of.get(id(channel))
-        if found is None:
-            is_whole = channel.topic in self._whole
-            payloads: list[bytes] | None = (
-                [] if is_whole or channel.type not in BULKY_TYPES else None
-            )
-            found = self._of[id(channel)] = _Messages(channel, is_whole, payloads)
-        found.log_times.append(record.log_time)
-        found.publish_times.append(record.publish_time)
-        if found.payloads is not None:
-            found.payloads.append(record.payload)
-            found.size += len(record.payload)
-            self._size += len(record.payload)
-            if self._size > _MOST_BYTES:
-                self._drop_largest()
-
-    def _drop_largest(self) -> None:
-        some = [messages for messages in self._of.values() if not messages.is_whole]
-        largest = max(some, key=lambda messages: messages.size, default=None)
-        if largest is not None:
-            largest.payloads = None
-            self._size -= largest.size
-            largest.size = 0
-
-    def rows(self) -> Iterator[Row]:
-        """Yields the rows, by topic."""
-        order = sorted(self._of.values(), key=lambda one: (one.channel.topic, one.channel.type))
-        for number, messages in enumerate(order):
-            channel, packed = messages.channel, messages.packed()
-            yield {
-                "topic": channel.topic,
-                "channel": number,
-                "type": channel.type,
-                "encoding": channel.encoding,
-                "latched": channel.latched,
-                "schema_encoding": channel.schema.encoding,
-                "schema": channel.schema.text,
-                "metadata": json.dumps(channel.metadata),
-                "messages": len(messages.log_times),
-                "first_ns": messages.log_times[0],
-                "last_ns": messages.log_times[-1],
-                "has_payloads": messages.payloads is not None,
-                "packed": packed,
-            }
+    def row(self, number: int) -> Row:
+        """Returns its row, the n-th of the bag; without payloads where these take too much."""
+        logged = np.concatenate([part.log_times for part in self.parts])
+        published = np.concatenate([part.publish_times for part in self.parts])
+        order = np.lexsort((np.concatenate([part.places for part in self.parts]), logged))
+        logged, published, channel = logged[order], published[order], self.channel
+        payloads = self.payloads and [self.payloads[nth] for nth in order.tolist()]
+        packed = packed_messages(logged, published, payloads)
+        most = max(_MOST_OF_MESSAGE * len(logged), _LEAST_OF_CHANNEL)
+        if payloads is not None and not self.is_whole and len(packed) > most:
+            payloads = None
+            packed = packed_messages(logged, published, None)
+        return {
+            "topic": channel.topic,
+            "channel": number,
+            "type": channel.type,
+            "encoding": channel.encoding,
+            "latched": channel.latched,
+            "schema_encoding": channel.schema.encoding,
+            "schema": channel.schema.text,
+            "metadata": json.dumps(channel.metadata),
+            "messages": len(logged),
+            "first_ns": int(logged[0]),
+            "last_ns": int(logged[-1]),
+            "has_payloads": payloads is not None,
+            "packed": packed,
+        }

@@ -9,7 +9,7 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
@@ -29,21 +29,21 @@ from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
-from ros2_memory.lake.conditions import of_bags, overlapping
 from ros2_memory.lake.forgetting import Tombstone, append_tombstone, forget_in_lake
 from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of
+from ros2_memory.lake.tables import TABLES, day_of, of_bags, overlapping
 from ros2_memory.lake.upkeep import compact, expire
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import Memory
+    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.lake.tables import Row
     from ros2_memory.lake.warehouse import LakeTables
     from ros2_memory.storage.base import BagReader
@@ -110,29 +110,13 @@ class _Seen:
     is_forgotten: bool | None = None
 
 
-@dataclass(slots=True)
-class _OfRobot:
-    """What is known of the bags that a robot has, and no longer of those that it had.
-
-    Attributes:
-        seen: the newest state of each, by its path.
-        known: what the lake has of them, by id.
-        receipts: by path; None before they were read.
-    """
-
-    seen: dict[str, _Seen] = field(default_factory=dict)
-    known: dict[str, ShippedBag] = field(default_factory=dict)
-    receipts: dict[str, Receipt] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class _Ready:
+class _Ready(NamedTuple):
     """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
-    robot: RobotBags
+    of: _OneRobot
     bag: ShippedBag
     rows: Mapping[str, Sequence[Row]]
-    replaced: tuple[ShippedBag, ...]
+    replaced: Sequence[ShippedBag]
 
 
 class Shipper:
@@ -162,15 +146,12 @@ class Shipper:
         most_bags: int = MOST_BAGS,
     ) -> None:
         self._lake = lake
-        self._robots = robots
         self._clock = clock
-        self._messages = messages
         self._tombstones = set(tombstones)
         self._pause = pause
         self._alive = alive
         self._most_bags = most_bags
-        self._of = {robot.name: _OfRobot() for robot in robots}
-        self._refused: set[str] = set()
+        self._robots = [_OneRobot(robot, lake, clock, messages) for robot in robots]
 
     def run(self) -> Shipped:
         """Ships what is new: one pass over all robots.
@@ -181,8 +162,8 @@ class Shipper:
         done = Shipped()
         batch: list[_Ready] = []
         rows = 0
-        for robot in [robot for robot in self._robots if self._forget(robot, done)]:
-            for ready in self._ready(robot, done):
+        for one in [one for one in self._robots if self._forget(one.robot, done)]:
+            for ready in one.ready(self._tombstones, self._alive, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
                 if len(batch) >= self._most_bags or rows >= MOST_ROWS:
@@ -234,15 +215,123 @@ class Shipper:
 
     def _look_again(self) -> None:
         """Has everything looked at again, in the bag directories and in the lake."""
-        self._of = {robot.name: _OfRobot() for robot in self._robots}
+        for one in self._robots:
+            one.look_again()
 
-    def _ready(self, robot: RobotBags, done: Shipped) -> Iterator[_Ready]:
-        """Yields the bags of a robot that are to be shipped, the oldest first, with their rows."""
+    def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
+        """Commits a batch.
+
+        Raises:
+            LakeError: the lake cannot be written; it is not known how far that came.
+        """
+        self._pause()
+        bags = [bag for ready in batch for bag in (ready.bag, *ready.replaced)]
+        # Few files have to be looked at for it.
+        condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
+        rows = 0
+        try:
+            for name, table in TABLES.items():
+                filled = table.filled([row for ready in batch for row in ready.rows[name]])
+                rows += filled.num_rows
+                self._lake.replace(name, condition, filled)
+        except LakeError:
+            self._look_again()
+            raise
+        done.bags += len(batch)
+        done.rows += rows
+        log.info("bags_shipped", bags=len(batch), rows=rows)
+        for one in self._robots:
+            one.shipped([ready for ready in batch if ready.of is one], done)
+
+
+class _OneRobot:
+    """What is to be shipped of one robot, and what is known of the bags that it has.
+
+    `seen` has the newest state of each by its file, `known` what the lake has of them by their ids;
+    neither those that it had: a hub runs for years.
+    """
+
+    def __init__(
+        self, robot: RobotBags, lake: LakeTables, clock: Clock, messages: Sequence[str]
+    ) -> None:
+        self.robot = robot
+        self._lake = lake
+        self._clock = clock
+        self._messages = messages
+        self._may_write = True
+        self.look_again()
+
+    def look_again(self) -> None:
+        """Has everything looked at again."""
+        self._seen: dict[str, _Seen] = {}
+        self._known: dict[str, ShippedBag] = {}
+        self._receipts: dict[str, Receipt] | None = None
+
+    def ready(
+        self, tombstones: Collection[Tombstone], alive: Callable[[], object], done: Shipped
+    ) -> Iterator[_Ready]:
+        """Yields the bags that are to be shipped, the oldest first, with their rows."""
+        robot = self.robot
         snapshot = robot.memory.index.refresh()
         if snapshot.problem is not None:
             done.problems.append(f"{robot.name}: {snapshot.problem}")
             return
-        now = robot.memory.clock.now()
+        bags = self._settled(snapshot, done)
+        self._look_up(bags)
+        by_file = {shipped.file: shipped for shipped in self._known.values()}
+        ids: set[str] = set()
+        confirmed: list[ShippedBag] = []
+        # A saved moment's copy of a bag counts where the bag itself is gone.
+        for bag in sorted(bags, key=lambda bag: (robot.is_moment(bag), bag.start)):
+            alive()
+            try:
+                seen = self._look(bag)
+                before = self._known.get(seen.bag_id)
+                is_again = before is not None and robot.is_moment(bag)
+                if seen.bag_id in ids or is_again:
+                    continue
+                if seen.is_forgotten is None:
+                    seen.is_forgotten = any(
+                        tombstone.forbids(robot.memory.reader, robot.name, bag, seen.bag_id)
+                        for tombstone in tombstones
+                    )
+                if seen.is_forgotten:
+                    done.problems.append(
+                        f"{robot.name}: {bag.file} has messages that were forgotten in the lake; "
+                        "it is not shipped: delete it, or the messages, with ros2-memory forget"
+                    )
+                    continue
+                ids.add(seen.bag_id)
+                shipped = self._described(bag, seen.bag_id, before)
+                if before is not None and _is_same(before, shipped):
+                    self._known[shipped.bag_id] = shipped
+                    confirmed.append(shipped)
+                    continue
+                of_file = by_file.get(shipped.file)
+                if of_file is not None and self._is_cut(of_file, bag):
+                    continue
+                rows = rows_of(robot.memory, bag, shipped, self._messages)
+            except (BagError, OSError, ValueError) as error:
+                done.problems.append(f"{robot.name}: {error}")
+                continue
+            replaced = {before} if before is not None else set()
+            if of_file is not None and _holds(of_file, shipped):
+                replaced.add(of_file)
+            yield _Ready(self, shipped, rows, [*replaced])
+        self._confirm(confirmed, done)
+        self._drop_gone(bags)
+
+    def shipped(self, batch: Sequence[_Ready], done: Shipped) -> None:
+        """Notes that bags were committed."""
+        for ready in batch:
+            for old in ready.replaced:
+                self._known.pop(old.bag_id, None)
+            self._known[ready.bag.bag_id] = ready.bag
+        self._confirm([ready.bag for ready in batch], done)
+
+    def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
+        """Returns the bags that change no more; reports the others."""
+        robot, now = self.robot, self.robot.memory.clock.now()
         closed = [
             bag
             for bag in snapshot.bags
@@ -257,100 +346,51 @@ class Shipper:
             for bag in open_bags
         ]
         done.problems += [f"{robot.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
-        known = self._look_up(robot, bags)
-        by_file = {shipped.file: shipped for shipped in known.values()}
-        ids: set[str] = set()
-        confirmed: list[ShippedBag] = []
-        # A saved moment's copy of a bag counts where the bag itself is gone.
-        for bag in sorted(bags, key=lambda bag: (robot.is_moment(bag), bag.start)):
-            self._alive()
-            try:
-                seen = self._look(robot, bag)
-                before = known.get(seen.bag_id)
-                is_again = before is not None and robot.is_moment(bag)
-                if seen.bag_id in ids or is_again or self._is_forgotten(robot, bag, seen, done):
-                    continue
-                ids.add(seen.bag_id)
-                shipped = self._described(robot, bag, seen.bag_id, before)
-                if before is not None and _is_same(before, shipped):
-                    known[shipped.bag_id] = shipped
-                    confirmed.append(shipped)
-                    continue
-                if _is_cut(robot, bag, by_file.get(shipped.file)):
-                    continue
-                rows = rows_of(robot.memory, bag, shipped, self._messages)
-            except (BagError, OSError, ValueError) as error:
-                done.problems.append(f"{robot.name}: {error}")
-                continue
-            older = {before, by_file.get(shipped.file)} - {None}
-            replaced = (one for one in older if one and (one is before or _holds(one, shipped)))
-            yield _Ready(robot, shipped, rows, tuple(replaced))
-        self._confirm(robot, confirmed, done)
-        self._drop_gone(robot, bags)
+        return bags
 
-    def _look_up(self, robot: RobotBags, bags: Sequence[BagFile]) -> dict[str, ShippedBag]:
-        """Returns what the lake has of a robot's bags; it is asked about the time of new ones.
+    def _look_up(self, bags: Sequence[BagFile]) -> None:
+        """Asks the lake what it has of the time of new bags.
 
         Raises:
             LakeError: the lake cannot be read.
         """
-        of_robot = self._of[robot.name]
-        new = [bag for bag in bags if bag.file not in of_robot.seen]
+        new = [bag for bag in bags if bag.file not in self._seen]
         if new:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
-            condition = overlapping(robot.name, ("start_ns", "end_ns"), begin, stop)
-            for row in self._lake.rows("bags", condition, ShippedBag._fields).to_pylist():
-                shipped = ShippedBag(**row)
-                of_robot.known.setdefault(shipped.bag_id, shipped)
-        return of_robot.known
+            of_time = overlapping(self.robot.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
+            for row in self._lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
+                self._known.setdefault(row["bag_id"], ShippedBag(**row))
 
-    def _drop_gone(self, robot: RobotBags, bags: Sequence[BagFile]) -> None:
-        """Drops what is known of bags that the robot has no longer: a hub runs for years."""
-        of_robot = self._of[robot.name]
-        names = {bag.file: robot.name_of(bag) for bag in bags}
-        of_robot.seen = {file: seen for file, seen in of_robot.seen.items() if file in names}
-        ids, own = {seen.bag_id for seen in of_robot.seen.values()}, {*names.values()}
-        of_robot.known = {
+    def _drop_gone(self, bags: Sequence[BagFile]) -> None:
+        """Drops what is known of bags that the robot has no longer."""
+        names = {bag.file: self.robot.name_of(bag) for bag in bags}
+        self._seen = {file: seen for file, seen in self._seen.items() if file in names}
+        ids, own = {seen.bag_id for seen in self._seen.values()}, {*names.values()}
+        self._known = {
             bag_id: shipped
-            for bag_id, shipped in of_robot.known.items()
+            for bag_id, shipped in self._known.items()
             if bag_id in ids or shipped.file in own
         }
-        if of_robot.receipts is not None:
-            receipts = of_robot.receipts.items()
-            of_robot.receipts = {name: receipt for name, receipt in receipts if name in own}
+        if self._receipts is not None:
+            receipts = self._receipts.items()
+            self._receipts = {name: receipt for name, receipt in receipts if name in own}
 
-    def _look(self, robot: RobotBags, bag: BagFile) -> _Seen:
+    def _look(self, bag: BagFile) -> _Seen:
         """Returns a state of a bag, which is read once."""
-        state, known = (bag.size, bag.mtime_ns, bag.sidecar_ns), self._of[robot.name].seen
-        seen = known.get(bag.file)
+        state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
+        seen = self._seen.get(bag.file)
         if seen is None or seen.state != state:
-            summary = robot.reader.summarize(bag.path)
+            summary = self.robot.reader.summarize(bag.path)
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
-            seen = _Seen(state, bag_id_of(robot.name, bag, summary.start))
-            known[bag.file] = seen
+            seen = _Seen(state, bag_id_of(self.robot.name, bag, summary.start))
+            self._seen[bag.file] = seen
         return seen
 
-    def _is_forgotten(self, robot: RobotBags, bag: BagFile, seen: _Seen, done: Shipped) -> bool:
-        """Returns, and reports, whether a bag has a message that was forgotten."""
-        if seen.is_forgotten is None:
-            reader = robot.memory.reader
-            seen.is_forgotten = any(
-                tombstone.forbids(reader, robot.name, bag, seen.bag_id)
-                for tombstone in self._tombstones
-            )
-        if seen.is_forgotten:
-            done.problems.append(
-                f"{robot.name}: {bag.file} has messages that were forgotten in the lake; it is "
-                "not shipped: delete it, or the messages, with ros2-memory forget"
-            )
-        return seen.is_forgotten
-
-    def _described(
-        self, robot: RobotBags, bag: BagFile, bag_id: str, before: ShippedBag | None
-    ) -> ShippedBag:
+    def _described(self, bag: BagFile, bag_id: str, before: ShippedBag | None) -> ShippedBag:
         """Returns what a bag would be known as."""
+        robot = self.robot
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         return ShippedBag(
             robot=robot.name,
@@ -365,48 +405,25 @@ class Shipper:
             end_ns=bag.end,
         )
 
-    def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
-        """Commits a batch.
+    def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
+        """Returns whether only retention took messages out of a bag after it was shipped.
 
-        Raises:
-            LakeError: the lake cannot be written; it is not known how far that came.
+        The lake keeps those, as it keeps the bags that retention deletes.
         """
-        self._pause()
-        # Few files have to be looked at for it.
-        condition = of_bags(
-            (bag.robot, bag.day, bag.bag_id)
-            for ready in batch
-            for bag in (ready.bag, *ready.replaced)
-        )
-        rows = 0
-        try:
-            for name, table in TABLES.items():
-                filled = table.filled([row for ready in batch for row in ready.rows[name]])
-                rows += filled.num_rows
-                self._lake.replace(name, condition, filled)
-        except LakeError:
-            self._look_again()
-            raise
-        for ready in batch:
-            known = self._of[ready.robot.name].known
-            for old in ready.replaced:
-                known.pop(old.bag_id, None)
-            known[ready.bag.bag_id] = ready.bag
-        done.bags += len(batch)
-        done.rows += rows
-        log.info("bags_shipped", bags=len(batch), rows=rows)
-        for robot in self._robots:
-            self._confirm(robot, [ready.bag for ready in batch if ready.robot is robot], done)
+        if before.size == bag.size:
+            return False
+        receipt = read_receipts(self.robot.bag_dir).get(before.file)
+        return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
-    def _confirm(self, robot: RobotBags, bags: Iterable[ShippedBag], done: Shipped) -> None:
+    def _confirm(self, bags: Sequence[ShippedBag], done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
+        robot, lake = self.robot, self._lake.lake_id
         if not has_recorded(robot.bag_dir):
             return
         try:
-            of_robot, lake = self._of[robot.name], self._lake.lake_id
-            if of_robot.receipts is None:
-                of_robot.receipts = read_receipts(robot.bag_dir)
-            known = of_robot.receipts
+            if self._receipts is None:
+                self._receipts = read_receipts(robot.bag_dir)
+            known = self._receipts
             missing = [
                 Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self._clock.now())
                 for bag in bags
@@ -415,27 +432,15 @@ class Shipper:
             if missing:
                 append_receipts(robot.bag_dir, missing)
                 known.update((receipt.bag, receipt) for receipt in missing)
-            self._refused.discard(robot.name)
+            self._may_write = True
         except OSError as error:
-            problem = (
+            if self._may_write:
+                log.warning("receipts_not_written", robot=robot.name, reason=str(error))
+            self._may_write = False
+            done.problems.append(
                 f"{robot.name}: no receipts can be written into {robot.bag_dir} "
                 f"({error.strerror or error}): its recorder cannot wait for shipping"
             )
-            if robot.name not in self._refused:
-                log.warning("receipts_not_written", robot=robot.name, reason=str(error))
-                self._refused.add(robot.name)
-            done.problems.append(problem)
-
-
-def _is_cut(robot: RobotBags, bag: BagFile, before: ShippedBag | None) -> bool:
-    """Returns whether only retention took messages out of a bag after it was shipped.
-
-    The lake keeps those, as it keeps the bags that retention deletes.
-    """
-    if before is None or before.size == bag.size:
-        return False
-    receipt = read_receipts(robot.bag_dir).get(before.file)
-    return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

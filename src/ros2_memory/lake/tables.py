@@ -1,4 +1,4 @@
-"""The Iceberg tables of a lake, as tables.yaml declares them, and rows as Arrow tables."""
+"""The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which."""
 
 from __future__ import annotations
 
@@ -6,11 +6,21 @@ from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
 
 import pyarrow as pa
 import yaml
 from pyiceberg.exceptions import NoSuchTableError
+from pyiceberg.expressions import (
+    AlwaysFalse,
+    And,
+    EqualTo,
+    GreaterThanOrEqual,
+    In,
+    LessThan,
+    LessThanOrEqual,
+    Or,
+)
 from pyiceberg.io.pyarrow import schema_to_pyarrow
 from pyiceberg.partitioning import PartitionField, PartitionSpec
 from pyiceberg.schema import Schema as IcebergSchema
@@ -21,11 +31,14 @@ from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
     from datetime import date
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
+    from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.core.model import TimeWindow
 
 NAMESPACE: Final = "ros2_memory"
 ROWS_VERSION: Final = 28
@@ -33,7 +46,6 @@ ROWS_VERSION: Final = 28
 
 _NS_PER_US: Final = 1_000
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")
-"""The column that `time` repeats."""
 _PROPERTIES: Final = {
     "write.parquet.compression-codec": "zstd",
     "commit.manifest-merge.enabled": "true",
@@ -105,21 +117,18 @@ class LakeTable:
 
     def filled(self, rows: Sequence[Row]) -> pa.Table:
         """Returns rows, sorted as the table is."""
-        schema = self.arrow_schema
-        columns = {
-            field.name: _array([row.get(field.name) for row in rows], field.type)
-            for field in schema
-        }
-        if "time" in columns:
-            first = next(columns[name] for name in _FIRST_TIMES if name in columns)
-            in_us = pa.array(first.to_numpy() // _NS_PER_US)
-            columns["time"] = in_us.cast(schema.field("time").type)
-        if "topic" in columns:
-            columns["topic_key"] = _array(
-                [topic_key(topic) for topic in columns["topic"].to_pylist()],
-                schema.field("topic_key").type,
-            )
-        return self.sorted(pa.Table.from_pydict(columns, schema))
+        first = next((name for name in _FIRST_TIMES if name in self.columns), None)
+        whole: list[Row] = []
+        for row in rows:
+            # `time` repeats the first time, in microseconds.
+            more = {"time": cast("int", row[first]) // _NS_PER_US} if first else {}
+            whole.append({"topic_key": topic_key(str(row.get("topic", ""))), **more, **row})
+        try:
+            found = pa.Table.from_pylist(whole, self.arrow_schema)
+        except UnicodeEncodeError:
+            # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
+            found = pa.Table.from_pylist([*map(_encodable, whole)], self.arrow_schema)
+        return self.sorted(found)
 
 
 def _iceberg_type(kind: str, inner_id: int) -> object:
@@ -171,21 +180,60 @@ def end_of(day: date) -> Ns:
     return int(next_day.timestamp()) * NS_PER_S - 1
 
 
-def _array(values: Sequence[object], kind: pa.DataType) -> pa.Array:
-    try:
-        return pa.array(values, kind)
-    except UnicodeEncodeError:
-        # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
-        return pa.array([*map(_encodable, values)], kind)
-
-
 def _encodable(value: object) -> object:
-    """Returns a text, or the names and values of a map, as UTF-8 can have them."""
+    """Returns a text, or all texts of rows, as UTF-8 can have them."""
     if isinstance(value, str):
         return encodable(value)
+    if isinstance(value, dict):
+        return {name: _encodable(item) for name, item in value.items()}
     if isinstance(value, list | tuple):
         return type(value)(map(_encodable, value))
     return value
+
+
+def _is(kind: type[BooleanExpression], column: str, value: object) -> BooleanExpression:
+    # The constructors are not those that Pydantic's plugin for mypy takes them to have.
+    return kind(column, value)  # type: ignore[call-arg,misc]
+
+
+def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
+    """Returns the condition on rows of one day of some robots."""
+    return And(_is(In, "robot", robots), _is(EqualTo, "day", day.isoformat()))
+
+
+def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
+    """Returns the condition on rows of bags of a robot, of any day.
+
+    The bounds of the ids let Iceberg pass over the files of other times.
+    """
+    bounds = And(
+        _is(GreaterThanOrEqual, "bag_id", min(ids)), _is(LessThanOrEqual, "bag_id", max(ids))
+    )
+    return And(_is(EqualTo, "robot", robot), bounds, _is(In, "bag_id", ids))
+
+
+def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
+    """Returns the condition on rows of bags, given by robot, day and id."""
+    ids: dict[tuple[str, date], set[str]] = {}
+    for robot, day, bag_id in bags:
+        ids.setdefault((robot, day), set()).add(bag_id)
+    found: BooleanExpression = AlwaysFalse()
+    for (robot, day), some in ids.items():
+        found = Or(found, And(of_robots([robot], day), of_ids(robot, some)))
+    return found
+
+
+def overlapping(
+    robot: str, columns: tuple[str, str], window: TimeWindow, topics: Collection[str] = ()
+) -> BooleanExpression:
+    """Returns the condition on rows of a robot whose span reaches into a window.
+
+    `columns` have its first and last time (inclusive). Where there are `topics`, only their rows.
+    """
+    first, last = columns
+    span = And(_is(LessThan, first, window.stop), _is(GreaterThanOrEqual, last, window.start))
+    of_robot = And(_is(EqualTo, "robot", robot), span)
+    return And(of_robot, _is(In, "topic", topics)) if topics else of_robot
 
 
 def open_tables(

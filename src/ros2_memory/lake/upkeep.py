@@ -1,15 +1,23 @@
-"""Keeps the tables of a lake small: closed days in few files, old versions and their files gone."""
+"""Keeps the tables of a lake small: closed days in few files, old versions and their files gone.
+
+pyiceberg drops old versions from the metadata of tables, but deletes no file. A list of what lies
+in a store would have files of other programs, too, also those that they are about to commit. So
+only files are deleted that this program recorded when it wrote them: those below a table's own
+location to which no version, branch or tag of the table refers.
+"""
 
 from __future__ import annotations
 
-from itertools import groupby
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
+from pyiceberg.manifest import ManifestEntryStatus
+
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.lake.conditions import of_robots
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.files import Partitions
-from ros2_memory.lake.tables import TABLES, day_of
+from ros2_memory.lake.tables import TABLES, day_of, of_robots
+from ros2_memory.lake.warehouse import WRITTEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -60,28 +68,73 @@ def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[
         for day, files in days.items()
         if day < closed and len(files) > FEW_FILES
     )
-    for day, group in groupby(sizes, key=lambda part: part[0]):
-        robots: list[str] = []
-        room = _MOST_BYTES
-        for _, robot, size in group:
-            if size > _MOST_BYTES:
-                continue
-            if robots and (size > room or len(robots) == _MOST_ROBOTS):
-                yield day, robots
-                robots, room = [], _MOST_BYTES
-            robots.append(robot)
-            room -= size
-        if robots:
-            yield day, robots
+    some: dict[str, int] = {}
+    last = closed
+    for day, robot, size in sizes:
+        is_full = sum(some.values()) + size > _MOST_BYTES or len(some) == _MOST_ROBOTS
+        if some and (is_full or day != last):
+            yield last, [*some]
+            some = {}
+        if size <= _MOST_BYTES:
+            some[robot] = size
+        last = day
+    if some:
+        yield last, [*some]
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
-    """Drops versions of up to a time, and deletes their files; returns how many of these.
+    """Drops the versions of up to a time, and deletes the files that are left without one.
+
+    The newest version stays, and those that a branch or a tag names. Returns how many files.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
-    files = lake.expire(until)
-    if files:
-        log.info("old_files_deleted", files=files)
-    return files
+    gone: set[str] = set()
+    state_dir = lake.location.state_dir
+    with lake.location.translated("deleting old files of the lake"):
+        tables = [lake.current(name) for name in TABLES]
+        for table in tables:
+            kept = {ref.snapshot_id for ref in table.metadata.refs.values()}
+            old = [
+                version.snapshot_id
+                for version in table.metadata.snapshots
+                if version.snapshot_id not in kept and version.timestamp_ms * NS_PER_MS <= until
+            ]
+            if old:
+                table.maintenance.expire_snapshots().by_ids(old).commit()
+                table.refresh()
+        recorded = WRITTEN.rows(state_dir)
+        own = [written.file for written in recorded if written.at < until]
+        try:
+            for table in tables:
+                below = f"{table.location().rstrip('/')}/"
+                files = {file for file in own if file.startswith(below) and ".." not in file}
+                for file in sorted(files - _referenced(table)) if files else ():
+                    with suppress(FileNotFoundError):  # as after a kill
+                        table.io.delete(file)
+                    gone.add(file)
+        finally:
+            if gone:
+                left = [written for written in recorded if written.file not in gone]
+                WRITTEN.replace(state_dir, left)
+    if gone:
+        log.info("old_files_deleted", files=len(gone))
+    return len(gone)
+
+
+def _referenced(table: IcebergTable) -> set[str]:
+    """Returns the files that some version, branch or tag of a table refers to."""
+    found = {table.metadata_location}
+    found.update(statistics.statistics_path for statistics in table.metadata.statistics)
+    for snapshot in table.metadata.snapshots:
+        found.add(snapshot.manifest_list)
+        for manifest in snapshot.manifests(table.io):
+            if manifest.manifest_path not in found:
+                found.add(manifest.manifest_path)
+                found.update(
+                    entry.data_file.file_path
+                    for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=False)
+                    if entry.status is not ManifestEntryStatus.DELETED
+                )
+    return found

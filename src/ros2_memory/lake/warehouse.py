@@ -2,11 +2,16 @@
 
 The catalogue is an SQLite file in the state directory, or a REST service. Whatever goes wrong there
 becomes a `LakeError`, in whose sentence no secret is.
+
+Each file is recorded in the state directory before it is written: pyiceberg deletes none, and a
+process that is killed leaves files that no version ever had (`upkeep`).
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import sys
 import warnings
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
@@ -15,11 +20,12 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from pyiceberg.catalog.rest import RestCatalog
 from pyiceberg.catalog.sql import SqlCatalog
+from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
-from ros2_memory.core.timebase import NS_PER_MS
+from ros2_memory.core.timebase import NS_PER_MS, WallClock
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
-from ros2_memory.lake.written_files import delete_unreferenced, file_properties
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -32,8 +38,37 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Ns
 
 CATALOGUE_FILE: Final = "catalogue.sqlite"
+WRITTEN_FILE: Final = "written.jsonl"
+RECORD: Final = "ros2-memory.written"
+"""The setting of a `RecordingFileIO` that names the folder of its record."""
 _MOST_CHARS: Final = 500
 _MASK: Final = "********"
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """A file, and when (ns) it was about to be written."""
+
+    file: str
+    at: Int64
+
+
+WRITTEN: Final = JsonLog(WRITTEN_FILE, Written, most_bytes=sys.maxsize)
+
+
+class RecordingFileIO(PyArrowFileIO):
+    """Records each file durably before it is written."""
+
+    def new_output(self, location: str) -> PyArrowFile:
+        """Returns a file to be written."""
+        from pathlib import Path  # noqa: PLC0415 - pyiceberg reads this class's annotations
+
+        record = self.properties.get(RECORD)
+        if record:
+            # With a REST catalogue nothing else is there before the first table.
+            Path(record).mkdir(parents=True, exist_ok=True)
+            WRITTEN.append(Path(record), [Written(location, WallClock().now())])
+        return super().new_output(location)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +121,10 @@ class LakeLocation:
         Raises:
             LakeError: it cannot be opened.
         """
-        # It logs each file that it opens, at the level of our own events.
+        # It logs each file that it opens, at the level of our own events, and warns of deletes that
+        # match no row: most repeat nothing.
         logging.getLogger("pyiceberg").setLevel(logging.WARNING)
+        warnings.filterwarnings("ignore", "Delete operation did not match", UserWarning)
         kind = RestCatalog if self.catalog == "rest" else SqlCatalog
         with self.translated("opening the lake's catalogue"):
             if self._is_file:
@@ -96,7 +133,8 @@ class LakeLocation:
             properties = {
                 **self.properties,
                 **self.secrets,
-                **file_properties(self.state_dir),
+                "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
+                RECORD: os.fspath(self.state_dir.absolute()),
                 "warehouse": self.warehouse,
                 "uri": f"sqlite:///{file}" if self._is_file else self.uri or "",
             }
@@ -171,53 +209,17 @@ class LakeTables:
     def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
         """Replaces rows by others, in one transaction."""
         table = self.current(name)
-        with self.location.translated(f"writing the lake's {name}"), quiet_deletes():
+        with self.location.translated(f"writing the lake's {name}"):
             table.overwrite(rows, overwrite_filter=condition)
 
     def delete(self, name: str, condition: BooleanExpression) -> None:
         """Deletes rows from the newest version; `expire` deletes those before."""
         table = self.current(name)
-        with self.location.translated(f"deleting from the lake's {name}"), quiet_deletes():
+        with self.location.translated(f"deleting from the lake's {name}"):
             table.delete(condition)
             # The list of what a version deleted has the bounds of its columns, which are texts of
             # rows; the next version does not refer to it.
             table.append(table.schema().as_arrow().empty_table())
-
-    def expire(self, until: Ns) -> int:
-        """Drops the versions of up to a time, and deletes the files that are left without one.
-
-        The newest version stays, and those that a branch or a tag names. Returns how many files.
-        """
-        with self.location.translated("deleting old files of the lake"):
-            for table in self._tables.values():
-                metadata = table.refresh().metadata
-                kept = {ref.snapshot_id for ref in metadata.refs.values()}
-                old = [
-                    version.snapshot_id
-                    for version in metadata.snapshots
-                    if version.snapshot_id not in kept and version.timestamp_ms * NS_PER_MS <= until
-                ]
-                if old:
-                    table.maintenance.expire_snapshots().by_ids(old).commit()
-                table.refresh()
-            return delete_unreferenced(self.location.state_dir, self._tables.values(), until)
-
-    def older_versions(self) -> tuple[str, ...]:
-        """Returns the branches and tags that keep older versions, each after its table."""
-        return tuple(
-            f"{name}: {ref}"
-            for name, table in self._tables.items()
-            for ref, version in table.metadata.refs.items()
-            if version.snapshot_id != table.metadata.current_snapshot_id
-        )
-
-
-@contextmanager
-def quiet_deletes() -> Iterator[None]:
-    """Keeps pyiceberg from warning that a delete, which mostly repeats nothing, matched no row."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Delete operation did not match", UserWarning)
-        yield
 
 
 def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:

@@ -93,42 +93,26 @@ def test_a_robot_that_never_did_is_named_and_one_that_could_not_read_all_is_not(
     }
 
 
-def test_a_clock_that_ran_ahead_is_named_and_its_rows_come_last() -> None:
-    replies = [
-        RobotReply("ahead", {"timestamp": 900.0, "value": 1}, latest=900, is_ahead=True),
-        RobotReply("r1", {"timestamp": 7.0, "value": 1}, latest=8),
-    ]
-    found = reply_of("find_last_match", replies)
-    assert [row["robot_name"] for row in found["matches"]] == ["r1", "ahead"]
-    (note,) = found["notes"]
-    assert note.startswith("ahead: ")
-
-
-def test_a_frame_is_that_of_its_row_and_labels_are_added_up() -> None:
+def test_what_is_not_in_rows_is_added_up_inherited_or_asked_of_whom() -> None:
     def of(name: str, frame: str, labels: dict[str, Any]) -> RobotReply:
         things: list[Any] = [{"label": label, "last_seen": 1.0} for label in labels]
         value: Any = {"frame_id": frame, "things": things, "total": len(things), "labels": labels}
         return RobotReply(name, value)
 
     found = reply_of("find_things", [of("r1", "map", {"mug": 2}), of("r2", "odom", {"mug": 1})])
-    assert [(row["robot_name"], row["frame_id"]) for row in found["things"]] == [
-        ("r1", "map"),
-        ("r2", "odom"),
-    ]
+    assert [row["frame_id"] for row in found["things"]] == ["map", "odom"]
     assert found["labels"] == {"mug": 3}
     assert "frame_id" not in found
 
-
-def test_a_stay_that_goes_on_is_the_newest() -> None:
-    def of(name: str, arrived: float, departed: float | None) -> RobotReply:
+    def stay(name: str, arrived: float, departed: float | None) -> RobotReply:
         row: dict[str, Any] = {"arrived": arrived, "departed": departed}
         value: Any = {"there_now": departed is None, "visits": [row], "total": 1, "minutes": 1.5}
         return RobotReply(name, value)
 
-    found = reply_of("visits", [of("r1", 8.0, 9.0), of("r2", 1.0, None)])
+    # A stay that goes on is the newest.
+    found = reply_of("visits", [stay("r1", 8.0, 9.0), stay("r2", 1.0, None)])
     assert [row["robot_name"] for row in found["visits"]] == ["r2", "r1"]
-    assert found["there_now"] == ["r2"]
-    assert found["minutes"] == 3
+    assert (found["there_now"], found["minutes"]) == (["r2"], 3)
 
 
 def test_a_topic_has_one_row_with_the_robots_that_record_it() -> None:

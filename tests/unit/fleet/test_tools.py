@@ -6,23 +6,17 @@ The oracle is a server of each robot alone.
 from __future__ import annotations
 
 import json
-import threading
-from collections import Counter
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from ros2_memory.core.errors import (
-    BusyError,
     InvalidArgumentsError,
-    QueryTimeoutError,
 )
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
@@ -48,7 +42,6 @@ from tests.support.memories import asked
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ros2_memory.history.context import Memory
 
 NAMES = ("r1", "r2", "r3")
 LAST: dict[str, object] = {"topic": "/vision/*", "condition_type": "contains", "value": "mug"}
@@ -79,18 +72,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in NAMES:
         write_robot(seeded(name), folder / name)
     return folder
-
-
-def test_metres_by_day_are_one_table_of_all_robots(folder: Path) -> None:
-    given: dict[str, object] = {"start": START_S, "end": START_S + 600, "by": "day"}
-    fleet = fleet_over(folder, NAMES)
-    table = reply(fleet, "trajectory_summary", given)
-    at = table["columns"].index("metres")
-    alone = {
-        name: reply(fleet, "trajectory_summary", {**given, "robot": name})["rows"][0][at - 1]
-        for name in NAMES
-    }
-    assert {row[0]: row[at] for row in table["rows"]} == alone
 
 
 def alone(folder: Path, robot: str, name: str, given: dict[str, object]) -> Any:
@@ -234,16 +215,37 @@ def test_what_is_about_a_robot_is_a_row_of_its_whole_reply(folder: Path, name: s
     ]
 
 
-def test_counts_of_all_have_a_column_with_the_robot(folder: Path) -> None:
-    given = LAST | {"topic": SEEN, "by": "hour"}
-    found = reply(fleet_over(folder, NAMES), "find_matches", given)
-    rows = [
-        [robot, *row]
-        for robot in NAMES
-        for row in alone(folder, robot, "find_matches", given)["rows"]
-    ]
-    assert found["columns"][:2] == ["robot_name", "hour"]
-    assert sorted(found["rows"]) == sorted(rows)
+BY: dict[str, object] = {**LAST, "topic": SEEN}
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("trajectory_summary", {"start": START_S, "end": START_S + 600, "by": "day"}),
+        ("find_matches", {**BY, "by": "hour"}),
+        ("find_matches", {**BY, "value": "", "by": "label"}),
+    ],
+)
+def test_a_table_of_all_has_the_rows_of_each_with_the_robot(
+    folder: Path, tool: str, given: dict[str, object]
+) -> None:
+    found = reply(fleet_over(folder, NAMES), tool, given)
+    rows = [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+    expected = []
+    for name in NAMES:
+        own = alone(folder, name, tool, given)
+        expected += [
+            {"robot_name": name, **dict(zip(own["columns"], row, strict=True))}
+            for row in own["rows"]
+        ]
+        if "all" in own:
+            assert found["all"][name] == own["all"]
+    assert sorted(rows, key=str) == sorted(expected, key=str)
+
+
+def test_who_may_ask_about_none_is_told_so(folder: Path) -> None:
+    found = reply(fleet_over(folder, NAMES), "memory_status", {}, Call(robots=frozenset()))
+    assert found["error"] == "refused"
 
 
 class TestWhichRobot:
@@ -279,21 +281,6 @@ class TestWhichRobot:
         tool = tools_of(fleet_over(folder, NAMES))["find_last_match"]
         with pytest.raises(InvalidArgumentsError, match="condition_type"):
             tool.question(LAST | {"condition_type": "like"})
-
-
-class TestWhoMayAsk:
-    def test_others_robots_are_neither_asked_nor_named(self, folder: Path) -> None:
-        fleet, only = fleet_over(folder, NAMES), frozenset({"r1", "r3"})
-        found = reply(fleet, "data_time_range", {}, Call(robots=only))
-        assert {row["robot_name"] for row in found["robots"]} == only
-        refused = reply(fleet, "memory_status", {"robot": "r2"}, Call(robots=only))
-        unknown = reply(fleet, "memory_status", {"robot": "r9"}, Call(robots=only))
-        assert refused["detail"].replace("r2", "r9") == unknown["detail"]
-        assert "r2" not in reply(fleet, "list_frames", {}, Call(robots=only))["detail"]
-
-    def test_who_may_ask_about_none_is_told_so(self, folder: Path) -> None:
-        found = reply(fleet_over(folder, NAMES), "memory_status", {}, Call(robots=frozenset()))
-        assert found["error"] == "refused"
 
 
 class TestMaps:
@@ -353,23 +340,6 @@ class TestMaps:
         assert found["by_robot"]["r2"]["total"] == 0
         assert any(note.startswith("no answer of r3: ") for note in found["notes"])
 
-    def test_labels_of_all_are_one_table_with_the_robot(self, folder: Path) -> None:
-        given: dict[str, object] = {
-            "topic": "/vision/*",
-            "condition_type": "contains",
-            "value": "",
-            "by": "label",
-        }
-        found = reply(fleet_over(folder, NAMES), "find_matches", given)
-        assert found["columns"][:3] == ["robot_name", "label", "count"]
-        for name in NAMES:
-            rows = {row[1]: row[2:] for row in found["rows"] if row[0] == name}
-            assert rows.keys() == {label for _, label in seeded(name).seen}
-            # It publishes what it sees alone: a label lasts until another one is seen.
-            runs = Counter(label for label, _ in groupby(label for _, label in seeded(name).seen))
-            assert {label: row[0] for label, row in rows.items()} == runs
-            assert found["all"][name][0] == runs.total()
-
     def test_several_named_places_are_those_of_each_robot_with_a_row_for_each(
         self, folder: Path
     ) -> None:
@@ -414,26 +384,6 @@ class TestTrouble:
         assert str(tmp_path) not in json.dumps(found)
         status = reply(Fleet(robots, FixedClock(NOW)), "memory_status", {"robot": "away"})
         assert "from fleet.robots" in status["doubts"]
-
-    def test_one_that_hangs_blocks_one_thread_however_often_it_is_asked(self, folder: Path) -> None:
-        released = threading.Event()
-
-        def hangs() -> Memory:
-            released.wait()
-            return fleet_memory(folder / "r1")
-
-        fleet = Fleet([Robot("r1", folder / "r1", hangs)], FixedClock(NOW))
-        asked: Any = tools_of(fleet)["list_frames"].question({"robot": "r1"})
-        with pytest.raises(QueryTimeoutError):
-            asked(None, Call(Deadline.after(0.2)))
-        for _ in range(3):
-            with pytest.raises(BusyError):
-                asked(None, Call(Deadline.after(0.2)))
-        stuck = [each for each in threading.enumerate() if each.name == "robot-r1"]
-        assert len(stuck) == 1
-        released.set()
-        stuck[0].join()
-        assert asked(None, Call())
 
     def test_where_nobody_has_data_the_reason_is_that_of_all(self, folder: Path) -> None:
         found = reply(fleet_over(folder, NAMES), "find_matches", LAST | {"topic": "/none"})

@@ -29,8 +29,7 @@ from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.shipper import Shipped, Shipper
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import compact, expire
-from ros2_memory.lake.warehouse import LakeTables
-from ros2_memory.lake.written_files import WRITTEN
+from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock

@@ -15,7 +15,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.lake.rows import bag_id_of, made_of, rows_of
-from ros2_memory.lake.tables import TABLES, Row, day_of, topic_key
+from ros2_memory.lake.tables import TABLES, Row, day_of
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, SeededRobot, seeded, write_robot
@@ -173,7 +173,3 @@ def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:
     assert table["value"].to_pylist() == ["bad \\udc80"]
     assert table["topic_key"].to_pylist() == ["\\udc80"]
     assert table["texts"].to_pylist() == [[("\\udc80", "\\udc81")]]
-
-
-def test_a_topic_key_has_no_slash() -> None:
-    assert topic_key("/vision/scene/objects") == "vision.scene.objects"

@@ -165,9 +165,8 @@ def test_what_ships_for_years_forgets_bags_that_are_gone(tmp_path: Path) -> None
         for day in range(6):
             bag = write_bag(tmp_path / "hall", day, at_s=START_S + day * DAY_S)
             assert shipper.run().bags == 1
-            of_robot = shipper._of["hall"]
-            kept = [len(of_robot.known), len(of_robot.seen)]
-            assert max(*kept, len(of_robot.receipts or ())) <= 2
+            [robot] = shipper._robots
+            assert max(map(len, (robot._known, robot._seen, robot._receipts or ()))) <= 2
             bag.unlink()
 
 

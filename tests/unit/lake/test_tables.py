@@ -24,13 +24,13 @@ def catalog(tmp_path_factory: pytest.TempPathFactory) -> SqlCatalog:
 def test_a_row_comes_back_as_it_was(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["events"])["events"]
     keys = {"robot": "kitchen", "bag_id": "a", "day": DAY}
-    row = {"topic": "/odom", "kind": "stop", "first_ns": 5_000_000_123, "x": 1.5}
+    row = {"topic": "/wheel/odom", "kind": "stop", "first_ns": 5_000_000_123, "x": 1.5}
     table.append(TABLES["events"].filled([{**keys, **row}]))
     [found] = open_tables(catalog, ["events"])["events"].scan().to_arrow().to_pylist()
     assert (found["robot"], found["bag_id"], found["day"]) == ("kitchen", "a", DAY)
     assert (found["first_ns"], found["last_ns"], found["x"]) == (5_000_000_123, None, 1.5)
     assert found["time"].timestamp() == 5.0
-    assert found["topic_key"] == "odom"
+    assert found["topic_key"] == "wheel.odom"
 
 
 def test_files_lie_by_robot_and_day_and_are_zstd(catalog: SqlCatalog) -> None:

@@ -1,17 +1,17 @@
 """DuckDB, inside of this process: the default engine. It loads no extension."""
-# ruff: noqa: S608 - tables are named by constants of the lake, and files as literals
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
-from urllib.parse import urlsplit
 
 import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
 from pyiceberg.io.pyarrow import PyArrowFileIO
 
-from ros2_memory.lake.engines.base import LakeEngine, expanded, failed, text_literal
+from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.lake.engines.base import LakeEngine
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -23,10 +23,16 @@ _SETTINGS: Final = {
     "autoload_known_extensions": "false",
     "python_enable_replacements": "false",
 }
+_LOCAL: Final = (
+    " UNION ALL BY NAME SELECT * FROM"
+    " read_parquet(${}_files, union_by_name = true, hive_partitioning = false)"
+)
+
+log = get_logger(__name__)
 
 
 class DuckdbEngine(LakeEngine):
-    """Reads local files itself, and those of a store through Arrow.
+    """Reads local files itself, within its limits, and those of a store through Arrow.
 
     Args:
         memory_mb: how much memory it may use.
@@ -43,41 +49,42 @@ class DuckdbEngine(LakeEngine):
         self._connection = duckdb.connect(config=settings)
 
     def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
-        """Runs the select in a cursor of its own."""
-        text, bound = expanded(sql, parameters)
+        """Runs the select in a cursor of its own, which alone knows the tables."""
+        sources: list[str] = []
+        bound: dict[str, object] = {**parameters}
         try:
             with self._connection.cursor() as cursor:
-                sources = [
-                    f"{name} AS ({_source(cursor, name, files)})" for name, files in tables.items()
-                ]
-                query = f"WITH {', '.join(sources)} {text}"
+                for name, files in tables.items():
+                    source = f"SELECT * FROM {name}_rows"  # noqa: S608 - a table of the lake
+                    rows, local = _opened(files)
+                    cursor.register(f"{name}_rows", rows)
+                    if local:
+                        source += _LOCAL.format(name)
+                        bound[f"{name}_files"] = local
+                    sources.append(f"{name} AS ({source})")
+                query = f"WITH {', '.join(sources)} {sql}"
                 return cursor.sql(query, params=bound).to_arrow_table()
         except (duckdb.Error, OSError, pa.ArrowException) as error:
-            raise failed(error) from error
+            # Its sentence alone: a traceback with variables would show the keys of a store.
+            log.warning("lake_engine_failed", reason=f"{type(error).__name__}: {error}")
+            # Who asked is told nothing that may name a path or a key.
+            raise RefusedError(
+                f"the lake cannot be read ({type(error).__name__}); the server's log has the reason"
+            ) from error
 
     def close(self) -> None:
         """Closes the database, which is in memory."""
         self._connection.close()
 
 
-def _source(cursor: duckdb.DuckDBPyConnection, name: str, files: DataFiles) -> str:
-    """Returns a select of all rows of a table, with all columns."""
-    # Iceberg's locations are no URLs: what looks like an escape is part of the name.
-    local = [urlsplit(each) for each in files.locations]
-    if any(each.scheme not in {"file", ""} for each in local):
-        cursor.register(f"{name}_data", _dataset(files))
-        return f"SELECT * FROM {name}_data"
-    cursor.register(f"{name}_empty", files.schema.empty_table())
-    empty = f"SELECT * FROM {name}_empty"
-    if not local:
-        return empty
-    paths = ", ".join(text_literal(each.path) for each in local)
-    read = f"read_parquet([{paths}], union_by_name = true, hive_partitioning = false)"
-    return f"{empty} UNION ALL BY NAME SELECT * FROM {read}"
+def _opened(files: DataFiles) -> tuple[pa.Table | ds.Dataset, list[str]]:
+    """Returns the rows of files that are in a store, and the paths of those that are not.
 
-
-def _dataset(files: DataFiles) -> ds.Dataset:
-    first = urlsplit(files.locations[0])
-    store = PyArrowFileIO(dict(files.store)).fs_by_scheme(first.scheme, first.netloc)
-    paths = [each.netloc + each.path for each in map(urlsplit, files.locations)]
-    return ds.dataset(paths, schema=files.schema, format="parquet", filesystem=store)
+    All columns of the table are in the former, also where no file is in a store.
+    """
+    places = [PyArrowFileIO.parse_location(location) for location in files.locations]
+    paths = [path for *_, path in places]
+    if {scheme for scheme, *_ in places} <= {"file"}:
+        return files.schema.empty_table(), paths
+    store = PyArrowFileIO(dict(files.store)).fs_by_scheme(*places[0][:2])
+    return ds.dataset(paths, schema=files.schema, format="parquet", filesystem=store), []
