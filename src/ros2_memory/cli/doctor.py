@@ -17,7 +17,6 @@ from itertools import filterfalse
 from pathlib import Path
 from typing import Final, TypeVar
 
-from pydantic import SecretStr
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
@@ -613,7 +612,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     if server.transport == "stdio":
         yield ok("server.transport=stdio: each client starts its own server")
         with suppress(OSError, http.client.HTTPException, ValueError, EpisodicError):
-            _, reply = _health(server.host, server.port, None)  # it may be another program
+            _, reply = _health(server.host, server.port)  # it may be another program
             yield ok(
                 f"one that was started otherwise answers on {address}: {reply['status']}",
                 "to examine it, give this command its settings, such as deployment=robot",
@@ -621,7 +620,9 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         return
     start = time.monotonic()
     try:
-        status, reply = _health(server.host, server.port, api_token(os.environ))
+        token = api_token(os.environ)
+        shown = token.get_secret_value() if token else ""
+        status, reply = _health(server.host, server.port, shown)
     except (OSError, http.client.HTTPException) as problem:
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
         yield error(f"nothing answers on {address}: {problem}", do)
@@ -643,7 +644,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         yield warning(seen, "the findings above and its log have the cause")
 
 
-def _health(host: str, port: int, token: SecretStr | None) -> tuple[int, dict[str, JsonValue]]:
+def _health(host: str, port: int, token: str = "") -> tuple[int, dict[str, JsonValue]]:
     """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
 
     Linux connects to the loopback address where `host` is that of all interfaces.
@@ -653,7 +654,7 @@ def _health(host: str, port: int, token: SecretStr | None) -> tuple[int, dict[st
         HTTPException: the reply is not HTTP.
         ValueError: the reply is not a JSON object with a status.
     """
-    headers = {"Authorization": f"Bearer {token.get_secret_value()}"} if token else {}
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
     connection = http.client.HTTPConnection(host, port, timeout=_HEALTH_TIMEOUT_S)
     try:
         connection.request("GET", "/health", headers=headers)
