@@ -215,13 +215,13 @@ def _follows(older: Rows, newer: Rows) -> bool:
 def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
     """Returns two blocks that overlap as those messages that are newer than both can share, if any.
 
-    And all others: what comes later in a scan is no newer than the last of `other`.
+    And all others: what comes later in a scan than `other` is no newer than the last of that.
     """
     for empty, rest in ((one, other), (other, one)):
         if not empty.tested().times.size:
             return None, rest
-    in_order = sorted((one, other), key=lambda block: (block.first, block.last))
-    joined = stacked([block.tested() for block in in_order])
+    # Of one log time and recording what the scan reaches later was written before.
+    joined = stacked([other.tested(), one.tested()])
     joined = rows_of(joined, np.lexsort((joined.sources, joined.times)))
     cut = int(np.searchsorted(joined.times, other.last, side="right"))
     newer, older = rows_of(joined, slice(cut, None)), rows_of(joined, slice(cut))

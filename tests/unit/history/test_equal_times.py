@@ -152,6 +152,8 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
 @example(seed=2261696819, part=0.5, has_types=True)
 @example(seed=197226833, part=1.0, has_types=False)
 @example(seed=377827213, part=1.0, has_types=True)
+@example(seed=3788236090, part=1.0, has_types=True)
+@example(seed=205486330, part=1.0, has_types=False)
 def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
     seed: int, part: float, has_types: bool
 ) -> None:
@@ -165,7 +167,8 @@ def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
         write(bag_dir, recordings, draw)
         plain = memory_of(bag_dir)
         stored = with_store(plain, bag_dir, part=part)
-        if not has_types:
+        # A pause may look as where the clock was set ahead, which durations then leave out.
+        if not has_types and not asked(plain, bag_dir, "data_time_range")["clock_steps"]:
             assert counted(plain, bag_dir) == pytest.approx(sightings(recordings), abs=0.051)
         for name, given_ in QUESTIONS:
             reply = asked(stored, bag_dir, name, **given_, **SPAN)
