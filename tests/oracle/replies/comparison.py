@@ -171,6 +171,8 @@ def _was_null(recorded: Any, got: Any) -> bool:
 
 
 _UNKNOWN: Final = ("unknown_s", "is not known at any time of the window", "as from several robots")
+_TOO_SHORT: Final = "too short to say how fast"
+_OF_SPEED: Final = ("max_speed is measured", "avg_speed, by the positions")
 _SEVERAL_RUNS: Final = "changes with every start, and these are several runs of odometry"
 
 
@@ -181,9 +183,11 @@ def _tells_unknown_time(recorded: Any, got: Any) -> bool:
     return _tells_more(recorded, got, *_UNKNOWN, _SEVERAL_RUNS)
 
 
-def _tells_runs(recorded: Any, got: Any) -> bool:
-    """Whether the note on several runs of odometry is all that is new."""
-    return _tells_more(recorded, got, _SEVERAL_RUNS)
+def _tells_runs_and_no_speed(recorded: Any, got: Any) -> bool:
+    """Whether all that is new are notes on several runs of odometry, and that no speed is said."""
+    if isinstance(recorded, list) and any(_TOO_SHORT in each for each in got):
+        recorded = [each for each in recorded if not each.startswith(_OF_SPEED)]
+    return _tells_more(recorded, got, _SEVERAL_RUNS, _TOO_SHORT)
 
 
 def _tells_more(recorded: Any, got: Any, *new: str) -> bool:
@@ -394,8 +398,18 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
         "*",
         "*",
         "/notes",
-        "that places are of several runs of odometry is not said",
-        only=_tells_runs,
+        "that places are of several runs of odometry is not said, nor that no speed is known",
+        only=_tells_runs_and_no_speed,
+    ),
+    *(
+        KnownWrong(
+            "*",
+            "*",
+            path,
+            "a speed is said of poses within less than half a second",
+            only=lambda _recorded, got: got is None,
+        )
+        for path in ("*/max_speed*", "*/avg_speed*")
     ),
     KnownWrong(
         "*",

@@ -479,6 +479,27 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     assert paths(-1000, -800) == {}
 
 
+def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
+    tmp_path: Path,
+) -> None:
+    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
+        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
+        at = poses[0].log_time
+        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
+        mounted = tf(at, mount, topic="/tf_static")
+        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
+    memory = memory_of(tmp_path)
+
+    def robots(start_s: int, stop_s: int) -> list[str]:
+        window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
+        found: Any = Recordings().paths(memory, Call(), window)["paths"]
+        return [each["name"] for each in found]
+
+    assert robots(0, 600) == ["robin", "wren"]
+    assert robots(0, 1000) == ["jay", "robin", "wren"]
+    assert robots(0, 400) == []
+
+
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
     for n, name in enumerate(("robin", "wren")):
         write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(BEGIN + n * 60 * S, 0.0, 0.0)])
