@@ -28,7 +28,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.telemetry import Answered
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
@@ -749,3 +749,24 @@ def test_where_time_runs_out_the_track_takes_the_place_of_older_poses(
 def test_a_box_without_its_corners_or_a_pixel_is_refused(query: str) -> None:
     with pytest.raises(InvalidArgumentsError, match="give x0"):
         box_asked(QueryParams(query))
+
+
+@pytest.mark.parametrize(("first", "seconds"), [(True, 0.7), (False, 2.4)])
+def test_all_parts_of_a_first_look_have_the_time_of_one_part_of_another(
+    first: bool, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each takes all the time that it may: the clock goes on by that."""
+    monkeypatch.setattr(span, "_QUICK_S", 0.8)
+    now, took = 0.0, []
+
+    def part(call: Call) -> span.Shown:
+        nonlocal now
+        took.append(call.deadline.left_s())
+        now += took[-1]
+        return span.Shown({})
+
+    call = replace(Call(), deadline=Deadline.after(60.0, lambda: now))
+    parts = dict.fromkeys(("path", "events", "things"), part)
+    found = [*span._in_time(parts, call, span.SpanRequest(first=first))]
+    assert [name for name, _ in found] == ["path", "events", "things"]
+    assert sum(took) == pytest.approx(seconds)

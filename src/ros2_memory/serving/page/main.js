@@ -95,6 +95,7 @@ async function look(isMore = false, isPatient = false) {
   const { view, recording, poses } = state;
   lookedAt = Date.now();
   if (isPatient) given.set("patient", "1");
+  if (!view) given.set("first", "1");
   if (isMore) {
     const isOld = Date.now() - statusAt > STATUS_MS;
     const isDue = Date.now() - wholeAt >= MOST_DUTY * (view.whole_ms || 0);
@@ -140,7 +141,7 @@ async function look(isMore = false, isPatient = false) {
     if (reply.whole_ms !== undefined) lookAtLabels();
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !isWhole(reply, given);
-    if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
+    if (isPart && !isPatient && (!view || !reply.filling)) setTimeout(() => look(false, !reply.filling), 50);
   } catch (error) {
     if (mine !== asking || error.name === "AbortError") return;
     if (error instanceof Locked) lock(error);
