@@ -85,6 +85,11 @@ def unix(at: int) -> float:
     return at / US_PER_S
 
 
+def has_begun(span: Span, day: int) -> bool:
+    """Returns whether something began on a day, and not in the evening before."""
+    return day_start(day) <= span.start < day_start(day + 1)
+
+
 class _Asker:
     def __init__(self, seed: int) -> None:
         self._draw = Random(f"questions {seed}")
@@ -189,8 +194,10 @@ class _Asker:
             held = {each.text for each in self._tasks if each.start < stop and each.end > start}
             text = f"What were you doing on {date_of(day)} at {at:%H:%M}?"
             return Question(EXACT, text, held, day=day, at=f"{at:%Y-%m-%dT%H:%M}")
-        day, name = self._task_of_day()
-        mine = self._of(name, self._during(day))
+        mine: list[Span] = []
+        while not mine:
+            day, name = self._task_of_day()
+            mine = [each for each in self._of(name, self._during(day)) if has_begun(each, day)]
         which = self._draw.randrange(len(mine))
         text = f"When exactly on {date_of(day)} did you begin {name} (time {which + 1})?"
         return Question(EXACT, text, unix(mine[which].start), name, day, nth=which)

@@ -342,6 +342,38 @@ def test_a_look_without_things_leaves_those_shown_and_is_not_the_last(page: Brow
     assert robots == [False, True]
 
 
+def test_a_gap_is_as_long_as_it_was_where_the_span_begins_in_it(page: Browser) -> None:
+    gap = page.run(
+        "const gap = { kind: 'gap', t: 100, end: 160, text: 'nothing was recorded' };"
+        "uncut(gap, { gaps: [[1, 5], [40, 160.004]] }); return [gap.t, gap.end]"
+    )
+    assert gap == [40, 160.004]
+
+
+def test_notes_have_times_and_lengths_as_the_page_has_them(page: Browser) -> None:
+    said, clocks = page.run(
+        "const [from, to] = [1784000424.95, 1784087059.8];"
+        "return [inWords('nothing was recorded from 1784000424.950000 to 1784087059.800000 "
+        "(8.66e+04 s)'), [clock(from), clock(to)]]"
+    )
+    assert said == f"nothing was recorded from {clocks[0]} to {clocks[1]} (24.1 h)"
+
+
+def test_one_recording_is_not_counted_as_all(page: Browser) -> None:
+    said = page.run(
+        "const row = (name, holds) => ({ name, holds });"
+        "const range = { earliest: 0, latest: 1000, bags: 3, gaps: [[100, 900]] };"
+        "const rows = [row('red', 2), row('red/a'), row('red/b'), row('blue')];"
+        "return ['', 'red', 'blue'].map((recording) =>"
+        "  recordedOf({ range, recordings: rows, recordings_total: 4, recording }))"
+    )
+    assert said == [
+        "3 min in 3 recordings over 17 min",
+        "3 min in 2 recordings over 17 min",
+        "17 min in 3 bags",
+    ]
+
+
 def test_no_name_on_the_map_covers_another_or_a_thing(page: Browser) -> None:
     """Two things far from all others have their names; of twelve in one place some have none."""
     drawn = page.run(

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 16
+FORMAT: Final = 17
 """Version of the file. Raise it with every change of its tables and of their bytes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4

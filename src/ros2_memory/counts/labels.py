@@ -102,7 +102,8 @@ def count_labels(
     if texts and not rows:
         view.notes.add(
             f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
-            "label or a list of such, and nothing deeper; leave by out to search texts"
+            "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
+            "search texts"
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")

@@ -298,9 +298,9 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         poses = counted(path.invalid, "pose")
         yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
     if path.is_noisy:
+        # Without its number, which is in the reply, it is said once for several windows.
         yield (
-            f"the positions are noisy: all steps add up to {totals.path_sum_m:.2f} m; "
-            "distance_m leaves out what noise adds"
+            "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
         )
     if path.avg_speed is None and path.poses:
         yield (

@@ -32,7 +32,7 @@ POSITIONS: Final = (
     ("bbox", "center", "position"),
 )
 _MAX_JSON_CHARS: Final = 1 << 16
-MAX_DEPTH: Final = 4
+MAX_DEPTH: Final = 5
 """Lists, objects and texts that are JSON around a detection, and it."""
 _JSON: Final = frozenset("[{")
 

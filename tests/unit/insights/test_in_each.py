@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import time
 from datetime import datetime
+from random import Random
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -11,7 +13,8 @@ import pytest
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.insights.at_each import hours_of_days
 from ros2_memory.tools.arguments import _as_hours
-from tests.support.memories import asked
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import asked, memory_of
 from tests.support.rooms import S, asked_of, draw, write
 
 if TYPE_CHECKING:
@@ -157,3 +160,28 @@ def test_hours_are_local_also_where_clocks_are_changed(monkeypatch: pytest.Monke
         found = hours_of_days(window, *_as_hours("22:00-04:00"))  # type: ignore[misc]
     time.tzset()
     assert [(each.stop - each.start) // (3600 * S) for each in found] == [4, 5, 6, 2]
+
+
+def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> None:
+    draw = Random("noise")
+    for day in range(3):
+        poses = [
+            odom((BEGIN + day * DAY_S) * S + n * S // 5, n / 50 + draw.gauss(0, 0.03), 0.0)
+            for n in range(500)
+        ]
+        write_mcap(tmp_path / f"rec_{day}" / f"rec_{day}_0.mcap", poses)
+    memory = memory_of(tmp_path)
+    evenings = {**SPAN, "between": "23:00-01:00"}
+    compared = {
+        **dict(zip(("start", "end"), (BEGIN, BEGIN + 600), strict=True)),
+        **dict(zip(("with_start", "with_end"), (BEGIN + DAY_S, BEGIN + DAY_S + 600), strict=True)),
+    }
+    for tool, given in (
+        ("trajectory_summary", evenings),
+        ("recap", evenings),
+        ("compare", compared),
+    ):
+        reply = asked(memory, tmp_path, tool, **given)
+        assert json.dumps(reply).count("the positions are noisy") == 1
+        sums = [row["path_sum_m"] for row in reply.get("windows", ())]
+        assert len({*sums}) == len(sums)

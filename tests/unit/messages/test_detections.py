@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import JsonValue
-from ros2_memory.messages.detections import Detection, detections_of, without_low_scores
+from ros2_memory.messages.detections import (
+    MAX_DEPTH,
+    Detection,
+    detections_of,
+    without_low_scores,
+)
 from tests.support.strategies import json_values
 
 
@@ -65,6 +70,28 @@ def test_a_point_that_nobody_filled_in_is_no_place() -> None:
 def test_a_text_that_is_json_is_looked_into() -> None:
     value: JsonValue = {"value": '[{"label": "cup", "point": [1, 2, 3]}]'}
     assert detections_of(value, "odom") == (Detection("cup", (1.0, 2.0, 3.0), "odom"),)
+
+
+def test_a_json_object_with_a_list_of_detections_in_a_text_is_looked_into() -> None:
+    """As of a detector that publishes std_msgs/msg/String."""
+    said = json.dumps({"detections": [{"label": "cup", "score": 0.8}, {"label": "fork"}]})
+    assert detections_of({"data": said}) == (Detection("cup", score=0.8), Detection("fork"))
+    kept = without_low_scores({"data": said}, 0.9)
+    assert detections_of(kept) == (Detection("fork"),)
+
+
+def test_what_lies_too_deep_is_not_looked_into() -> None:
+    value: JsonValue = [{"label": "cup"}]
+    for _ in range(MAX_DEPTH - 2):
+        value = {"inner": value}
+    assert detections_of(value) == (Detection("cup"),)
+    assert detections_of({"inner": value}) == ()
+    text = json.dumps(value)
+    for _ in range(MAX_DEPTH):
+        text = json.dumps({"inner": text})
+    for hostile in (text, "[" * 50_000, '{"a":' * 10_000, json.dumps([[[[[[text]]]]]])):
+        assert detections_of({"data": hostile}) == ()
+        assert without_low_scores({"data": hostile}, 0.5) == {"data": hostile}
 
 
 def test_a_list_of_names_is_a_list_of_things() -> None:

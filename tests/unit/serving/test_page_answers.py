@@ -28,7 +28,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.telemetry import Answered
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
@@ -479,6 +479,27 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     assert paths(-1000, -800) == {}
 
 
+def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
+    tmp_path: Path,
+) -> None:
+    for name, begins, parent in (("robin", 0, "base"), ("wren", 500, "map"), ("jay", 900, "base")):
+        poses = [odom(BEGIN + (begins + n) * S, float(n), 0.0) for n in range(10)]
+        at = poses[0].log_time
+        mount = transform(at, parent, "laser", (0.1, 0.0, 0.0))
+        mounted = tf(at, mount, topic="/tf_static")
+        write_mcap(tmp_path / name / "0.mcap", [mounted, *poses])
+    memory = memory_of(tmp_path)
+
+    def robots(start_s: int, stop_s: int) -> list[str]:
+        window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
+        found: Any = Recordings().paths(memory, Call(), window)["paths"]
+        return [each["name"] for each in found]
+
+    assert robots(0, 600) == ["robin", "wren"]
+    assert robots(0, 1000) == ["jay", "robin", "wren"]
+    assert robots(0, 400) == []
+
+
 def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None:
     for n, name in enumerate(("robin", "wren")):
         write_mcap(tmp_path / name / f"{name}_0.mcap", [odom(BEGIN + n * 60 * S, 0.0, 0.0)])
@@ -728,3 +749,24 @@ def test_where_time_runs_out_the_track_takes_the_place_of_older_poses(
 def test_a_box_without_its_corners_or_a_pixel_is_refused(query: str) -> None:
     with pytest.raises(InvalidArgumentsError, match="give x0"):
         box_asked(QueryParams(query))
+
+
+@pytest.mark.parametrize(("first", "seconds"), [(True, 0.7), (False, 2.4)])
+def test_all_parts_of_a_first_look_have_the_time_of_one_part_of_another(
+    first: bool, seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each takes all the time that it may: the clock goes on by that."""
+    monkeypatch.setattr(span, "_QUICK_S", 0.8)
+    now, took = 0.0, []
+
+    def part(call: Call) -> span.Shown:
+        nonlocal now
+        took.append(call.deadline.left_s())
+        now += took[-1]
+        return span.Shown({})
+
+    call = replace(Call(), deadline=Deadline.after(60.0, lambda: now))
+    parts = dict.fromkeys(("path", "events", "things"), part)
+    found = [*span._in_time(parts, call, span.SpanRequest(first=first))]
+    assert [name for name, _ in found] == ["path", "events", "things"]
+    assert sum(took) == pytest.approx(seconds)

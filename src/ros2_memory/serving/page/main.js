@@ -95,6 +95,7 @@ async function look(isMore = false, isPatient = false) {
   const { view, recording, poses } = state;
   lookedAt = Date.now();
   if (isPatient) given.set("patient", "1");
+  if (!view) given.set("first", "1");
   if (isMore) {
     const isOld = Date.now() - statusAt > STATUS_MS;
     const isDue = Date.now() - wholeAt >= MOST_DUTY * (view.whole_ms || 0);
@@ -122,7 +123,10 @@ async function look(isMore = false, isPatient = false) {
     if (!isWholeOwed) wholeAt = lookedAt;
     if (reply.status) statusAt = lookedAt;
     if (reply.recordings && !reply.mixed.length) reply.paths = [];
-    if (reply.events) reply.events.push(...always(reply, reply.range || view.range));
+    if (reply.events) {
+      reply.events.forEach((each) => uncut(each, reply.range || view.range));
+      reply.events.push(...always(reply, reply.range || view.range));
+    }
     // Of the same span, what there was no time for stays as it was.
     const of = [recording, poses, state.last, state.last === null ? given.get("start") + given.get("end") : ""].join();
     state.view = isMore && view && view.path !== undefined ? continued(view, reply)
@@ -137,7 +141,7 @@ async function look(isMore = false, isPatient = false) {
     if (reply.whole_ms !== undefined) lookAtLabels();
     // What takes long comes later: the rest can be looked at until then.
     const isPart = reply.range && reply.range.earliest !== null && !isWhole(reply, given);
-    if (isPart && !isPatient && !reply.filling) setTimeout(() => look(false, true), 50);
+    if (isPart && !isPatient && (!view || !reply.filling)) setTimeout(() => look(false, !reply.filling), 50);
   } catch (error) {
     if (mine !== asking || error.name === "AbortError") return;
     if (error instanceof Locked) lock(error);
@@ -231,6 +235,11 @@ function placeBy(topic) {
   map.fit();
   remember();
   look();
+}
+/* A gap is as long as it was, also where the span begins or ends in it. */
+function uncut(event, { gaps }) {
+  const whole = event.kind === "gap" && gaps.find(([start, end]) => start <= event.t + 0.01 && end >= event.end - 0.01);
+  if (whole) [event.t, event.end] = whole;
 }
 /* What was in view all the time is no event: the timeline has it wherever something was recorded. */
 function always(reply, range) {
@@ -349,10 +358,11 @@ function ageOf(view) {
   return (isHalted(view) ? Date.now() / 1000 : view.range.now) - view.range.latest;
 }
 /* How much is recorded, where that is far less than from the first to the last. */
-function recordedOf({ range, recordings = [], recordings_total: total = 0 }) {
+function recordedOf({ range, recordings = [], recordings_total: total = 0, recording }) {
   const whole = range.latest - range.earliest;
   const length = whole - range.gaps.reduce((sum, [start, end]) => sum + end - start, 0);
-  const number = total - recordings.filter((each) => each.holds).length;
+  const one = recordings.find((each) => each.name === recording);
+  const number = recording ? (one && one.holds) || 1 : total - recordings.filter((each) => each.holds).length;
   if (length > whole / 2 || number < 2) return `${lasting(whole)} in ${counted(range.bags, "bag")}`;
   return `${lasting(length)} in ${counted(number, "recording")} over ${lasting(whole)}`;
 }

@@ -419,7 +419,8 @@ class RobotMap {
   drawPath(c) {
     this.paths.forEach((path, index) => {
       c.strokeStyle = colour(ofPath(index));
-      c.lineWidth = 2;
+      // What lies below others shows on both sides of them.
+      c.lineWidth = 1 + this.paths.length - index;
       c.beginPath();
       const exact = this.exactly(path);
       if (exact) this.trace(c, exact, 0);

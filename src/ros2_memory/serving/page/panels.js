@@ -24,8 +24,11 @@ function robotRows(robot, extra = []) {
   }
   return [...rows, ...extra];
 }
+/* A sentence of the server with its times and lengths as they are on the page. */
+const inWords = (note) => note.replace(/\((\d[\d.]*(?:e[+-]?\d+)?) s\)/g, (_, s) => `(${lasting(Number(s))})`)
+  .replace(/\b\d{9,10}\.\d{6}\b/g, (unix) => clock(Number(unix)));
 function notesOf(notes) {
-  const rows = (notes || []).map((each) => el("li", { class: "soft" }, each));
+  const rows = (notes || []).map((each) => el("li", { class: "soft" }, inWords(each)));
   return rows.length ? [el("details", {}, el("summary", {}, counted(rows.length, "note")),
     el("ul", {}, ...rows))] : [];
 }

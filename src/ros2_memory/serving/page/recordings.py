@@ -15,7 +15,12 @@ from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryT
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.robots import ADVICE, describe_mixed, mixed_recordings
+from ros2_memory.history.robots import (
+    ADVICE,
+    contradicting_frames,
+    describe_mixed,
+    mixed_recordings,
+)
 from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
 from ros2_memory.serving.page.span import path_in
 
@@ -119,7 +124,7 @@ class Recordings:
         }
 
     def paths(self, memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
-        """Returns a path for each robot, where recordings of several overlap in time; else none.
+        """Returns a path for each robot, where recordings are plainly of several; else none.
 
         Each is of one recording, or of a folder of recordings that do not overlap each other.
         Those that overlap come first, then the newest.
@@ -161,10 +166,11 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
 
 
 def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
-    """Returns the names under which the robots of a window are found, if some overlap in time."""
+    """Returns the names under which the robots of a window are found, if there are several.
+
+    Some of their recordings overlap in time, or have frames of other robots.
+    """
     mixed = [each.pair for each in mixed_recordings(memory, call) if each.topic is not None]
-    if not any(window.overlaps(each.start, each.end) for each in mixed):
-        return []
     root = str(memory.index.bag_dir)
     names: dict[str, str] = {}
     ends: dict[str, Ns] = {}
@@ -172,6 +178,14 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
         if any(window.overlaps(bag.start, bag.end) for bag in bags):
             names[path] = name_of(path, bags, root)
             ends[names[path]] = max(bag.end for bag in bags)
+    here = {*map(_folder, names.values())}
+    unlike = [
+        {_folder(path.removeprefix(f"{root}/")) for path in each.recordings}
+        for each in contradicting_frames(memory, call)
+    ]
+    unlike = [folders for folders in unlike if len(folders) > 1 and folders <= here]
+    if not unlike and not any(window.overlaps(each.start, each.end) for each in mixed):
+        return []
     pairs = [
         tuple(names[path] for path in map(str, (each.first, each.second)) if path in names)
         for each in mixed
@@ -179,6 +193,7 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
     folders = [{*map(_folder, pair)} for pair in pairs if len(pair) == 2]
     split = {each for folder in folders if len(folder) == 1 for each in folder}
     overlapping = {name for pair in pairs for name in pair}
+    overlapping |= {name for name in ends if any(_folder(name) in each for each in unlike)}
     robots: dict[str, tuple[bool, Ns]] = {}
     for name, end in ends.items():
         robot = name if _folder(name) in split else _folder(name)

@@ -188,6 +188,7 @@ def span_request(given: QueryParams) -> SpanRequest:
         things=given.get("things") != "0",
         status=given.get("status") != "0",
         patient=given.get("patient") == "1",
+        first=given.get("first") == "1",
         signals=tuple(map(Signal.parse, signals)),
     )
 

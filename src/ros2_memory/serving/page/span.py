@@ -46,7 +46,7 @@ from ros2_memory.serving.page.signals import Signal, signal_in
 from ros2_memory.things.find import find_things
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator, Mapping
 
     from numpy.typing import NDArray
 
@@ -69,8 +69,8 @@ MOST_QUESTIONS: Final = 30
 _EXTREMES: Final = 5  # of a bin: the first pose, and those farthest west, east, south and north
 _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
-"""How long each part of an answer may take; of a patient one the latter. The page shows what there
-is, and asks again for the rest."""
+"""How long each part of an answer may take; of a patient one the latter, of a first one all of them
+the former. The page shows what there is, and asks again for the rest."""
 _OF_WHOLE: Final = ("events", "things")
 """Parts that are of the whole span; `whole_ms` is their processor time, so that a live page knows
 how often it may ask for them."""
@@ -102,6 +102,7 @@ class SpanRequest:
         things: whether things, events and totals of the whole span are looked up.
         status: whether the state of the memory is; without it only how far it reaches.
         patient: whether the answer may take long; else what takes long is left out.
+        first: whether nothing is shown yet, so that the answer must not take long as a whole.
         signals: numbers to be plotted.
     """
 
@@ -113,6 +114,7 @@ class SpanRequest:
     things: bool = True
     status: bool = True
     patient: bool = False
+    first: bool = False
     signals: tuple[Signal, ...] = ()
 
     def window(self, earliest: Ns, latest: Ns) -> TimeWindow:
@@ -181,17 +183,11 @@ def span_shown(
     }
     if not request.things:
         del parts["things"]
-    budget_s = _PART_S if request.patient else _QUICK_S
     whole_s = 0.0
-    for name, part in parts.items():
-        begun = time.thread_time()
-        try:
-            found = part(replace(call, deadline=call.deadline.within(budget_s)))
-        except QueryTimeoutError as error:
-            found = Shown({}, (f"the {name} are not known yet: {error}",))
+    for name, (found, took_s) in _in_time(parts, call, request):
         shown |= found.part
         notes += found.notes
-        whole_s += time.thread_time() - begun if name in _OF_WHOLE else 0.0
+        whole_s += took_s if name in _OF_WHOLE else 0.0
     if request.things:
         shown["whole_ms"] = round(whole_s * 1000)
     if request.signals:
@@ -200,6 +196,23 @@ def span_shown(
         ]
     shown["notes"] = [*dict.fromkeys(notes)]
     return shown
+
+
+def _in_time(
+    parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
+) -> Iterator[tuple[str, tuple[Shown, float]]]:
+    """Yields each part, or why it is not known yet, with the processor time (s) that it took."""
+    budget_s = _PART_S if request.patient else _QUICK_S
+    whole = call.deadline.within(budget_s)
+    for name, part in parts.items():
+        begun = time.thread_time()
+        if request.first:
+            budget_s = max(whole.left_s(), 0.0) / 2
+        try:
+            found = part(replace(call, deadline=call.deadline.within(budget_s)))
+        except QueryTimeoutError as error:
+            found = Shown({}, (f"the {name} are not known yet: {error}",))
+        yield name, (found, time.thread_time() - begun)
 
 
 def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
