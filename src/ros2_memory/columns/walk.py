@@ -167,16 +167,12 @@ class _Walk:
         if not rows:
             return Texts(np.zeros(0, np.uint32), ())
         size = int(sizes[0])
-        words: list[bytes]
         if (sizes == size).all():
             data = gathered(self.buffer, np.dtype(f"V{size}"), places).tobytes() if size else b""
             if data == data[:size] * rows:
                 return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
-            words = [data[begin : begin + size] for begin in range(0, len(data), size)]
-        else:
-            ends = (places + sizes).tolist()
-            buffer = self.buffer
-            words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
+        buffer, ends = self.buffer, (places + sizes).tolist()
+        words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
         known: dict[bytes, int] = {}
         codes = [known.setdefault(word, len(known)) for word in words]
         return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
