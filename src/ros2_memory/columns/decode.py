@@ -413,8 +413,9 @@ def _table(kind: _Kind, batch: Batch, reader: BagReader | None, *, skip: bool = 
         batch = batch.taken(order)
     hashes = None
     if kind.is_hashed:
-        payloads = map(batch.payload, range(batch.sizes.size))
-        hashes = np.array([*map(zlib.crc32, payloads)], np.int64)
+        buffer, ends = batch.buffer, batch.starts + batch.sizes
+        spans = zip(batch.starts.tolist(), ends.tolist(), strict=True)
+        hashes = np.array([zlib.crc32(buffer[begin:end]) for begin, end in spans], np.int64)
     table = Table(
         batch.channel,
         batch.log_times,

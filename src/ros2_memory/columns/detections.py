@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.scores import hypotheses, is_object, scored
+from ros2_memory.columns.scores import hypotheses, is_object, or_else, scored
 from ros2_memory.columns.shown import (
+    ByType,
     Group,
     Items,
     Listing,
     Message,
     Narrowed,
     Nothing,
-    Shape,
     UnknownShapeError,
     children,
     placed,
@@ -141,13 +141,11 @@ class DetectionColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._extractor = extractor
-        self._known: dict[tuple[Definition, str], tuple[Source, ...] | None] = {}
+        self._sources = ByType(extractor, lambda shape: tuple(sources_in(shape.value)))
 
     def of(self, table: Table) -> Found | None:
         """Returns the detections of a table's messages; None where they have to be read."""
-        definition = table.definition
-        sources = self._sources(table)
+        definition, sources = table.definition, self._sources.of(table)
         if definition is None or sources is None:
             return None
         values = Values(table)
@@ -164,23 +162,11 @@ class DetectionColumns:
 
         Of several parts for each of them, or for all.
         """
-        sources = self._sources(known)
+        sources = self._sources.of(known)
         found: bool | Mask = sources is None
         for source in sources or ():
             found = found | (not isinstance(source, Json) or _may_be_json(known, source.leaf))
         return found
-
-    def _sources(self, table: Table | PartZones) -> tuple[Source, ...] | None:
-        if table.definition is None or "" in table.left_out:
-            return None
-        key = (table.definition, table.channel.type)
-        if key not in self._known:
-            try:
-                shape = Shape(table.definition, table.channel.type, self._extractor)
-                self._known[key] = tuple(sources_in(shape.value))
-            except UnknownShapeError:
-                self._known[key] = None
-        return self._known[key]
 
 
 def detections_by(found: Sequence[Sequence[Detection]]) -> Detections:
@@ -321,7 +307,10 @@ def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detect
         yield _found(values, source.leaf.level, texts, among, np.full(len(texts), math.nan))
         return
     objects = source.scored
-    name, score, error = _named(values, objects)
+    named = objects.read(values)
+    if named is None:
+        raise UnknownShapeError("names or scores are not held")
+    name, score, error = named
     among, size = np.arange(len(name)), len(name)
     if source.is_best:
         elements, parent = values.elements(objects.level), objects.level.parent
@@ -382,12 +371,15 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     if not _may_be_json(values.table, source.leaf):
         return
     texts = texts_of(values, source.leaf)
-    known = [_parsed(word, source.depth) for word in texts.words]
-    counts = np.array([*map(len, known)], np.int64)
-    if not counts.any():
+    once = values.table.remember(
+        f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
+        lambda: detections_by([_parsed(word, source.depth) for word in texts.words]),
+        lambda found: 1000 + 100 * found.rows.size,
+    )
+    if not once.rows.size:
         return
+    counts = np.bincount(once.rows, minlength=len(texts.words))
     among = np.flatnonzero(counts[texts.codes])
-    once = detections_by(known)
     first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
     of = np.repeat(among, counts)
     nth = np.repeat(first, counts) + within(counts)
@@ -398,7 +390,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
         Texts(once.labels.codes[nth], once.labels.words),
         once.scores[nth],
         once.places[nth],
-        _or_else(Texts(once.frames.codes[nth], once.frames.words), around),
+        or_else(Texts(once.frames.codes[nth], once.frames.words), around),
     )
 
 
@@ -409,30 +401,6 @@ def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
     for _ in range(MAX_DEPTH - depth):
         value = {"": value}
     return detections_of(value)
-
-
-def _named(values: Values, objects: Scored) -> tuple[Texts, Floats, float]:
-    """Returns the name of each of some objects, blank where it has none, its score, and the error.
-
-    Raises:
-        UnknownShapeError: names or scores are not held.
-    """
-    columns, score = [texts_of(values, leaf) for leaf in objects.labels], objects.score(values)
-    if score is None:
-        raise UnknownShapeError("scores are not held")
-    name = columns[0]
-    for other in columns[1:]:
-        name = _or_else(name, other, blank=True)
-    return name, *score
-
-
-def _or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
-    """Returns each of some texts, or another where it is empty (or `blank`)."""
-    is_none = [not (word.strip() if blank else word) for word in one.words]
-    if not any(is_none):
-        return one
-    codes = np.where(np.array(is_none)[one.codes], other.codes + len(one.words), one.codes)
-    return Texts(codes.astype(np.uint32), (*one.words, *other.words))
 
 
 def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
@@ -479,7 +447,7 @@ def _frames(values: Values, level: Level, among: Ints, leaves: Sequence[Leaf]) -
     for leaf in leaves:
         texts = texts_of(values, leaf)
         at = texts.codes[_owners(values, level, among, leaf.level)]
-        found = _or_else(Texts(at, texts.words), found)
+        found = or_else(Texts(at, texts.words), found)
     return found
 
 
@@ -513,7 +481,7 @@ def _with_frames(values: Values, found: Detections, own: tuple[Leaf, ...]) -> De
     """Returns detections with the frame of their message where they name none."""
     if not own or found.frames.words.count("") == 0:
         return found
-    return found._replace(frames=_or_else(found.frames, _frames(values, ROWS, found.rows, own)))
+    return found._replace(frames=or_else(found.frames, _frames(values, ROWS, found.rows, own)))
 
 
 def _stamps(values: Values, definition: Definition) -> Ints | None:

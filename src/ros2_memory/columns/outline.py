@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 import numpy as np
 
 from ros2_memory.columns.fragments import Fragment, Kind
-from ros2_memory.columns.table import IN_PART, Texts, letters_of
+from ros2_memory.columns.table import IN_PART, SPACES, Texts, letters_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     Mask = NDArray[np.bool_]
     Floats = NDArray[np.float64]
 
-_SPACES: Final = {code: " " for code in range(128) if not chr(code).isalpha()}
 _BYTES: Final = 500
 """About how much memory an entry takes."""
 _MOST_LETTERS: Final = 1_024
@@ -68,7 +67,7 @@ class Letters(NamedTuple):
         """Returns the letters of texts; None where they are too many."""
         known: dict[frozenset[str], int] = {}
         alike = [
-            known.setdefault(frozenset(text.casefold().translate(_SPACES).split()), len(known))
+            known.setdefault(frozenset(text.casefold().translate(SPACES).split()), len(known))
             for text in texts.words
         ]
         words = sorted(frozenset().union(*known))

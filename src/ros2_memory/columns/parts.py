@@ -18,7 +18,7 @@ import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.stored import Lazily, StoredTable, lazy_columns
+from ros2_memory.columns.stored import StoredTable, lazy_columns
 from ros2_memory.columns.table import Zone, joined
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.layout import Layout
     from ros2_memory.columns.outline import Outline
-    from ros2_memory.columns.stored import Topic
+    from ros2_memory.columns.stored import Remembered, Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
@@ -140,12 +140,14 @@ def _hashes(table: Table) -> IntArray:
 
 def part_table(
     topic: Topic,
-    packed: Mapping[str, Packed],
+    packed: Callable[[str], Packed | None],
     load: Callable[[str], Column],
     outline: Callable[[], Outline | None] = lambda: None,
     *,
     messages: int,
     dropped: Sequence[str] = (),
+    memory: Remembered | None = None,
+    number: int = 0,
 ) -> StoredTable:
     """Returns a part as a table whose columns are loaded when they are first asked for.
 
@@ -153,30 +155,29 @@ def part_table(
 
     Args:
         topic: of the part.
-        packed: what is known of each column; their data is not needed.
+        packed: as of `StoredTable`.
         load: returns a column by its path.
         outline: as of `StoredTable`.
         messages: how many rows it has.
         dropped: the columns that are beyond the topic's share.
+        memory: as of `StoredTable`.
+        number: of the part.
     """
-    columns, elements = lazy_columns(topic.layout, load)
     left_out = topic.layout.left_out
     if dropped:
         reason = "beyond the share of the store (store.max_share)"
         left_out = {**left_out, **dict.fromkeys(dropped, reason)}
-        columns = Lazily([path for path in columns if path not in dropped], columns.__getitem__)
-        there = [path for path in elements if f"{path}#" not in dropped]
-        elements = Lazily(there, elements.__getitem__)
     none = np.zeros(messages, np.int64)
     return StoredTable(
         topic.channel,
         none,
         none,
         none,
-        columns,
-        elements,
+        *lazy_columns(topic.layout, load, dropped),
         left_out,
         definition=topic.definition,
         packed=packed,
         outline=outline,
+        memory=memory,
+        number=number,
     )

@@ -70,9 +70,17 @@ class PoseColumns:
             columns = self._known[key]
             if columns is None:
                 raise NoPoseError
-            return _read(_Rows(table, index), columns, times)
+            if index is not None:
+                return _read(_Rows(table, index), columns, times)
+            return table.remember(
+                "poses", lambda: _read(_Rows(table, None), columns, times), _bytes_of
+            )
         except UnknownShapeError:
             return None
+
+
+def _bytes_of(poses: Poses) -> int:
+    return 1000 + 80 * len(poses)
 
 
 class NoPoseError(Exception):

@@ -5,7 +5,6 @@ Of a part that nothing needs not even the times are unpacked.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar, cast
@@ -26,14 +25,13 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.coverage import Coverage
     from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
-    from ros2_memory.columns.stored import Topic
     from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
@@ -265,25 +263,30 @@ class Scanner:
         topic = self.store.topic(head.topic)
         if topic is None:
             raise GoneError
-        columns = _PartColumns(self, topic, head, together)
+        packed = partial(self.packed, head, together=together)
 
         def load(path: str) -> Column:
-            return self._column(head.number, path, columns[path])
+            known = packed(path)
+            if known is None:
+                raise KeyError(path)
+            return self._column(head.number, path, known)
 
         table = part_table(
             topic,
-            columns,
+            packed,
             load,
             partial(self._outlines.get, _outline_key(head)),
             messages=head.messages,
             dropped=head.dropped,
+            memory=self._read,
+            number=head.number,
         )
         counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
 
         def integers(path: str) -> IntArray | None:
-            return None if path not in columns else np.asarray(load(path), np.int64)
+            return None if packed(path) is None else np.asarray(load(path), np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)
@@ -347,27 +350,3 @@ class Scanner:
 def _outline_key(head: PartHead) -> FragmentKey:
     # Those of a day are read together: of one topic alone.
     return FragmentKey(head.first, str(head.topic), (head.number,))
-
-
-class _PartColumns(Mapping[str, "Packed"]):
-    """What is known of the columns of a part, looked up when it is first asked for."""
-
-    def __init__(
-        self, scanner: Scanner, topic: Topic, head: PartHead, together: Sequence[PartHead]
-    ) -> None:
-        self._scanner = scanner
-        self._topic = topic
-        self._head = head
-        self._together = together
-
-    def __getitem__(self, path: str) -> Packed:
-        packed = self._scanner.packed(self._head, path, self._together)
-        if packed is None:
-            raise KeyError(path)
-        return packed
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._topic.layout.slots)
-
-    def __len__(self) -> int:
-        return len(self._topic.layout.slots)

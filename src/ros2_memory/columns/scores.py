@@ -27,6 +27,7 @@ from ros2_memory.columns.shown import (
     opened,
     unknown,
 )
+from ros2_memory.columns.table import Texts
 from ros2_memory.columns.values import Kind, Leaf, Level
 from ros2_memory.core.text import LABELS
 from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES
@@ -34,7 +35,6 @@ from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from ros2_memory.columns.table import Texts
     from ros2_memory.columns.values import Floats, Ints, Mask, Values
 
 Object: TypeAlias = Message | Group
@@ -54,23 +54,18 @@ class Scored:
     labels: tuple[Leaf, ...]
     scores: tuple[Leaf, ...]
 
-    def labelled(self, values: Values) -> Mask | None:
-        """Returns which of a level's objects have a label; None where that is not held."""
-        found: Mask | None = None
-        for leaf in self.labels:
-            texts = values.texts(leaf)
-            if texts is None:
-                return None
-            has = _flags(texts, lambda word: bool(word.strip()))
-            found = has if found is None else found | has
-        return found
+    def read(self, values: Values) -> tuple[Texts, Floats, float] | None:
+        """Returns the name (blank: none) and score (NaN: none) of each, and the error of scores.
 
-    def score(self, values: Values) -> tuple[Floats, float] | None:
-        """Returns the score of each (NaN: none) and its error; None where that is not held."""
-        size = values.size(self.level)
-        if size is None:
+        None where these are not held.
+        """
+        names = [values.texts(leaf) for leaf in self.labels]
+        name = names[0]
+        for other in names[1:]:
+            name = None if name is None or other is None else or_else(name, other, blank=True)
+        if name is None:
             return None
-        score, error = np.full(size, np.nan), 0.0
+        score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
             found = values.numbers(leaf)
             if found is None or not isinstance(found.error, float):
@@ -78,7 +73,16 @@ class Scored:
             number = found.values.astype(np.float64, copy=False)
             score = np.where(np.isnan(score), number, score)
             error = max(error, found.error)
-        return score, error
+        return name, score, error
+
+
+def or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
+    """Returns each of some texts, or another where it is empty (or `blank`)."""
+    is_none = [not (word.strip() if blank else word) for word in one.words]
+    if not any(is_none):
+        return one
+    codes = np.where(np.array(is_none)[one.codes], other.codes + len(one.words), one.codes)
+    return Texts(codes.astype(np.uint32), (*one.words, *other.words))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,10 +107,11 @@ class _Scores:
         return Kept(surely[among], perhaps[among])
 
     def _kept(self, values: Values) -> Kept:
-        labelled, found = self.scored.labelled(values), self.scored.score(values)
-        if labelled is None or found is None:
+        found = self.scored.read(values)
+        if found is None:
             return unknown(values.size(self.level) or 0)
-        score, error = found
+        name, score, error = found
+        labelled = _has_label(name)
         surely = ~(labelled & (score < self.least + error))
         perhaps = ~(labelled & (score < self.least - error))
         if self.has_inner or may_be_json(values, self.texts):
@@ -133,11 +138,11 @@ class _BestScores:
 
     def _kept(self, values: Values) -> Kept:
         size = values.size(self.level) or 0
-        labelled, found = self.hypotheses.labelled(values), self.hypotheses.score(values)
-        results = values.elements(self.hypotheses.level)
-        if labelled is None or found is None or results is None or found[1]:
+        found, results = self.hypotheses.read(values), values.elements(self.hypotheses.level)
+        if found is None or results is None or found[2]:
             return unknown(size)  # also with rounded scores, of which another may be the best
-        score, _ = found
+        name, score, _ = found
+        labelled = _has_label(name)
         rank = np.where(np.isnan(score), -np.inf, score)
         # The first of those of the highest score, for each detection.
         order = np.lexsort((-rank, results.owners))
@@ -166,12 +171,12 @@ class _Hypotheses:
 
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the hypothesis stays."""
-        found, results = self.best.hypotheses.score(values), values.elements(self.level)
-        if found is None or found[1] or results is None:
+        found, results = self.best.hypotheses.read(values), values.elements(self.level)
+        if found is None or found[2] or results is None:
             return unknown(len(among))
         # Where it is not sure that the detection is one, neither is what stays of it.
         is_one = self.best.kept(values, results.owners[among]).surely
-        is_low = found[0][among] < self.best.least
+        is_low = found[1][among] < self.best.least
         return Kept(~is_low & is_one, ~is_low | ~is_one)
 
 
@@ -265,7 +270,5 @@ def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
     )
 
 
-def _flags(texts: Texts, meets: Callable[[str], bool]) -> Mask:
-    """Returns which rows have a word that meets something, tested once for each word."""
-    flags = np.fromiter(map(meets, texts.words), np.bool_, len(texts.words))
-    return flags[texts.codes] if len(flags) else np.zeros(0, np.bool_)
+def _has_label(name: Texts) -> Mask:
+    return np.array([bool(word.strip()) for word in name.words], np.bool_)[name.codes]

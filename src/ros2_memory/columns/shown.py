@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -27,10 +27,14 @@ from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
+    from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Ints, Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
+
+T = TypeVar("T")
 
 MAX_LEAVES: Final = 20_000
 """Of one value: nested definitions of some lines can spell out more than memory holds."""
@@ -50,6 +54,21 @@ class Kept(NamedTuple):
 
     surely: Mask
     perhaps: Mask
+
+    @property
+    def unsure(self) -> Mask:
+        """Where it may stand or not."""
+        return self.perhaps & ~self.surely
+
+    @property
+    def is_none(self) -> bool:
+        """Whether it stands nowhere."""
+        return not self.perhaps.any()
+
+
+def nowhere(size: int) -> Kept:
+    """Returns that it stands in none of so many rows or elements."""
+    return Kept(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 
 def unknown(size: int) -> Kept:
@@ -238,9 +257,13 @@ class Shape:
         definition: the type's fields.
         type_name: the type as the channel names it.
         extractor: has the schema map.
+
+    Attributes:
+        type: as the channel names it.
     """
 
     def __init__(self, definition: Definition, type_name: str, extractor: SchemaExtractor) -> None:
+        self.type = type_name
         self._definition = definition
         self._fields = extractor.fields_of(type_name)
         self._limit = extractor.limit
@@ -425,6 +448,33 @@ class Shape:
             return node
         # PX4 writes w first.
         return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
+
+
+class ByType(Generic[T]):
+    """What is made of the shape of each type, once.
+
+    Args:
+        extractor: has the schema map.
+        make: returns it; raises `UnknownShapeError` where it depends on the message.
+    """
+
+    def __init__(self, extractor: SchemaExtractor, make: Callable[[Shape], T]) -> None:
+        self._extractor = extractor
+        self._make = make
+        self._known: dict[tuple[Definition, str], T | None] = {}
+
+    def of(self, known: Table | PartZones) -> T | None:
+        """Returns that of a table's type, or of some parts'; None where the messages decide."""
+        definition = known.definition
+        if definition is None or "" in known.left_out:
+            return None
+        key = (definition, known.channel.type)
+        if key not in self._known:
+            try:
+                self._known[key] = self._make(Shape(*key, self._extractor))
+            except UnknownShapeError:
+                self._known[key] = None
+        return self._known[key]
 
 
 def descend(node: Node, path: Sequence[str]) -> Node | None:

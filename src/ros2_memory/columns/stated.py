@@ -36,9 +36,9 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.columns.detections import found_in, sources_in, texts_of
 from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import (
+    ByType,
     Listing,
     Narrowed,
-    Shape,
     Spot,
     UnknownShapeError,
     children,
@@ -53,12 +53,11 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.facts import Fact
     from ros2_memory.columns.detections import Source
-    from ros2_memory.columns.shown import Node
+    from ros2_memory.columns.shown import Node, Shape
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import Definition
 
 
 class FromColumns(NamedTuple):
@@ -91,21 +90,11 @@ class StatedColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._extractor = extractor
-        self._known: dict[tuple[Definition, str], _Plan | None] = {}
+        self._plans = ByType(extractor, _Plan.of)
 
     def of(self, table: Table) -> FromColumns | None:
         """Returns what the messages of a table state; None where they all have to be read."""
-        if table.definition is None or "" in table.left_out:
-            return None
-        key = (table.definition, table.channel.type)
-        if key not in self._known:
-            try:
-                shape = Shape(table.definition, table.channel.type, self._extractor)
-                self._known[key] = _Plan.of(shape.value, table.channel.type)
-            except UnknownShapeError:
-                self._known[key] = None
-        plan = self._known[key]
+        plan = self._plans.of(table)
         try:
             return None if plan is None else plan.read(table)
         except UnknownShapeError:
@@ -126,12 +115,13 @@ class _Plan(NamedTuple):
     numbers: tuple[Leaf, ...] = ()
 
     @classmethod
-    def of(cls, value: Node, type_name: str) -> _Plan:
-        """Returns what is looked for in a value.
+    def of(cls, shape: Shape) -> _Plan:
+        """Returns what is looked for in the value of a type.
 
         Raises:
             UnknownShapeError: it depends on the message.
         """
+        value, type_name = shape.value, shape.type
         if type_name == GOALS:
             return cls(type_name, numbers=tuple(_of_goals(value)))
         if has_errors(type_name):

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar, cast
+from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.columns.table import Elements, Table, joined_column, joined_zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
 
     from ros2_memory.columns.layout import Layout
     from ros2_memory.columns.outline import Outline
@@ -21,6 +21,16 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
 V = TypeVar("V")
+
+
+class Remembered(Protocol):
+    """What is remembered, as long as there is room for it."""
+
+    def get(self, key: Hashable) -> object | None:
+        """Returns what is remembered under a key."""
+
+    def put(self, key: Hashable, value: object, size: int) -> None:
+        """Remembers a value of about so many bytes."""
 
 
 class Lazily(Mapping[str, V]):
@@ -54,12 +64,17 @@ class StoredTable(Table):
     """A table whose columns are unpacked when they are first asked for, by any thread.
 
     Attributes:
-        packed: what is known of each column, by the paths of `Layout.slots`; without its data.
+        packed: returns what is known of a column, by its path as in `Layout.slots`, without its
+            data; None where there is no such one.
         outline: returns what else is known of them; None where it was not made.
+        memory: has what was made of it, under its number; None where nothing is remembered.
+        number: of the part.
     """
 
-    packed: Mapping[str, Packed] = field(kw_only=True)
+    packed: Callable[[str], Packed | None] = field(kw_only=True)
     outline: Callable[[], Outline | None] = field(kw_only=True, default=lambda: None)
+    memory: Remembered | None = field(kw_only=True, default=None)
+    number: int = field(kw_only=True, default=0)
 
     def error(self, path: str) -> float:
         """Returns the greatest absolute error of a column; 0.0: it is exact.
@@ -70,15 +85,30 @@ class StoredTable(Table):
         Raises:
             KeyError: there is no such column.
         """
-        return self.packed[path.rstrip(".")].error
+        packed = self.packed(path.rstrip("."))
+        if packed is None:
+            raise KeyError(path)
+        return packed.error
 
     def zone(self, path: str) -> Zone | None:
         """Returns what is known of a column without unpacking it; None where there is no such one.
 
         `path` is as in `error`.
         """
-        packed = self.packed.get(path.rstrip("."))
+        packed = self.packed(path.rstrip("."))
         return None if packed is None else packed.zone
+
+    def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
+        """Returns what is made of all rows, as of `Table`."""
+        if self.memory is None:
+            return make()
+        key = (self.number, f"={what}")
+        known = self.memory.get(key)
+        if known is not None:
+            return cast("V", known)  # by name: each has one type
+        made = make()
+        self.memory.put(key, made, size_of(made))
+        return made
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +147,7 @@ def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
         _joined_elements([table.elements for table in tables], [*map(len, tables)]),
         first.left_out,
         definition=first.definition,
-        packed={},
+        packed=lambda _: None,
         tables=tables,
     )
 
@@ -161,13 +191,14 @@ class Topic:
 
 
 def lazy_columns(
-    layout: Layout, column: Callable[[str], Column]
+    layout: Layout, column: Callable[[str], Column], dropped: Collection[str]
 ) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
     """Returns the columns and sequences of a table, each made when it is needed, and kept.
 
     Args:
         layout: of the table.
         column: returns the column, or the owners, at a path of `Layout.slots`.
+        dropped: the paths of those that there are not.
     """
 
     def elements_in(inside: Layout, around: str) -> Mapping[str, Elements]:
@@ -179,6 +210,10 @@ def lazy_columns(
                 elements_in(inner, f"{whole}."),
             )
 
-        return Lazily(inside.sequences, elements)
+        paths = [path for path in inside.sequences if f"{around}{path}#" not in dropped]
+        return Lazily(paths, elements)
 
-    return Lazily(layout.columns, column), elements_in(layout, "")
+    columns = (
+        [path for path in layout.columns if path not in dropped] if dropped else layout.columns
+    )
+    return Lazily(columns, column), elements_in(layout, "")

@@ -25,14 +25,16 @@ import math
 import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.storage.base import Channel, Definition, IntArray
+
+T = TypeVar("T")
 
 Numbers: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
 
@@ -42,6 +44,8 @@ IN_PART: Final = "LETTERS"
 """Begins the words of a zone that are no whole texts, but the rows of letters in them.
 
 No casefolded text begins so."""
+SPACES: Final = {code: " " for code in range(128) if not chr(code).isalpha()}
+"""For `str.translate`: what of ASCII is no letter becomes a space."""
 _LETTERS: Final = re.compile(r"[^\W\d_]+")
 MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
@@ -120,7 +124,8 @@ def joined_zone(zones: Sequence[Zone]) -> Zone:
 
 def letters_of(text: str) -> list[str]:
     """Returns the rows of letters in a text, each as long as it goes on."""
-    return _LETTERS.findall(text)
+    # The expression takes four times as long.
+    return text.translate(SPACES).split() if text.isascii() else _LETTERS.findall(text)
 
 
 def may_be_in(words: str, text: str) -> bool:
@@ -269,6 +274,17 @@ class Table:
         """Returns what is known of a column without reading it: None, decoded ones are read."""
         del path
         return None
+
+    def remember(self, what: str, make: Callable[[], T], size_of: Callable[[T], int]) -> T:
+        """Returns what `make` makes of all rows; of a part that is stored it is remembered.
+
+        Args:
+            what: its name. Nothing else is made of a table under it.
+            make: makes it.
+            size_of: returns about how much memory it takes.
+        """
+        del what, size_of
+        return make()
 
     def rows(self, positions: IntArray) -> Table:
         """Returns some rows, in the order given."""

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -19,17 +20,18 @@ from ros2_memory.analysis.conditions import POSITION_KEYS, Beyond, Contains, Equ
 from ros2_memory.columns.scores import may_be_json, without_low
 from ros2_memory.columns.shown import (
     MAX_LEAVES,
+    ByType,
     Group,
     Kept,
     Listing,
     Message,
     Nothing,
-    Shape,
     Spot,
     UnknownShapeError,
     at_field,
     children,
     leaves_below,
+    nowhere,
     opened,
     placed,
     unknown,
@@ -43,13 +45,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.columns.shown import Limits, Node
+    from ros2_memory.columns.shown import Limits, Node, Shape
     from ros2_memory.columns.table import Table, Zone
     from ros2_memory.columns.values import Mask, Numeric
     from ros2_memory.columns.zones import Zones
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import Definition
 
 ZoneOf: TypeAlias = "Callable[[Leaf], Zone | Zones | None]"
 """Returns what is known of a leaf without reading it, of one part or of several."""
@@ -61,36 +62,6 @@ _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Truth:
-    """Which rows meet a condition.
-
-    Attributes:
-        rows: how many there are.
-        some_met: which meet it; None where none does.
-        some_unsure: which may or may not, so that the bag must decide; None where all is settled.
-    """
-
-    rows: int
-    some_met: Mask | None = None
-    some_unsure: Mask | None = None
-
-    @property
-    def is_none(self) -> bool:
-        """Whether surely no row meets it."""
-        return self.some_met is None and self.some_unsure is None
-
-    @property
-    def met(self) -> Mask:
-        """Which rows surely meet it."""
-        return np.zeros(self.rows, np.bool_) if self.some_met is None else self.some_met
-
-    @property
-    def unsure(self) -> Mask:
-        """Which rows the bag must decide; none of those that are met."""
-        return np.zeros(self.rows, np.bool_) if self.some_unsure is None else self.some_unsure
-
-
 class ColumnCondition:
     """Tests one condition on tables; remembers what it means for each type that it met.
 
@@ -100,61 +71,38 @@ class ColumnCondition:
     """
 
     def __init__(self, condition: Condition, extractor: SchemaExtractor) -> None:
-        self._condition = condition
-        self._extractor = extractor
-        self._plans: dict[tuple[Definition, str], _Plan | None] = {}
+        self._plans = ByType(extractor, partial(_Plan.of, condition))
 
-    def truth(self, table: Table) -> Truth:
+    def truth(self, table: Table) -> Kept:
         """Returns which rows of a table meet the condition."""
-        rows, plan = len(table), self._plan_of(table)
+        plan, values = self._plans.of(table), Values(table)
         if plan is None:
-            return _truth(rows, unknown(rows))
-        values = Values(table)
-        if rows == 0 or not plan.may_match(values.zone):
-            return Truth(rows)
+            return unknown(values.rows)
+        if values.rows == 0 or not plan.may_match(values.zone):
+            return nowhere(values.rows)
         if plan.counted is None:
-            return _truth(rows, _any_of(plan.whole, values))
+            return _any_of(plan.whole, values)
         texts = tuple(
             t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
         )
         counted = _any_of(plan.counted, values)
         if not may_be_json(values, texts):
-            return _truth(rows, counted)
+            return counted
         # A text in which detections were left out is another text: both have to pass.
         whole = _any_of(plan.whole, values)
-        surely, perhaps = counted.surely & whole.surely, counted.perhaps & whole.perhaps
-        return _truth(rows, Kept(surely, perhaps))
+        return Kept(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
 
     def may_match(self, known: Table | PartZones) -> bool | Mask:
         """Returns whether a row may meet the condition, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        plan = self._plan_of(known)
+        plan = self._plans.of(known)
         if plan is None:
             return True
         if isinstance(known, PartZones):
             return plan.may_match(lambda leaf: zone_of(leaf, known.zone))
         return plan.may_match(Values(known).zone)
-
-    def _plan_of(self, table: Table | PartZones) -> _Plan | None:
-        definition, type_name = table.definition, table.channel.type
-        if definition is None or "" in table.left_out:
-            return None
-        key = (definition, type_name)
-        if key not in self._plans:
-            try:
-                self._plans[key] = self._made(Shape(definition, type_name, self._extractor).value)
-            except UnknownShapeError:
-                self._plans[key] = None
-        return self._plans[key]
-
-    def _made(self, value: Node) -> _Plan:
-        condition = self._condition
-        whole = _tests(condition, value)
-        if condition.min_score <= 0:
-            return _Plan(whole, None)
-        return _Plan(whole, _tests(condition, without_low(value, condition.least_score)))
 
 
 class _Plan(NamedTuple):
@@ -163,6 +111,18 @@ class _Plan(NamedTuple):
     whole: Sequence[_LeafTest | _PlaceTest]
     counted: Sequence[_LeafTest | _PlaceTest] | None
 
+    @classmethod
+    def of(cls, condition: Condition, shape: Shape) -> _Plan:
+        """Returns what a condition tests on the value of a type.
+
+        Raises:
+            UnknownShapeError: it depends on the message.
+        """
+        whole = _tests(condition, shape.value)
+        if condition.min_score <= 0:
+            return cls(whole, None)
+        return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
+
     def may_match(self, zone_of: ZoneOf) -> bool | Mask:
         found: bool | Mask = False
         for test in self.whole:
@@ -170,11 +130,6 @@ class _Plan(NamedTuple):
             if found is True:
                 break
         return found
-
-
-def _truth(rows: int, kept: Kept) -> Truth:
-    unsure = kept.perhaps & ~kept.surely
-    return Truth(rows, kept.surely if kept.surely.any() else None, unsure if unsure.any() else None)
 
 
 def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
@@ -192,7 +147,7 @@ def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
             perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
         if surely.all():
             break
-    return Kept(surely, perhaps)
+    return Kept(surely, perhaps | surely)
 
 
 def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ros2_memory.columns.plan import Array, NumberSequence, Run, Sequence, Text, Time
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Texts
+from ros2_memory.core.arrays import gathered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import SEQUENCE
 
@@ -34,11 +35,12 @@ _HEADER_BYTES: Final = 4
 _LITTLE_ENDIAN: Final = 0x0100
 """The first two bytes of the header of plain CDR in little endian, as a number in little endian."""
 _MAX_PADDING: Final = 3
-_EVERY_BYTE: Final = (1,)
+_UINT8: Final = np.dtype("u1")
+_UINT16: Final = np.dtype("<u2")
+_UINT32: Final = np.dtype("<u4")
 _LENGTH: Final = struct.Struct("<I")
 
 
-Row: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.generic[object]]]"
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
 
@@ -68,7 +70,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
         raise NotWalkedError
     walk = _Walk(batch.buffer)
     try:
-        if (walk.at("<u2", batch.starts) != _LITTLE_ENDIAN).any():
+        if (gathered(batch.buffer, _UINT16, batch.starts) != _LITTLE_ENDIAN).any():
             raise NotWalkedError
         level = Level(left_out=dict(plan.left_out))
         rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
@@ -105,13 +107,6 @@ def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
 class _Walk:
     buffer: bytes
 
-    def at(self, dtype: np.dtype[np.generic[object]] | str, places: IntArray) -> Row:
-        """Returns what lies at these places of the buffer, aligned or not."""
-        kind = np.dtype(dtype)
-        # A view with an element at every byte: indexing it gathers one field of all messages.
-        count = max(len(self.buffer) - kind.itemsize + 1, 0)
-        return np.ndarray(count, kind, self.buffer, 0, _EVERY_BYTE)[places]
-
     def read(self, plan: Plan, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
         """Goes through messages that begin at these positions; returns where they end.
 
@@ -137,8 +132,7 @@ class _Walk:
 
     def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
         columns = level.columns
-        # As bytes: field by field numpy gathers ten times as long.
-        block = self.at(f"V{run.dtype.itemsize}", places).view(run.dtype)
+        block = gathered(self.buffer, run.dtype, places)
         for nth, entry in enumerate(run.fields):
             if isinstance(entry, Array):
                 columns[f"{entry.path}.length"] = np.full(places.size, entry.length, np.uint32)
@@ -152,7 +146,7 @@ class _Walk:
                 columns[entry.path] = number != 0 if entry.is_bool else np.ascontiguousarray(number)
 
     def _length(self, rows: _Rows, at: IntArray) -> IntArray:
-        return self.at("<u4", rows.origins + at).astype(np.int64)
+        return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64)
 
     def _read_text(self, text: Text, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
         at = _aligned(at, text.align, text.skip)
@@ -162,7 +156,7 @@ class _Walk:
         # Zero behind each string, as rosbags demands.
         if (sizes < 1).any() or (end > rows.sizes).any():
             raise NotWalkedError
-        if self.at("u1", rows.origins + end - 1).any():
+        if gathered(self.buffer, _UINT8, rows.origins + end - 1).any():
             raise NotWalkedError
         if level is not None:
             level.columns[text.path] = self._texts(rows.origins + at, sizes - 1)
@@ -173,16 +167,12 @@ class _Walk:
         if not rows:
             return Texts(np.zeros(0, np.uint32), ())
         size = int(sizes[0])
-        words: list[bytes]
         if (sizes == size).all():
-            data = self.at(f"V{size}", places).tobytes() if size else b""
+            data = gathered(self.buffer, np.dtype(f"V{size}"), places).tobytes() if size else b""
             if data == data[:size] * rows:
                 return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
-            words = [data[begin : begin + size] for begin in range(0, len(data), size)]
-        else:
-            ends = (places + sizes).tolist()
-            buffer = self.buffer
-            words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
+        buffer, ends = self.buffer, (places + sizes).tolist()
+        words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
         known: dict[bytes, int] = {}
         codes = [known.setdefault(word, len(known)) for word in words]
         return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
@@ -212,9 +202,11 @@ class _Walk:
             return np.zeros(0, step.dtype)
         count = int(counts[0])
         if count and (counts == count).all():
-            data = self.at(f"V{count * step.size}", places).tobytes()
+            data = gathered(self.buffer, np.dtype(f"V{count * step.size}"), places).tobytes()
             return np.frombuffer(data, step.dtype)
-        return self.at(step.dtype, np.repeat(places, counts) + within(counts) * step.size)
+        return gathered(
+            self.buffer, step.dtype, np.repeat(places, counts) + within(counts) * step.size
+        )
 
     def _read_sequence(
         self, step: Sequence, rows: _Rows, at: IntArray, level: Level | None

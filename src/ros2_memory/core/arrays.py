@@ -15,11 +15,27 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
+Scalar = TypeVar("Scalar", bound="np.generic[object]")
 Ints: TypeAlias = NDArray[np.int64]
 
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 
 _MOST_KEYS: Final = 2**62
+_EVERY_BYTE: Final = (1,)
+
+
+def gathered(
+    buffer: bytes, dtype: np.dtype[Scalar], places: Ints
+) -> np.ndarray[tuple[int], np.dtype[Scalar]]:
+    """Returns what lies at some places of a buffer, aligned or not.
+
+    Raises:
+        IndexError: something ends behind the buffer.
+    """
+    # An element at every byte. As bytes: field by field a structure takes ten times as long.
+    count = max(len(buffer) - dtype.itemsize + 1, 0)
+    elements = np.ndarray(count, f"V{dtype.itemsize}", buffer, 0, _EVERY_BYTE)
+    return elements[places].view(dtype)
 
 
 def row_sums(rows: NDArray[np.float64]) -> Floats:

@@ -319,11 +319,11 @@ class CandidateRows:
 
     def _candidates(self, rows: Rows) -> IntArray:
         self.has_looked = True
-        truth = self._test.truth(rows.table)
-        if truth.is_none:
+        found = self._test.truth(rows.table)
+        if found.is_none:
             self.ruled_out = True
             return np.empty(0, np.int64)
-        may = truth.met | truth.unsure
+        may = found.perhaps
         if rows.index is not None:
             may = may[rows.index]
         self.ruled_out |= not may.all()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
+from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import Elapsed
@@ -144,7 +144,7 @@ def _standstills_in(
         InvalidArgumentsError: a message of the topic carries no position.
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    stands = [*_stands(view, topic, window.widened(CONTEXT_NS))][::-1]
+    stands = [one for _, one in _stands(view, topic, window.widened(CONTEXT_NS))][::-1]
     found = standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
@@ -166,21 +166,22 @@ def _standstills_in(
     return standstills, drops
 
 
-def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[Stands]:
-    """Yields what shows where the robot stood in slices of its poses, the newest first."""
+def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:
+    """Yields what shows where the robot stood; see `slices_by_poses`."""
 
     def make(some: PoseSlice) -> Stands:
         return stands_of(some.poses, some.start, some.stop)
 
-    for _, stands in slices_by_poses(
-        view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS
-    ):
-        yield stands
+    return slices_by_poses(view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS)
 
 
-def make_drive(view: View, window: TimeWindow) -> None:
-    """Makes the slices of the path in a window, and of where the robot stood."""
+def drive_made(view: View, window: TimeWindow) -> Iterator[Ns]:
+    """Makes the slices of the path in a window, and of where the robot stood, the newest first.
+
+    Yields the log time (ns) of each.
+    """
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)
-        deque(slices_of_path(view, topic, window.widened(SLICE_NS), []), maxlen=0)
-        deque(_stands(view, topic, window.widened(SLICE_NS + BESIDE_NS)), maxlen=0)
+        path = slices_of_path(view, topic, window.widened(SLICE_NS), [])
+        stands = _stands(view, topic, window.widened(SLICE_NS + BESIDE_NS))
+        yield from merge((at for at, _ in path), (at for at, _ in stands), reverse=True)

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.columns.shown import nowhere
 from ros2_memory.columns.stored import StoredTable, joined_stored
-from ros2_memory.columns.truth import ColumnCondition, Truth
+from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.columns.shown import Kept
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
@@ -149,16 +151,16 @@ class Matching:
     def _block(self, topic: str, parts: Sequence[Rows], window: TimeWindow) -> Block:
         stored = [rows.table for rows in parts if isinstance(rows.table, StoredTable)]
         table = parts[0].table if len(parts) == 1 else joined_stored(stored)
-        truth = self._test.truth(table) if parts[0].may_match else Truth(len(table))
+        truth = self._test.truth(table) if parts[0].may_match else nowhere(len(table))
         self.ruled_out |= truth.is_none
         first, last = max(parts[0].first, window.start), min(parts[-1].last, window.stop - 1)
         tested = partial(self._tested, topic, parts, truth)
         return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
-    def _tested(self, topic: str, parts: Sequence[Rows], truth: Truth) -> Tested:
+    def _tested(self, topic: str, parts: Sequence[Rows], truth: Kept) -> Tested:
         counting = np.concatenate([rows.mask() for rows in parts])
-        met, unsure = truth.met[counting], truth.unsure[counting]
-        self.ruled_out |= not (met | unsure).all()
+        met, unsure = truth.surely[counting], truth.unsure[counting]
+        self.ruled_out |= not truth.perhaps[counting].all()
         times, found = np.concatenate([rows.times for rows in parts]), met.astype(np.uint8)
         sources = self._sources(topic, parts)
         undecided = np.flatnonzero(unsure)

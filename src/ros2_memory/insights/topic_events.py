@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import deque
+from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -66,6 +66,13 @@ def events_back(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
+    return (events for _, events in _timed_back(view, topic, window, reached))
+
+
+def _timed_back(
+    view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
+) -> Iterator[tuple[Ns, TopicEvents]]:
+    """Yields the same, each with a log time (ns) that none of it is earlier than."""
     columns = StatedColumns(view.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
 
@@ -78,19 +85,20 @@ def events_back(
             if stretch.window.contains(first) and is_wanted:
                 yield first, _events(view, columns, together)
 
-    for _, events in joined_back(view, opened, EVENTS, make):
-        yield events
+    return joined_back(view, opened, EVENTS, make)
 
 
-def make_events(view: View, window: TimeWindow, topics: Iterable[str]) -> None:
-    """Makes the events of the parts of some topics in a window.
+def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterator[Ns]:
+    """Makes the events of the parts of some topics in a window, the newest first.
+
+    Yields a log time (ns) of each.
 
     Raises:
-        QueryTimeoutError: the deadline has passed.
+        QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    for topic in topics:
-        # What a part has before or after is of it all the same.
-        deque(events_back(view, topic, window.widened(PART_NS)), maxlen=0)
+    # What a part has before or after is of it all the same.
+    every = [_timed_back(view, topic, window.widened(PART_NS)) for topic in topics]
+    yield from merge(*((at for at, _ in events) for events in every), reverse=True)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:

@@ -7,6 +7,7 @@ shown begin and end at poses.
 from __future__ import annotations
 
 from contextlib import suppress
+from heapq import merge
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -94,12 +95,15 @@ def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
     return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
 
 
-def make_tracks(view: View, window: TimeWindow) -> None:
-    """Makes what the parts in a window say of where the robot was in the frames of places."""
+def tracks_made(view: View, window: TimeWindow) -> Iterator[Ns]:
+    """Makes what the parts in a window say of where the robot was in the frames of places.
+
+    Yields a log time (ns) of each, the newest first.
+    """
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_path_topic(view)
-        for frame in map_placement(view, topic).frames:
-            RobotTracks(view, frame).make(window)
+        frames = map_placement(view, topic).frames
+        yield from merge(*(RobotTracks(view, one).made(window) for one in frames), reverse=True)
 
 
 def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:

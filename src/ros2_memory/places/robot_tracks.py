@@ -7,7 +7,7 @@ not change any more are remembered, so a week is asked again in a tenth of a sec
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict, deque
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -173,14 +173,16 @@ class RobotTracks:
         tracks = tuple(joined_track(parts, fastest) for parts in others)
         return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
 
-    def make(self, window: TimeWindow) -> None:
-        """Makes the tracks of those in a window and beside it.
+    def made(self, window: TimeWindow) -> Iterator[Ns]:
+        """Makes the tracks of parts in a window and beside it, the newest first.
+
+        Yields a log time (ns) of each.
 
         Raises:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out.
         """
-        deque(self._parts(window.widened(2 * PART_NS), Deadline.never()), maxlen=0)
+        return (at for at, _ in self._parts(window.widened(2 * PART_NS), Deadline.never()))
 
     def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Ns, TrackPart]]:
         """Yields the track, the newest first, each part with a time that it is not earlier than."""

@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 import subprocess
 import time
+from collections import deque
 from contextlib import suppress
 from functools import partial
+from heapq import merge
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import anyio
@@ -27,9 +29,9 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import make_statics
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
-from ros2_memory.insights.drive import make_drive
-from ros2_memory.insights.topic_events import make_events
-from ros2_memory.places.region_visits import make_tracks
+from ros2_memory.insights.drive import drive_made
+from ros2_memory.insights.topic_events import events_made
+from ros2_memory.places.region_visits import tracks_made
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
@@ -196,11 +198,16 @@ def make_fragments(
         try:
             view = View(memory, Call(stored=True))
             make_statics(view, window)
-            make_drive(view, window)
-            make_tracks(view, window)
-            make_events(view, window, topics_with_changes(view))
+            made = [
+                drive_made(view, window),
+                tracks_made(view, window),
+                events_made(view, window, topics_with_changes(view)),
+            ]
             if nth < len(pieces):
-                Watching(view).make(window)
+                made.append(Watching(view).made(window))
+            # Each goes back in time as far as the others: what they read is still remembered.
+            deque(merge(*made, reverse=True), maxlen=0)
+            if nth < len(pieces):
                 memory.columns.make_outlines(view.timeline, window)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))

@@ -203,15 +203,18 @@ class Watching:
             if found := self._unpacked(around.window.start, sessions, self._known(around)):
                 yield found
 
-    def make(self, window: TimeWindow) -> None:
+    def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the sights that follow from the parts of a window; those of others are left out.
 
+        Yields the log time (ns) of each, the newest first.
+
         Raises:
-            QueryTimeoutError: the deadline has passed.
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         for around in self._stretches_in(window.widened(SIGHTS_NS)):
             if around.parts is not None:
                 self._known(around)
+            yield around.window.start
 
     def _stretches_in(self, window: TimeWindow) -> Iterator[_Around]:
         """Yields the stretches of a window in which there may be messages, the newest first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.table import Elements, Table, Texts, joined
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.shared_bags import BAGS, needs_real
 
@@ -77,7 +79,7 @@ def part(*given: Table) -> StoredTable:
 
     topic = Topic(CHANNEL, Layout.from_json(layout.to_json()))
     messages = sum(map(len, given))
-    return part_table(topic, packed, load, messages=messages)
+    return part_table(topic, packed.get, load, messages=messages)
 
 
 def differences(column: Column, back: Column) -> float:
@@ -170,6 +172,29 @@ def test_columns_are_unpacked_once_by_whoever_asks_first() -> None:
     for path, column in found[0].items():
         assert all(differences(column, other[path]) == 0.0 for other in found)
     assert back.columns["speed"] is back.columns["speed"]
+
+
+def test_what_is_made_of_a_part_is_made_once() -> None:
+    made: list[int] = []
+
+    def rows(of: Table) -> int:
+        def make() -> int:
+            made.append(len(of))
+            return len(of)
+
+        return of.remember("rows", make, lambda _: 100)
+
+    memory: ByteLru[object] = ByteLru(250)
+    one = replace(part(table(20)), memory=memory, number=1)
+    other = replace(part(table(30)), memory=memory, number=2)
+    assert [rows(one), rows(one), rows(other), rows(other)] == [20, 20, 30, 30]
+    assert made == [20, 30]
+    memory.put("more", "", 100)
+    assert rows(one) == 20
+    assert made == [20, 30, 20], "it was dropped for something else"
+    plain = table(20)
+    assert rows(plain) == rows(plain) == 20
+    assert made[3:] == [20, 20], "a table that is not stored remembers nothing"
 
 
 @needs_real

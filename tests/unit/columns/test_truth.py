@@ -28,8 +28,8 @@ from tests.unit.columns.drawn_tables import (
 )
 
 if TYPE_CHECKING:
+    from ros2_memory.columns.shown import Kept
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.truth import Truth
     from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()
@@ -49,12 +49,12 @@ PLAIN = (
 RANDOM = st.randoms(use_true_random=False)
 
 
-def compared(found: Truth, condition: Condition, values: list[JsonValue]) -> int:
+def compared(found: Kept, condition: Condition, values: list[JsonValue]) -> int:
     """Checks what is settled; returns how many rows are not."""
     expected = np.array([condition.matches(value) for value in values])
-    assert not (found.met & found.unsure).any()
-    assert found.is_none == (not (found.met | found.unsure).any())
-    wrong = np.flatnonzero((found.met != expected) & ~found.unsure)
+    assert not (found.surely & found.unsure).any()
+    assert found.is_none == (not (found.surely | found.unsure).any())
+    wrong = np.flatnonzero((found.surely != expected) & ~found.unsure)
     assert not wrong.size, (condition, values[wrong[0]])
     return int(found.unsure.sum())
 
@@ -140,7 +140,7 @@ def detections(*scored: tuple[str, float]) -> object:
 def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
     found = ColumnCondition(condition, EXTRACTOR).truth(drawn_of(type_name, messages).table)
     assert not found.unsure.any()
-    return [bool(each) for each in found.met]
+    return [bool(each) for each in found.surely]
 
 
 @pytest.mark.parametrize(
@@ -265,14 +265,14 @@ def test_a_column_that_its_zone_rules_out_is_not_unpacked(condition: Condition) 
     found = ColumnCondition(condition, EXTRACTOR).truth(table)
     assert found.is_none
     assert not table.unpacked
-    assert not found.met.any()
+    assert not found.surely.any()
     assert not found.unsure.any()
-    assert found.met.size == found.unsure.size == 2
+    assert found.surely.size == found.unsure.size == 2
 
 
 def test_only_the_columns_that_may_match_are_unpacked() -> None:
     table = stored(drawn_of(VISION, [detections(("cup", 0.9))]).table, 0.0)
-    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).met.tolist() == [
+    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).surely.tolist() == [
         True
     ]
     assert table.unpacked == {"detections.label"}
@@ -283,7 +283,7 @@ def test_a_limit_within_the_error_of_a_number_is_unsure() -> None:
     drawn = drawn_of(kind, [make(kind, data=number) for number in (0.96, 1.04, 2.0)])
     table = stored(drawn.table, 0.1, zones=False)
     found = ColumnCondition(Condition(Beyond(1.01, above=True), "value"), EXTRACTOR).truth(table)
-    assert found.met.tolist() == [False, False, True]
+    assert found.surely.tolist() == [False, False, True]
     assert found.unsure.tolist() == [True, True, False]
 
 
@@ -293,7 +293,7 @@ def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
     scan.ranges = np.linspace(1, 2, 100, dtype=np.float32)  # type: ignore[attr-defined]
     table = drawn_of(kind, [scan]).table
     near = ColumnCondition(Condition(Beyond(1.5, above=False), "ranges"), EXTRACTOR).truth(table)
-    assert near.met.all()
+    assert near.surely.all()
     assert ColumnCondition(Condition(Equals(3), "ranges"), EXTRACTOR).truth(table).is_none
     assert ColumnCondition(Condition(Equals(1.5), "ranges"), EXTRACTOR).truth(table).unsure.all()
     assert (
@@ -305,8 +305,8 @@ def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
 
 def test_one_tester_answers_for_tables_of_several_types() -> None:
     tester = ColumnCondition(Condition(Contains("cup")), EXTRACTOR)
-    assert tester.truth(drawn_of(VISION, [detections(("cup", 1.0))]).table).met.all()
-    assert tester.truth(drawn_of(STRING, [make(STRING, data="Cup")]).table).met.all()
+    assert tester.truth(drawn_of(VISION, [detections(("cup", 1.0))]).table).surely.all()
+    assert tester.truth(drawn_of(STRING, [make(STRING, data="Cup")]).table).surely.all()
     assert tester.truth(drawn_of(VISION, [detections(("fork", 1.0))]).table).is_none
 
 

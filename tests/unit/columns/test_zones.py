@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from typing import TYPE_CHECKING
 
@@ -12,7 +13,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.store import ColumnStore
-from ros2_memory.columns.table import Zone
+from ros2_memory.columns.table import Zone, letters_of
 from ros2_memory.columns.zones import Zones
 from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import World, store_file
@@ -100,3 +101,9 @@ def test_known_files_are_the_bags_as_they_were_indexed(tmp_path: Path) -> None:
     indexed = {bag.file: bag for bag in world.memory.index.snapshot().bags}
     assert store.known_files(tmp_path) == indexed
     assert len(indexed) == 3
+
+
+@given(st.text(st.characters(codec="ascii")) | st.text())
+@example("".join(map(chr, range(128))))
+def test_rows_of_letters_are_those_of_unicode(text: str) -> None:
+    assert letters_of(text) == re.findall(r"[^\W\d_]+", text)

@@ -2,26 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from random import Random
+from shutil import copytree
 from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
 from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import write_mcap
 from tests.support.memories import memory_of, with_store
 from tests.support.moving_map import BEGIN, S, moving_map
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
     from ros2_memory.places.robot_tracks import JoinedTrack
+    from ros2_memory.storage.base import Batch
 
 MINUTES = 25
 UNPLACED = 300
@@ -67,3 +72,28 @@ def test_a_part_of_a_stored_track_is_as_one_that_is_made(bag_dir: Path) -> None:
         assert_same(track(stored, window), made)
         assert_same(track(most, window), made)
         assert (made.left_out > 0) == (first < UNPLACED and last > 0)
+
+
+class Unread(Rosbag2Reader):
+    """A reader of which no message may be asked."""
+
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        raise AssertionError(f"messages of {path} are read")
+
+
+def test_making_tracks_reads_no_bag_that_waits_to_be_stored(bag_dir: Path, tmp_path: Path) -> None:
+    bag_dir = copytree(bag_dir / "rec", tmp_path / "rec").parent
+    plain = memory_of(bag_dir)
+    store = with_store(plain, bag_dir, part=0.8).columns.store
+    most = replace(plain, columns=Scanner(store, bag_dir), reader=Unread())
+    window = TimeWindow(BEGIN, BEGIN + MINUTES * 60 * S)
+    assert [*RobotTracks(View(most, Call(stored=True)), "odom").made(window)]
+    with pytest.raises(AssertionError, match="are read"):
+        RobotTracks(View(most, Call()), "odom").over(window)

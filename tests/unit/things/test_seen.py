@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections import deque
 from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -55,7 +56,7 @@ def made_in(bag_dir: Path) -> World:
 
 def make(memory: Memory) -> None:
     assert memory.columns is not None
-    Watching(View(memory, Call())).make(EVERYTHING)
+    deque(Watching(View(memory, Call())).made(EVERYTHING), maxlen=0)
     memory.columns.write_fragments()
 
 

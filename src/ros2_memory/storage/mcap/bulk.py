@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.core.arrays import gathered
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
@@ -43,7 +44,9 @@ _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says
 _OUTSIDE: Final = "damaged: a chunk holds messages outside its stated times"
 _TWICE: Final = "damaged: a message index holds a message twice"
 
-_EVERY_BYTE: Final = (1,)
+_INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
+_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
+_UINT32: Final = np.dtype("<u4")
 _OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
 _INDEX: Final = np.dtype(
     [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
@@ -196,12 +199,12 @@ def _pairs(chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: IntArray) 
     at = stated["at"] - (behind - begins)[number]
     if at.min() < 0 or at.max() + _INDEX.itemsize > len(region):
         raise UnreadableError(_OTHER_INDEX)
-    heads = np.ndarray(len(region) - _INDEX.itemsize + 1, _INDEX, region, 0, _EVERY_BYTE)[at]
+    heads = gathered(region, _INDEX, at)
     sizes = heads["size"].astype(np.int64)
     after = at + _INDEX.itemsize + sizes
     order = np.argsort(at)
     if (
-        (heads["opcode"] != Opcode.MESSAGE_INDEX).any()
+        (heads["opcode"] != _INDEX_OPCODE).any()
         or (heads["channel"] != stated["channel"]).any()
         or (heads["length"] != sizes + 6).any()
         or (sizes % _PAIR.itemsize).any()
@@ -221,7 +224,7 @@ def _pairs(chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: IntArray) 
     before = np.cumsum(counts) - counts
     pairs_at = np.repeat(at[kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
     pairs_at += np.arange(total) * _PAIR.itemsize
-    pairs = np.ndarray(len(region) - _PAIR.itemsize + 1, _PAIR, region, 0, _EVERY_BYTE)[pairs_at]
+    pairs = gathered(region, _PAIR, pairs_at)
     times = np.ascontiguousarray(pairs["time"])
     chunk_of = np.repeat(number[kept], counts)
     starts = np.array([chunk.start for chunk in chunks])[chunk_of]
@@ -266,11 +269,10 @@ def batches_of(
         or len(buffer) < MESSAGE.size
     ):
         raise UnreadableError(NOT_THERE)
-    views = np.ndarray(len(buffer) - MESSAGE.size + 1, _MESSAGE, buffer, 0, _EVERY_BYTE)
-    heads = views[at]
+    heads = gathered(buffer, _MESSAGE, at)
     stops = at + RECORD.size + heads["length"]
     if (
-        (heads["opcode"] != Opcode.MESSAGE).any()
+        (heads["opcode"] != _MESSAGE_OPCODE).any()
         or (heads["channel"] != pairs.channels).any()
         or (heads["log_time"] != pairs.times).any()
         or (stops > end).any()
@@ -334,11 +336,11 @@ def batches_of_chunk(
     times, offsets = column
     if offsets.min() < 0 or int(offsets.max()) > len(data) - MESSAGE.size:
         raise UnreadableError(NOT_THERE)
-    heads = np.ndarray(len(data) - MESSAGE.size + 1, _MESSAGE, data, 0, _EVERY_BYTE)[offsets]
+    heads = gathered(data, _MESSAGE, offsets)
     numbers = heads["channel"]
     ends = offsets + RECORD.size + heads["length"]
     if (
-        (heads["opcode"] != Opcode.MESSAGE).any()
+        (heads["opcode"] != _MESSAGE_OPCODE).any()
         or (heads["log_time"] != times).any()
         or (heads["length"] < 0).any()
         or (ends > len(data)).any()
@@ -379,9 +381,8 @@ def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
     long = sizes >= len(FRAME_MAGIC)
     if not long.all():
         starts = starts[long]
-    views = np.ndarray(max(len(buffer) - 3, 0), "<u4", buffer, 0, _EVERY_BYTE)
     found = np.zeros(long.size, np.bool_)
-    found[long] = views[starts] == _MAGIC
+    found[long] = gathered(buffer, _UINT32, starts) == _MAGIC
     return found
 
 
