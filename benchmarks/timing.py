@@ -232,7 +232,7 @@ def in_short(reply: str) -> tuple[str, str]:
     notes = [str(note) for note in cast("list[JsonValue]", parsed.get("notes") or [])]
     trouble = "; ".join(note for note in notes if any(word in note for word in _PARTIAL))
     counts = parsed
-    if "columns" in parsed:
+    if isinstance(parsed.get("all"), list):  # of several robots each has one
         columns, cells = (cast("list[str]", parsed[name]) for name in ("columns", "all"))
         counts = dict(zip(columns[1:], cells, strict=True))
     name = next((name for name in _COUNTS if name in counts), "")

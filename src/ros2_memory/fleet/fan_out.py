@@ -89,10 +89,7 @@ class FanOut:
                 else:
                     continue
                 del running[name]
-                for stage, spent in [*own.stages.spent.items()]:
-                    call.stages.add(stage, spent)
-                call.used_active |= own.used_active
-                call.used_thinned |= own.used_thinned
+                _add_costs(own, call)
         return {robot.name: done[robot.name] for robot in robots}
 
     def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
@@ -108,6 +105,14 @@ class FanOut:
             )
         self._is_done.pop(robot.name, None)
         return None
+
+
+def _add_costs(own: Call, call: Call) -> None:
+    """Adds what a robot's answer took to what the whole call did."""
+    for stage, spent in [*own.stages.spent.items()]:
+        call.stages.add(stage, spent)
+    call.used_active |= own.used_active
+    call.used_thinned |= own.used_thinned
 
 
 def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:

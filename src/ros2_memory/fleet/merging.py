@@ -233,43 +233,33 @@ def _rest(
         if key in _LEFT_OUT:
             continue
         own = {name: value[key] for name, value in values.items() if key in value}
-        how = rule.merging.get(key)
-        if how == "who":
-            found[key] = [name for name, is_so in own.items() if is_so]
-        elif how == "counted":
-            found[key] = _added(own.values())
-        elif how in {"earliest", "newest"}:
-            numbers = [_number(own[name]) for name in dated if own.get(name) is not None]
-            found[key] = (min if how == "earliest" else max)(numbers, default=None)
-        elif how != "added" and key != AT_LEAST and _agree(own, len(values)):
-            found[key] = next(iter(own.values()))
-        else:
-            if how == "added" or key == AT_LEAST:
-                found |= _summed(key, own.values(), values.values())
-            for name, value in own.items():
-                by_robot.setdefault(name, {})[key] = value
+        match rule.merging.get(key, "added" if key == AT_LEAST else ""):
+            case "who":
+                found[key] = [name for name, is_so in own.items() if is_so]
+            case "counted":
+                sums: Counter[str] = Counter()
+                for counts in own.values():
+                    sums.update(counts if isinstance(counts, dict) else {})
+                found[key] = dict(sums.most_common())
+            case ("earliest" | "newest") as how:
+                numbers = [_number(own[name]) for name in dated if own.get(name) is not None]
+                found[key] = (min if how == "earliest" else max)(numbers, default=None)
+            case "" if len(own) == len(values) and len({*map(to_json_text, own.values())}) == 1:
+                found[key] = next(iter(own.values()))
+            case how:
+                if how == "added":
+                    found |= _summed(key, own.values(), [*values.values()])
+                for name, value in own.items():
+                    by_robot.setdefault(name, {})[key] = value
     return {**found, "by_robot": {**by_robot}} if by_robot else found
 
 
-def _agree(own: Mapping[str, JsonValue], robots: int) -> bool:
-    return len(own) == robots and len({to_json_text(value) for value in own.values()}) == 1
-
-
-def _summed(key: str, own: Iterable[JsonValue], values: Iterable[JsonObject]) -> JsonObject:
+def _summed(key: str, own: Iterable[JsonValue], values: Sequence[JsonObject]) -> JsonObject:
     """Returns a key with its sum; no total where a robot has not counted all, but at least."""
-    values = [*values]
     if key == _TOTAL and any(AT_LEAST in value for value in values):
         return {}
     others = [value.get(_TOTAL) for value in values] if key == AT_LEAST else []
     return {key: round(sum(map(_number, (*own, *others))), 2)}
-
-
-def _added(objects: Iterable[JsonValue]) -> JsonObject:
-    sums: Counter[str] = Counter()
-    for counts in objects:
-        for key, count in counts.items() if isinstance(counts, dict) else ():
-            sums[key] += count if isinstance(count, int) else 0
-    return dict(sums.most_common())
 
 
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:

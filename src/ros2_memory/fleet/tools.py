@@ -6,6 +6,7 @@ several, their replies become one (`merging`), and what keeps a robot from answe
 
 from __future__ import annotations
 
+import threading
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -18,8 +19,16 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     RefusedError,
 )
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_rounded_up
+from ros2_memory.core.timebase import (
+    MAX_NS,
+    MIN_NS,
+    NS_PER_S,
+    Ns,
+    ns_from_unix,
+    unix_rounded_up,
+)
 from ros2_memory.fleet.fan_out import AT_ONCE, FanOut
 from ros2_memory.fleet.merging import (
     ANSWER_FOR_ALL,
@@ -33,13 +42,12 @@ from ros2_memory.fleet.merging import (
     reason_of,
     shipped_to,
 )
-from ros2_memory.fleet.page import Page
 from ros2_memory.fleet.robots import Robot, StoppedClock, names_of
 from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.fleet.robots import Fleet, FromLake
@@ -65,6 +73,10 @@ OF_LAKE: Final = frozenset(
 """The tools that ask a lake first, where there is one."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 """Tools whose reply says itself that a bag directory is missing."""
+
+
+_SHOWN_NS: Final[Ns] = NS_PER_S // 1000
+"""Rows are put in order by times as replies show them, in milliseconds."""
 
 
 def fleet_tools(
@@ -181,7 +193,7 @@ class _FleetQuestion:
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
         limit, oldest_first = self._limit(), given.get("oldest_first") is True
-        page = Page(limit, oldest_first=oldest_first)
+        page = _Page(limit, oldest_first=oldest_first)
         found = self.fan_out.ask(robots, partial(self._reply, now, page), call)
         replies = [reply for reply in found.values() if isinstance(reply, RobotReply)]
         errors = {name: error for name, error in found.items() if isinstance(error, EpisodicError)}
@@ -198,7 +210,7 @@ class _FleetQuestion:
             )
         )
 
-    def _reply(self, now: StoppedClock, page: Page, robot: Robot, call: Call) -> RobotReply:
+    def _reply(self, now: StoppedClock, page: _Page, robot: Robot, call: Call) -> RobotReply:
         """Returns a robot's reply; runs in a thread of its own.
 
         Raises:
@@ -235,6 +247,35 @@ class _FleetQuestion:
         given = self.given.get("limit")
         limit = default if given is None else given
         return int(limit) if isinstance(limit, int | float) else None
+
+
+class _Page:
+    """The `limit` rows that come first, of the rows of robots that answered so far. Thread-safe.
+
+    The newest rows come first, or the oldest.
+    """
+
+    def __init__(self, limit: int | None, *, oldest_first: bool) -> None:
+        self._limit = limit
+        self._oldest_first = oldest_first
+        self._lock = threading.Lock()
+        self._times: list[Ns] = []
+
+    def add(self, times: Iterable[Ns]) -> None:
+        """Adds the times of a robot's rows."""
+        with self._lock:
+            self._times = sorted((*self._times, *times), reverse=not self._oldest_first)
+            del self._times[self._limit :]
+
+    def window(self) -> TimeWindow | None:
+        """Returns where a row's time must lie for a place on the page; None while there is room."""
+        with self._lock:
+            if self._limit is None or len(self._times) < max(self._limit, 1):
+                return None
+            last = self._times[-1]
+        if self._oldest_first:
+            return TimeWindow(MIN_NS, last + _SHOWN_NS)
+        return TimeWindow(last - _SHOWN_NS, MAX_NS)
 
 
 def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None) -> Ns | None:

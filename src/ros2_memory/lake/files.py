@@ -178,7 +178,7 @@ class Lake:
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(file.location for file in files)
         found = DataFiles(TABLES[name].arrow_schema, locations, store)
-        return self._engine.select(sql, {name: found}, parameters or {})
+        return self._engine.select(sql, name, found, parameters or {})
 
     def _days(self, name: str) -> Mapping[str, Days]:
         with self._looking():

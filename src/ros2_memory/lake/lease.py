@@ -1,10 +1,11 @@
 """One writer for one lake: a lock that the system releases when its holder dies, and a lease.
 
 A commit of pyiceberg compares and swaps, so two writers would not lose a bag, nor have it twice.
-But each would delete files that the other is about to commit, and only one knows what was
-forgotten. So there is one: by a lock in the lake's state directory, on a file system that supports
-locks, and for those with another state directory by a lease in the warehouse, whose holder renews
-its term. A state directory that has it goes on at once, another one when the term is over.
+But only one knows what was forgotten, and with the SQLite catalogue of another state directory
+there would be a second lake in the same files. So there is one: by a lock in the lake's state
+directory, on a file system that supports locks, and for those with another state directory by a
+lease in the warehouse, whose holder renews its term. A state directory that has it goes on at once,
+another one when the term is over.
 """
 
 from __future__ import annotations

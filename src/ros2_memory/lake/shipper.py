@@ -290,12 +290,7 @@ class _OneRobot:
                 is_again = before is not None and robot.is_moment(bag)
                 if seen.bag_id in ids or is_again:
                     continue
-                if seen.is_forgotten is None:
-                    seen.is_forgotten = any(
-                        tombstone.forbids(robot.memory.reader, robot.name, bag, seen.bag_id)
-                        for tombstone in tombstones
-                    )
-                if seen.is_forgotten:
+                if self._is_forgotten(bag, seen, tombstones):
                     done.problems.append(
                         f"{robot.name}: {bag.file} has messages that were forgotten in the lake; "
                         "it is not shipped: delete it, or the messages, with ros2-memory forget"
@@ -387,6 +382,15 @@ class _OneRobot:
             seen = _Seen(state, bag_id_of(self.robot.name, bag, summary.start))
             self._seen[bag.file] = seen
         return seen
+
+    def _is_forgotten(self, bag: BagFile, seen: _Seen, tombstones: Collection[Tombstone]) -> bool:
+        """Returns whether a bag has a message that was forgotten; it is read for that once."""
+        if seen.is_forgotten is None:
+            reader, name = self.robot.memory.reader, self.robot.name
+            seen.is_forgotten = any(
+                tombstone.forbids(reader, name, bag, seen.bag_id) for tombstone in tombstones
+            )
+        return seen.is_forgotten
 
     def _described(self, bag: BagFile, bag_id: str, before: ShippedBag | None) -> ShippedBag:
         """Returns what a bag would be known as."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from datetime import date, timedelta
 from pathlib import Path
 
@@ -32,10 +32,9 @@ class WatchedEngine(LakeEngine):
         self._engine = engine
         self.read: set[str] = set()
 
-    def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
-        for files in tables.values():
-            self.read.update(files.locations)
-        return self._engine.select(sql, tables, parameters)
+    def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
+        self.read.update(files.locations)
+        return self._engine.select(sql, table, files, parameters)
 
     def days(self) -> set[date]:
         """The days of the files that were read since it was last asked."""
@@ -151,9 +150,9 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     found: list[BagSummary] = []
     select = shipping.engine.select
 
-    def selected(sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
+    def selected(sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
         found.append(robot.reader.summarize(bag.path))
-        return select(sql, tables, parameters)
+        return select(sql, table, files, parameters)
 
     monkeypatch.setattr(shipping.engine, "select", selected)
     assert len(index.snapshot(older * NS_PER_S).bags) == 3

@@ -20,6 +20,7 @@ from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
+from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
@@ -175,25 +176,6 @@ def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(
         fleet.named("cellar", limited)
 
 
-async def test_a_server_looks_at_what_was_shipped_before_it_is_asked(tmp_path: Path) -> None:
-    for name in ("hall", "attic"):
-        write_bag(tmp_path / name, 0)
-    ship_from(tmp_path, "hall", "attic")
-    fleet = served(tmp_path)
-    robots = [*fleet.robots.values()]
-    indexes = [each.lake.index for each in robots if each.lake is not None]
-    assert [each.published for each in indexes] == [None, None]
-    with anyio.fail_after(60):
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_fleet_fresh, fleet, 1.0)
-            while any(each.published is None for each in indexes):
-                await anyio.sleep(0.01)
-            tasks.cancel_scope.cancel()
-    assert [each.published.latest for each in indexes if each.published] == [
-        each.memory().index.snapshot().latest for each in robots
-    ]
-
-
 def test_a_robot_that_is_first_shipped_later_is_known_when_it_is_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -211,17 +193,26 @@ def test_a_robot_that_is_first_shipped_later_is_known_when_it_is_asked_for(
         fleet.named("garden", Call())
 
 
-async def test_a_server_looks_for_robots_that_are_first_shipped_later(
+async def test_a_server_looks_at_what_was_shipped_before_it_is_asked_and_for_later_robots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
     fleet = _with_a_later_robot(tmp_path)
+
+    def published() -> list[Snapshot | None]:
+        lakes = [robot.lake for robot in fleet.robots.values() if robot.lake is not None]
+        return [lake.index.published for lake in lakes]
+
+    assert published() == [None, None]
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(keep_fleet_fresh, fleet, 1.0, 0.01)
-            while not (cellar := fleet.robots.get("cellar")) or not cellar.memory().index.published:
+            while "cellar" not in fleet.robots or None in published():
                 await anyio.sleep(0.01)
             tasks.cancel_scope.cancel()
+    robots = [robot.memory().index for robot in fleet.robots.values()]
+    latest = [index.snapshot().latest for index in robots]
+    assert [each.latest for each in published() if each is not None] == latest
 
 
 def _with_a_later_robot(folder: Path) -> Fleet:
@@ -241,7 +232,8 @@ def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:
     engine = engine_of(node)
     [row] = engine.select(
         "SELECT current_setting('memory_limit') AS memory, current_setting('threads') AS threads",
-        {"bags": DataFiles(TABLES["bags"].arrow_schema, (), {})},
+        "bags",
+        DataFiles(TABLES["bags"].arrow_schema, (), {}),
         {},
     ).to_pylist()
     engine.close()

@@ -84,7 +84,7 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(both: list[dict[st
 
 
 def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
-    tmp_path: Path,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     noise = Random(1).randbytes
     image = [Msg("/camera", "sensor_msgs/msg/Image", nth, noise(9_000)) for nth in (1, 2, 3)]
@@ -106,6 +106,9 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     }
     chosen = {row["topic"]: row for row in lake_rows(memory, bag, ("/camera",))["channels"]}
     assert chosen["/camera"]["has_payloads"]
+    # Of more than may be in memory the largest goes.
+    monkeypatch.setattr("ros2_memory.lake.rows._MOST_BYTES", 8_000)
+    assert not any(row["has_payloads"] for row in lake_rows(memory, bag)["channels"])
 
 
 def test_metres_of_a_bag_are_those_of_a_recap_of_it(

@@ -38,15 +38,15 @@ class LakeEngine(ABC):
     """Runs SQL over data files."""
 
     @abstractmethod
-    def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
-        """Returns the rows of one select.
+    def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
+        """Returns the rows of one select over some files of a table.
 
-        Its subset is what most engines take: no `WITH` and no `UNION`; joins, `IN`,
-        `GROUP BY` with count, sum, min and max, `LIMIT`, `ORDER BY`, or `DISTINCT` without it. The
-        tables it names are those given; a column that a file lacks is null there, and a table may
-        have no file at all. `$name` is the parameter of that name, whose text is never SQL; a list
-        is for `IN $name`. Integers come back as integers of any width, sums of them only where they
-        are cast to BIGINT. Without `ORDER BY` the rows are in no order.
+        Its subset is what every engine takes: `FROM` the table, with `WHERE`, comparisons and `IN`,
+        count, sum, min and max by `GROUP BY`, and `ORDER BY`. A column that a file lacks is null
+        there, and the table may have no file at all. `$name` is the parameter of that name, whose
+        text is never SQL; a list is for `IN $name`. Integers come back as integers of any width,
+        sums of them only where they are cast to BIGINT. Without `ORDER BY` the rows are in no
+        order.
 
         Raises:
             RefusedError: a file cannot be read, or the engine cannot be reached; the log has why.

@@ -14,8 +14,6 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.lake.engines.base import LakeEngine
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from ros2_memory.lake.engines.base import DataFiles, Parameters
 
 _SETTINGS: Final = {
@@ -24,8 +22,8 @@ _SETTINGS: Final = {
     "python_enable_replacements": "false",
 }
 _LOCAL: Final = (
-    " UNION ALL BY NAME SELECT * FROM"
-    " read_parquet(${}_files, union_by_name = true, hive_partitioning = false)"
+    " UNION ALL BY NAME"
+    " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
 )
 
 log = get_logger(__name__)
@@ -48,21 +46,18 @@ class DuckdbEngine(LakeEngine):
             settings["threads"] = str(threads)
         self._connection = duckdb.connect(config=settings)
 
-    def select(self, sql: str, tables: Mapping[str, DataFiles], parameters: Parameters) -> pa.Table:
-        """Runs the select in a cursor of its own, which alone knows the tables."""
-        sources: list[str] = []
+    def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
+        """Runs the select in a cursor of its own, which alone knows the table."""
         bound: dict[str, object] = {**parameters}
         try:
             with self._connection.cursor() as cursor:
-                for name, files in tables.items():
-                    source = f"SELECT * FROM {name}_rows"  # noqa: S608 - a table of the lake
-                    rows, local = _opened(files)
-                    cursor.register(f"{name}_rows", rows)
-                    if local:
-                        source += _LOCAL.format(name)
-                        bound[f"{name}_files"] = local
-                    sources.append(f"{name} AS ({source})")
-                query = f"WITH {', '.join(sources)} {sql}"
+                rows, local = _opened(files)
+                cursor.register("in_store", rows)
+                source = "SELECT * FROM in_store"
+                if local:
+                    source += _LOCAL
+                    bound["local"] = local
+                query = f"WITH {table} AS ({source}) {sql}"
                 return cursor.sql(query, params=bound).to_arrow_table()
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             # Its sentence alone: a traceback with variables would show the keys of a store.
