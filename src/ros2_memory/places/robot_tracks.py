@@ -20,9 +20,10 @@ from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
     RobotTrack,
     TrackPart,
-    joined_track,
+    joined_part,
     jumps,
     thinned,
+    track_by,
     track_part,
 )
 from ros2_memory.analysis.poses import headings
@@ -168,10 +169,10 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in found)
-        one, *others = _by_robot(found)
+        one, others = _by_robot(found)
         fastest = view.limits.max_plausible_speed_mps
-        tracks = tuple(joined_track(parts, fastest) for parts in others)
-        return JoinedTrack(joined_track(one, fastest), since, left_out, tracks)
+        tracks = tuple(track_by([part], fastest) for part in others)
+        return JoinedTrack(track_by(one, fastest), since, left_out, tracks)
 
     def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the tracks of parts in a window and beside it, the newest first.
@@ -487,59 +488,33 @@ class _Pieces(NamedTuple):
     stops: Times
 
 
-def _by_robot(found: Sequence[TrackPart]) -> list[list[TrackPart]]:
-    """Returns the parts of the track in order of time, and of others what lies beside it.
+def _by_robot(found: Sequence[TrackPart]) -> tuple[list[TrackPart], list[TrackPart]]:
+    """Returns what of each recording is in the track, and what of it lies beside that.
 
-    Where several recordings place a robot in a slice, that which began first is in the track; of
+    Where several recordings place a robot at a time, that which began first is in the track; of
     those that began at one time the first by name.
     """
-    parts = sorted(
-        (part for part in found[::-1] if len(part.times)),
-        key=lambda part: (int(part.times[0]), part.recording),
-    )
     by_recording: dict[str, list[TrackPart]] = defaultdict(list)
-    for part in parts:
-        by_recording[part.recording].append(part)
-    if len(by_recording) < 2:
-        return [parts]
-    others: list[list[TrackPart]] = []
+    for part in found[::-1]:
+        if len(part.times):
+            by_recording[part.recording].append(part)
+    recordings = [joined_part(parts) for parts in by_recording.values()]
+    recordings.sort(key=lambda part: (int(part.times[0]), part.recording))
     kept: list[TrackPart] = []
+    others: list[TrackPart] = []
     placed: list[_Pieces] = []
-    for own in by_recording.values():
-        times = np.sort(np.concatenate([part.times for part in own]))
-        # They are in the order of their first times: no later one reaches back to the others.
-        placed = [pieces for pieces in placed if pieces.stops[-1] >= times[0]]
-        taken = _slices_beside(times, placed)
-        is_beside = [np.isin(part.times // TRACK_SLICE_NS, taken) for part in own]
-        kept += [
-            part.some(np.flatnonzero(~beside)) if beside.any() else part
-            for part, beside in zip(own, is_beside, strict=True)
-        ]
-        if taken.size:
-            others.append(
-                [
-                    part.some(np.flatnonzero(beside))
-                    for part, beside in zip(own, is_beside, strict=True)
-                    if beside.any()
-                ]
-            )
-        placed.append(_Pieces(*pieces_of(times, times)))
-    return [kept, *others]
-
-
-def _slices_beside(times: Times, placed: Sequence[_Pieces]) -> Times:
-    """Returns the slices in which poses of some times, ascending, lie beside others.
-
-    Whole ones: which of their poses are vertices was decided by all of them.
-    """
-    slices, begin = np.unique(times // TRACK_SLICE_NS, return_index=True)
-    firsts, lasts = times[begin], times[np.append(begin[1:], len(times)) - 1]
-    is_beside = np.zeros(len(slices), np.bool_)
-    for pieces in placed:
-        nth = np.searchsorted(pieces.stops, firsts)
-        is_beside |= np.append(pieces.starts, MAX_NS)[nth] <= lasts
-    beside: Times = slices[is_beside]
-    return beside
+    for part in recordings:
+        # No later one reaches back to those that are over.
+        placed = [pieces for pieces in placed if pieces.stops[-1] >= part.times[0]]
+        is_beside = np.zeros(len(part.times), np.bool_)
+        for pieces in placed:
+            nth = np.searchsorted(pieces.starts, part.times, side="right") - 1
+            is_beside |= (nth >= 0) & (part.times <= pieces.stops[nth])
+        kept.append(part.some(np.flatnonzero(~is_beside)))
+        if is_beside.any():
+            others.append(part.some(np.flatnonzero(is_beside)))
+        placed.append(_Pieces(*pieces_of(part.times, part.times)))
+    return kept, others
 
 
 def _without_jumps(parts: Parts, every: Mask) -> Parts:

@@ -161,23 +161,16 @@ def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: in
 
 def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
     """Returns the track of poses in log-time order; those that are no place are left out."""
-    return joined_track([track_part(times, x, y, heading)])
+    return track_by([joined_part([track_part(times, x, y, heading)])])
 
 
-def joined_track(parts: Sequence[TrackPart], fastest_mps: float = math.inf) -> RobotTrack:
-    """Returns the track by the poses of several tables; of two of one time the first counts.
-
-    Those of each recording are joined first: its slices are its own.
-    """
-    by_recording: dict[str, list[TrackPart]] = {}
-    for part in parts:
-        by_recording.setdefault(part.recording, []).append(part)
-    if not by_recording:
+def track_by(recordings: Sequence[TrackPart], fastest_mps: float = math.inf) -> RobotTrack:
+    """Returns the track by the whole parts of recordings; of two of one time the first counts."""
+    if not recordings:
         return empty_track()
-    every = [_joined(own) for own in by_recording.values()]
-    of = np.repeat(np.arange(len(every)), [len(one.times) for one in every])
-    whole = united_parts(every)
-    if len(every) > 1:
+    of = np.repeat(np.arange(len(recordings)), [len(one.times) for one in recordings])
+    whole = united_parts(recordings)
+    if len(recordings) > 1:
         order = _in_time(whole.times)
         whole, of = whole.some(order), of[order]
     turns = _continuous(whole.turns, np.diff(of, prepend=-1) == 0)
@@ -186,8 +179,8 @@ def joined_track(parts: Sequence[TrackPart], fastest_mps: float = math.inf) -> R
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
-def _joined(parts: Sequence[TrackPart]) -> TrackPart:
-    """Returns the track by the poses of several tables of one recording."""
+def joined_part(parts: Sequence[TrackPart]) -> TrackPart:
+    """Returns the track by the poses of all tables of one recording, of which there is one."""
     whole = united_parts(parts)
     if len(parts) > 1:
         whole = whole.some(_in_time(whole.times))

@@ -17,8 +17,9 @@ from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     TrackPart,
     empty_track,
-    joined_track,
+    joined_part,
     thinned,
+    track_by,
     track_of,
     track_part,
 )
@@ -94,10 +95,10 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
         times, x, y, heading = some
         return track_part(times, x, y, heading)
 
-    whole = joined_track([part(0, 1500)])
+    whole = track_by([joined_part([part(0, 1500)])])
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
-    assert same(joined_track(parts), whole)
-    assert same(joined_track(parts[::-1]), whole)
+    assert same(track_by([joined_part(parts)]), whole)
+    assert same(track_by([joined_part(parts[::-1])]), whole)
 
 
 def test_turns_on_the_spot_add_up() -> None:
@@ -138,4 +139,4 @@ def test_poses_that_are_no_place_are_left_out() -> None:
 
 def test_without_a_pose_there_is_no_track() -> None:
     assert not len(empty_track().times)
-    assert not len(joined_track([]).times)
+    assert not len(track_by([]).times)
