@@ -411,7 +411,10 @@ class ColumnStore(Database):
     # Writing
 
     def put_fragments(self, kind: str, made: Sequence[tuple[FragmentKey, bytes]]) -> bool:
-        """Stores fragments; not those of a part that is not stored any more, nor any again."""
+        """Stores fragments in place of those of the same time, settings and some of the parts.
+
+        Not those of a part that is not stored any more, nor any again.
+        """
 
         def write(connection: sqlite3.Connection) -> None:
             for key, data in made:
@@ -425,6 +428,14 @@ class ColumnStore(Database):
                     (kind, key.settings, key.start, parts, data),
                 )
                 if cursor.rowcount > 0:
+                    # What followed before there were all of these parts is not asked for again.
+                    older = connection.execute(
+                        "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
+                        " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
+                        " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
+                        (kind, key.settings, key.start, cursor.lastrowid, parts),
+                    ).fetchall()
+                    connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
                     connection.execute(
                         "INSERT INTO fragment_part SELECT value, ? FROM json_each(?)",
                         (cursor.lastrowid, parts),

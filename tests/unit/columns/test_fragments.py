@@ -118,6 +118,27 @@ def test_a_fragment_of_other_parts_settings_or_days_is_another(world: World) -> 
     assert words_in(world.store, "else").get(FragmentKey(T0, "any", (part,))) is None
 
 
+def test_what_follows_from_more_parts_takes_the_place_of_what_followed_from_some(
+    tmp_path: Path,
+) -> None:
+    for number in range(3):
+        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(T0 + number * 60 * S, 0, 0)])
+    world = World.of(tmp_path)
+    world.fill_alone()
+    one, two, three = (head.number for head in world.store.parts("/odom"))
+    words = words_in(world.store)
+    others = FragmentKey(T0, "", (three,)), FragmentKey(T0, "other", (one,))
+    for key in (FragmentKey(T0, "", (one,)), *others, FragmentKey(T0, "", (one, two))):
+        words.put(key, Words(str(key.parts)))
+    words.write()
+    found = words_in(world.store)
+    assert found.get(FragmentKey(T0, "", (one,))) is None
+    for key in (*others, FragmentKey(T0, "", (one, two))):
+        stored = found.get(key)
+        assert stored is not None
+        assert stored.words == str(key.parts)
+
+
 def test_fragments_go_with_their_part(world: World, tmp_path: Path) -> None:
     assert fragments_in(store_file(tmp_path)) > 0
     for path in sorted(tmp_path.glob("rec/*.mcap")):
