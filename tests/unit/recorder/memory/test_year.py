@@ -9,6 +9,7 @@ import sys
 import time
 from itertools import pairwise
 from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,8 +23,6 @@ from tests.unit.recorder.memory.test_days import days_of, keep_all, messages_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     from ros2_memory.storage.base import Record
@@ -106,7 +105,7 @@ def test_a_year_of_a_home_robot_fits_a_gigabyte(tmp_path: Path) -> None:
         keep_all(days, tmp_path)
         path.unlink()
     written = [*sorted(tmp_path.glob("memory/*.thinned.mcap"))]
-    first = [shutil.copy(path, tmp_path / f"first_{path.name}.day") for path in written]
+    first = [Path(shutil.copy(path, tmp_path / f"first_{path.name}.day")) for path in written]
     size = sum(path.stat().st_size for path in first) / DAYS
     spent = [time.process_time() - begun]
     for day in range(DAYS, WHOLE):
