@@ -223,6 +223,7 @@ def _memory_days_of(
     limits = MemoryLimits(
         memory.texts,
         memory.labels,
+        memory.people,
         round(memory.max_share * settings.retention.max_total_gb * GB),
         ns_from_unix(memory.max_age_d * 86_400),
     )

@@ -340,12 +340,13 @@ class MemorySettings:
     """What stays of bags that retention deletes: nothing, unless `keep` is true.
 
     `texts` are names or globs of topics of which texts stay, too; `labels` are the labels of people
-    that stay. `max_share` is of `retention.max_total_gb`.
+    that stay, `people` are more words for people. `max_share` is of `retention.max_total_gb`.
     """
 
     keep: Flag
     texts: tuple[Text, ...]
     labels: tuple[Text, ...]
+    people: tuple[Text, ...]
     max_share: Annotated[float, Field(strict=True, gt=0, le=0.5)]
     max_age_d: Positive
 

@@ -485,6 +485,8 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
+    if snapshot.timeline.thinned:
+        view.notes.add("silences and steps of the clock within the days of memory/ are not known")
     view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
     undecodable = undecodable_topics(view)
     steps = clock_steps(view)

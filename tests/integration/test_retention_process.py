@@ -22,6 +22,7 @@ from mcp import Client
 from ros2_memory import queries
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.state_files import LEAVING, Leaving
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.history.context import Call, QuerySettings
@@ -389,6 +390,12 @@ def test_days_are_kept_by_the_recorder_and_go_with_the_setting(tmp_path: Path) -
         assert asked - 1.01 <= reply["timestamp"] <= asked
         moved_s = reply["timestamp"] - two_days_ago / NS_PER_S
         assert reply["x"] == pytest.approx(moved_s / 4, abs=0.005)
+        leaving = site.run()
+        [said] = leaving.wait_for("memory_leaves")
+        leaving.stop()
+        assert (said["days"], said["left_s"]) == (len(days), 86_400)
+        assert [*site.bag_dir.glob("memory/*.thinned.mcap")] == days
+        LEAVING.write(site.bag_dir, Leaving(0.0))  # the recorder has run for a day
         again = site.run()
         [deleted] = again.wait_for("memory_deleted")
         assert deleted["days"] == len(days)

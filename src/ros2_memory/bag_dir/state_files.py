@@ -5,6 +5,7 @@
     expired.json       the recorder: messages that `retention.topics` takes out of bags, likewise
     deleted.jsonl      the recorder: what retention deletes, so that nobody calls it lost
     superseded.json    the recorder: bags of which thinned days have what stays, for the index
+    leaving.json       the recorder: when `memory/` is deleted, since `memory.keep` is false
     shipped.jsonl      `ship`: which bags are in a lake, for retention
     forgotten.jsonl    `forget`: what is deleted here, for the lake that may have it
     erasing.json       `forget`: messages that are being taken out of bags
@@ -33,6 +34,7 @@ from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
     EXPIRED_FILE,
     FORGOTTEN_FILE,
+    LEAVING_FILE,
     LOST_FILE,
     RECORDED_FILE,
     SCREENED_FILE,
@@ -294,6 +296,35 @@ def _superseded(bag_dir: Path) -> Superseded | None:
 def read_superseded(bag_dir: Path) -> Superseded:
     """Returns the bags that no longer count; none where the file cannot be read."""
     return _superseded(bag_dir) or Superseded()
+
+
+# leaving.json
+
+
+@dataclass(frozen=True, slots=True)
+class Leaving:
+    """The days of `memory/` are deleted once the recorder has run for so much longer (s)."""
+
+    left_s: _Seconds
+
+
+LEAVING: Final = JsonDocument(LEAVING_FILE, Leaving)
+
+
+@until_changed(LEAVING_FILE)
+def _leaving(bag_dir: Path) -> Leaving | None:
+    return LEAVING.read(bag_dir)
+
+
+def describe_leaving(bag_dir: Path) -> str | None:
+    """Returns a sentence on when `memory/` is deleted; None where it is not to be."""
+    leaving = _leaving(bag_dir)
+    if leaving is None:
+        return None
+    return (
+        f"memory/ is deleted once the recorder has run for {leaving.left_s / 3600:.1f} h more, "
+        "since memory.keep is false: set it to true to keep it, or delete the folder at once"
+    )
 
 
 # shipped.jsonl

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import ERASING_FILE
+from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.doctor_lake import check_lake, check_shipping
@@ -221,6 +222,8 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
             yield warning(seen, f"{do}{max(free - limits.min_free_gb + used, 0):.1f}, or make room")
         else:
             yield ok(seen)
+    if leaving := describe_leaving(robot.memory.index.bag_dir):
+        yield warning(leaving, "memory.keep=true keeps it")
     if limits.max_total_gb < SMALL_BUDGET_GB:
         do = f"raise retention.max_total_gb to {SMALL_BUDGET_GB:g} or more"
         yield warning(small_budget(limits.max_total_gb), do)

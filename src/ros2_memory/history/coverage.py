@@ -37,7 +37,7 @@ from ros2_memory.core.bag_summary import (
     READ_WITHOUT_INDEXES,
 )
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import united, without
+from ros2_memory.core.spans import overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -111,7 +111,7 @@ def note_unread(
 def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on days of a window of which only some messages stayed, if there are."""
     days = [bag for bag in snapshot.timeline.thinned if window.overlaps(bag.start, bag.end)]
-    if days:
+    if days and overlaps_any(snapshot.timeline.thinned_times, window.start, window.stop - 1):
         span = f"{unix_text(days[0].start)} to {unix_text(max(bag.end for bag in days))}"
         yield (
             f"of {counted(len(days), 'day')} in {span} only some messages stayed: all that a topic "

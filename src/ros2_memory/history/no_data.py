@@ -14,6 +14,7 @@ from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import (
     MAX_NS,
@@ -356,8 +357,8 @@ def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bo
 
 def _is_thinned(view: View, window: TimeWindow) -> bool:
     """Whether of some time of a window only some messages stayed, and something was recorded."""
-    days = view.snapshot.timeline.thinned
-    return any(window.overlaps(day.start, day.end) for day in days) and not view.gaps(window)
+    times = view.snapshot.timeline.thinned_times
+    return overlaps_any(times, window.start, window.stop - 1) and not view.gaps(window)
 
 
 def _within_recording(

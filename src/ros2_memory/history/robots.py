@@ -13,7 +13,7 @@ from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.layout import has_own_name, is_kept_apart
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, has_own_name, is_kept_apart
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagState, TimeWindow
@@ -368,7 +368,12 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[B
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
-    spans = [(*span, path) for path, span in view.timeline.recordings(topic).items()]
+    # A thinned day lies around what moments and rules have of it.
+    spans = [
+        (*span, path)
+        for path, span in view.timeline.recordings(topic).items()
+        if path != view.bag_dir / MEMORY_FOLDER
+    ]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
         open_spans = [each for each in open_spans if each[1] >= first]
         for since, until, other in open_spans:

@@ -17,6 +17,7 @@ from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     MAX_NS,
@@ -113,9 +114,9 @@ class View:
 
     def note_thinned(self, window: TimeWindow) -> None:
         """Records that what was read lies in a window, where that is partly in thinned days."""
-        for day in self.timeline.thinned:
-            if window.overlaps(day.start, day.end):
-                self.call.note_thinned(max(window.start, day.start), min(window.stop - 1, day.end))
+        part = window if self.call.asked is None else window.intersect(self.call.asked)
+        if not part.empty and overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1):
+            self.call.used_thinned = True
 
     def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.layout import BAG_KINDS, MOMENTS_FOLDER
+from ros2_memory.bag_dir.layout import BAG_KINDS, MOMENTS_FOLDER, is_thinned
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -195,8 +195,8 @@ class Overlapping(NamedTuple):
 def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
     """Returns the pairs of recordings that overlap and that no handover joins, in order of time.
 
-    Bags that a wrong clock dated are left out. Those in a saved moment count with the recording
-    that they were saved from.
+    Thinned days and bags that a wrong clock dated are left out. Those in a saved moment count with
+    the recording that they were saved from.
     """
     overlaps = snapshot.timeline.memo.of(_OVERLAPS, partial(_long_overlaps, snapshot))
     return tuple(each for each in overlaps if not _took_over(each))
@@ -221,7 +221,7 @@ def _sweep(
     pairs: dict[tuple[str, str], tuple[Ns, Ns, Ns]] = {}
     reach: dict[str, Ns] = {}
     for bag in snapshot.bags:
-        if bag.file in left_out:
+        if bag.file in left_out or is_thinned(bag.file):
             continue
         own, start, end = loose.get(bag.file) or folder_of(bag), bag.start, bag.end
         if _IN_MOMENTS in own:

@@ -14,10 +14,11 @@ from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
-from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_thinned
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import Spans, overlap_spans, united
+from ros2_memory.core.spans import Spans, overlap_spans, united, without
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.segment import (
     Pace,
     Segment,
@@ -36,7 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
@@ -163,6 +163,17 @@ class Timeline:
             if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in part.folders)
         ]
         return tuple(bag for part in parts for bag in part.bags if is_thinned(bag.file))
+
+    @cached_property
+    def thinned_times(self) -> Spans:
+        """The times of which a thinned day has some messages, and no other bag has all."""
+        days = united((day.start, day.end + 1) for day in self.thinned)
+        if not days:
+            return days
+        around = self.overlapping(TimeWindow(days[0][0], days[-1][1]))
+        whole = [bag for bag in around if not is_thinned(bag.file) and not is_carried(bag.file)]
+        # Between the bags of a moment nothing is missing.
+        return without(days, united([(bag.start, bag.end + 1) for bag in whole], NS_PER_S))
 
     @property
     def disk_use(self) -> tuple[int, int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.core.model import BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -105,7 +106,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         ),
         notes=(
             *view.notes.sentences(),
-            *filter(None, notes),
+            *filter(None, (*notes, describe_leaving(memory.index.bag_dir))),
             *mixed,
             *describe_excluded(memory.index.bag_dir, TimeWindow.everything()),
         ),

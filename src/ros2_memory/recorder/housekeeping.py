@@ -186,8 +186,14 @@ class Housekeeping(Housekeeper):
             is_unfinished = not size_of(directory / METADATA_FILE)
             if is_own and (directory in named or is_unfinished):
                 self._repair_recording(directory)
-        if self._memory is not None and not self._memory.keeps:
-            self._memory.clear()
+        self._clear_memory()
+
+    def _clear_memory(self) -> None:
+        try:
+            if self._memory is not None:
+                self._memory.clear()
+        except OSError as error:
+            _log.error("memory_not_limited", reason=error.strerror or str(error))
 
     def make_room(self, free_bytes_wanted: int) -> None:
         """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
@@ -284,6 +290,7 @@ class Housekeeping(Housekeeper):
     def _apply(self, free_bytes_wanted: int | None = None) -> None:
         begun = time.perf_counter_ns()
         self._update_moments()
+        self._clear_memory()
         before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
         self._collected = collected
         limit = f"{self._max_age_h:g} h"

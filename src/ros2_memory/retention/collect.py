@@ -141,7 +141,7 @@ class Outliving(Protocol):
         """
 
     def clear(self) -> None:
-        """Deletes all.
+        """Deletes all where nothing is to stay, some time after the first call.
 
         Raises:
             OSError: it cannot be deleted.

@@ -270,11 +270,11 @@ def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]
     hours: dict[Ns, list[StoredBag]] = {}
     for bag in stock.bags:
         if bag.path not in stays or bag.path in going:
-            date = bag.end if bag.has_dates else bag.written
-            hours.setdefault(date // HOUR_NS, []).append(bag)
+            hours.setdefault(bag.date // HOUR_NS, []).append(bag)
     last = next((bag.end // HOUR_NS for bag in stock.bags if bag.path == plan.newest), None)
     found: list[StoredBag] = []
     for hour, bags in sorted(hours.items()):
+        bags.sort(key=attrgetter("date"))
         inside = [bag for bag in bags if bag.path in going]
         if all(bag.path in plan.aged for bag in inside):
             found += inside if len(inside) == len(bags) else ()

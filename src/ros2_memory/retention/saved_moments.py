@@ -38,6 +38,7 @@ from ros2_memory.bag_dir.moment_file import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
@@ -276,7 +277,7 @@ class MomentKeeper:
         self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment | str:
         """Begins a moment and adds it to `stored`, or returns why it is refused."""
-        need = self._needed(begun.request, snapshot)
+        need, window = self._needed(begun.request, snapshot), window_of(begun.request)
         group = self._group(begun, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self._rule_bytes)):
             return (
@@ -284,8 +285,9 @@ class MomentKeeper:
                 "moments/ of the bag directory"
             )
         if not need.bags and not need.waits:
+            if overlaps_any(snapshot.timeline.thinned_times, window.start, window.stop - 1):
+                return "the bags of that time were deleted, and memory/ has what stayed of them"
             return "nothing was recorded then: ask for a time at which something was"
-        window = window_of(begun.request)
         # Those that may belong to the moment, as large as they are now.
         growing = [
             size_of(aside.path)

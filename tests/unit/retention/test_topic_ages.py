@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import fcntl
+import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
@@ -302,3 +304,30 @@ def test_a_damaged_list_of_what_went_is_named_and_replaced(bag_dir: Path) -> Non
     damaged = [log["path"] for log in logs if log["event"] == "expired_list_damaged"]
     assert damaged == [str(bag_dir / EXPIRED_FILE)]
     assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
+
+
+def test_a_large_bag_of_images_is_cut_in_little_memory(bag_dir: Path) -> None:
+    begin, data = T0 + 2 * HOUR, np.random.default_rng(5).bytes(1_000_000)
+    images = [
+        Msg("/camera", "std_msgs/msg/String", begin + n * S, bytes(8) + data) for n in range(60)
+    ]
+    path = write_mcap(
+        bag_dir / "rec_C" / "rec_C_0.mcap",
+        sorted(
+            [*images, *(odom(begin + n * S // 10, n / 10, 1.0) for n in range(600))],
+            key=lambda message: message.log_time,
+        ),
+    )
+    own_all(bag_dir)
+    size = path.stat().st_size
+    del images
+    cutter = cutter_of(bag_dir, topic_ages=(TopicAge("/camera", 24 * HOUR),))
+    tracemalloc.start()
+    try:
+        house(bag_dir, cutter).apply()
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert counts_of(path) == {"/odom": 600}
+    assert size > 50_000_000
+    assert peak < 15_000_000

@@ -19,8 +19,20 @@ from typing import TYPE_CHECKING, Final
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import ERASING_FILE, MEMORY_FOLDER, memory_file, utc_day
-from ros2_memory.bag_dir.state_files import SUPERSEDED, Superseded, read_superseded
+from ros2_memory.bag_dir.layout import (
+    ERASING_FILE,
+    LEAVING_FILE,
+    MEMORY_FOLDER,
+    memory_file,
+    utc_day,
+)
+from ros2_memory.bag_dir.state_files import (
+    LEAVING,
+    SUPERSEDED,
+    Leaving,
+    Superseded,
+    read_superseded,
+)
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
@@ -48,32 +60,33 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader, BagWriter, Record
 
-_PEOPLE: Final = frozenset(
-    [
-        "person",
-        "persons",
-        "people",
-        "human",
-        "humans",
-        "pedestrian",
-        "pedestrians",
-        "man",
-        "men",
-        "woman",
-        "women",
-        "child",
-        "children",
-        "boy",
-        "boys",
-        "girl",
-        "girls",
-        "baby",
-        "babies",
-        "face",
-        "faces",
-    ]
-)
-_WORD: Final = re.compile(r"[^\W\d_]+")
+_WORDS_FOR_PEOPLE: Final = """
+adult adults baby babies boy boys child children cyclist face faces family father girl girls
+grandfather grandmother guest guests guy human humans kid kids lady man men mother nurse patient
+pedestrian pedestrians people person persons resident skeleton skeletons visitor visitors woman
+women
+frau frauen gesicht gesichter junge kind kinder leute mädchen maedchen mann männer maenner
+mensch
+menschen personen
+enfant enfants femme femmes fille garçon garcon gens homme hommes humain personne personnes
+visage
+bambina bambino donna donne faccia persone ragazza ragazzo umano uomini uomo viso volto
+cara chica chico gente hombre hombres humano mujer mujeres niña niño niños nina nino ninos
+persona
+personas rostro
+criança crianca homem homens menina menino mulher mulheres pessoa pessoas rosto
+gezicht jongen kinderen mannen meisje mens mensen vrouw vrouwen
+ansigt ansikte ansikt barn flicka jente kvinde kvinna kvinne människa manniska menneske pige
+pojke
+człowiek czlowiek dziecko kobieta ludzie mężczyzna mezczyzna osoba osoby twarz
+adam çocuk cocuk insan kadın kadin kişi kisi yüz
+девочка женщина лицо люди мальчик мужчина ребёнок ребенок человек
+人 人物 人脸 人类 行人 男人 女人 男 女 孩子 小孩 儿童 男性 女性 子供 子ども 顔 歩行者
+사람 남자 여자 아이 어린이 얼굴 보행자
+"""  # noqa: RUF001 (Turkish)
+_PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
+_WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
+"""Words also begin at capitals: `TrackedPersons`."""
 _NAMES: Final = LISTS_OF_LABELS.union(LABELS, ("child_frame_id", "frame_id", "name", "names"))
 """Fields that may name people."""
 _FIRST_DAY: Final = "2014"
@@ -81,6 +94,10 @@ _FIRST_DAY: Final = "2014"
 _QOS: Final = "offered_qos_profiles"
 MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
 """The numbers of older days have one message a minute."""
+GRACE_S: Final = 86_400.0
+"""So long the recorder runs before days are deleted that nobody wants: `memory.keep` may have been
+lost by accident."""
+COUNTED_S: Final = 600.0
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 _EVERYTHING: Final = TimeWindow.everything()
 
@@ -94,12 +111,14 @@ class MemoryLimits:
     Attributes:
         texts: names or globs of the topics of which texts may stay: speech, descriptions, logs.
         labels: the labels of people that may stay.
+        people: words for people besides those that are known: names, roles.
         max_bytes: what all days may take.
         max_age_ns: how old a day may become.
     """
 
     texts: tuple[str, ...] = ()
     labels: tuple[str, ...] = ()
+    people: tuple[str, ...] = ()
     max_bytes: int = 10**9
     max_age_ns: Ns = 400 * 86_400 * NS_PER_S
 
@@ -115,6 +134,7 @@ class MemoryDays:
         extractor: has the schema map, by which detections are found.
         limits: which messages stay; None: none, and the days that exist are deleted.
         static_topics: topics that are latched whatever their publishers declare.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
@@ -127,6 +147,7 @@ class MemoryDays:
         *,
         limits: MemoryLimits | None,
         static_topics: Collection[str] = (),
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder = bag_dir / MEMORY_FOLDER
         self._reader = reader
@@ -135,8 +156,11 @@ class MemoryDays:
         self._extractor = extractor
         self.keeps = limits is not None
         self._limits = limits or MemoryLimits()
+        self._people = _PEOPLE.union(map(str.casefold, self._limits.people))
         self._static_topics = frozenset(static_topics)
         self._minutes: set[Path] = set()
+        self._monotonic = monotonic
+        self._leaving_since: float | None = None
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
         """Makes durable what stays of some bags, which may be deleted then.
@@ -220,21 +244,40 @@ class MemoryDays:
             flush(self._folder)
 
     def clear(self) -> None:
-        """Deletes all days, since nothing is to stay (`memory.keep`).
+        """Deletes all days where nothing is to stay (`memory.keep`), a day after saying so.
+
+        A day in which the recorder runs, since the wall clock may be wrong.
 
         Raises:
-            OSError: one cannot be deleted.
+            OSError: one cannot be deleted, or how long it is until then not be written.
         """
-        days = self._days()
+        bag_dir, days = self._folder.parent, self._days()
+        if self.keeps or not days:
+            if (bag_dir / LEAVING_FILE).exists():
+                LEAVING.remove(bag_dir)
+            return
+        now, since = self._monotonic(), self._leaving_since
+        left_s = GRACE_S
+        with suppress(ValueError):
+            left_s = (LEAVING.read(bag_dir) or Leaving(GRACE_S)).left_s
+        left_s = max(left_s - (0.0 if since is None else now - since), 0.0)
+        if since is None or now - since >= COUNTED_S or not left_s:
+            self._leaving_since = now
+            LEAVING.write(bag_dir, Leaving(left_s))
+        if since is None:
+            _log.warning("memory_leaves", days=len(days), left_s=left_s)
+        if not left_s:
+            self._delete_all(days)
+
+    def _delete_all(self, days: Sequence[Path]) -> None:
         for left in self._folder.glob(".*.thinned.mcap.tmp"):
             left.unlink()
-        if days:
-            _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         for path in days:
             path.unlink()
-        if days:
-            with suppress(OSError):
-                self._folder.rmdir()
+        _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
+        with suppress(OSError):
+            self._folder.rmdir()
+        LEAVING.remove(self._folder.parent)
 
     def _days(self) -> list[Path]:
         """Returns the files that the recorder wrote, the oldest first; no link is followed."""
@@ -254,7 +297,7 @@ class MemoryDays:
                 chosen.left_out[topic] = table.left_out[""]
             elif is_sampled(table):
                 chosen.left_out[topic] = "it has long arrays of numbers"
-            elif _is_of_people(f"{topic}/{kind}") and not self._limits.labels:
+            elif self._is_of_people(f"{topic}/{kind}") and not self._limits.labels:
                 chosen.left_out[topic] = "it is of people, and memory.labels names none"
             elif is_said(table) and not _is_named(topic, self._limits.texts):
                 chosen.left_out[topic] = "it has texts, and memory.texts does not name it"
@@ -325,7 +368,11 @@ class MemoryDays:
         """Returns whether a label is of people, or a number that may be: 0 is a person in COCO."""
         if label in self._limits.labels:
             return False
-        return _is_of_people(label) or label.strip().isdecimal()
+        return self._is_of_people(label) or label.strip().isdecimal()
+
+    def _is_of_people(self, name: str) -> bool:
+        """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
+        return not self._people.isdisjoint(map(str.casefold, _WORD.findall(name)))
 
     def _write(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
         """Writes a day anew, with more messages, and lists the bags that these are of.
@@ -417,11 +464,6 @@ class _Chosen:
     times: dict[tuple[str, str], set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
-
-
-def _is_of_people(name: str) -> bool:
-    """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
-    return not _PEOPLE.isdisjoint(_WORD.findall(name.casefold()))
 
 
 def _is_named(topic: str, globs: Sequence[str]) -> bool:

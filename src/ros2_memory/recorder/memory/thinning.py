@@ -5,8 +5,8 @@ A message that stays is as it was recorded. Those go that say again what others 
 - What moves has a pose a second (`STEP_NS`), and one in two while it stands: standstills are found,
   and where poses are farther apart none was recorded.
 - Of a boolean, a status or a name every message stays that changes it, and the last one before.
-- Of detections and transforms as few messages of each slot stay as show all labels and frames,
-  and the most of a label at once.
+- Of the detections of a second, and of the transforms of a slot, as few messages stay as show all
+  labels and frames, and the most of a label at once.
 - Of numbers one of each slot stays, and their least and greatest of five minutes.
 
 No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
@@ -152,10 +152,11 @@ class TopicThinning:
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
         times, named = table.log_times, self._labels(table)
+        has_labels = any(named)
         for path, column in table.columns.items():
             if isinstance(column, Texts):
                 # A text with detections differs in each message, and is none that holds.
-                if not any(named):
+                if not has_labels:
                     self._add_changes(path, column.codes, column.values(), times)
             elif _is_discrete(column):
                 self._add_changes(path, column, column.tolist(), times)
@@ -168,6 +169,7 @@ class TopicThinning:
         slot_ns = self.numbers_ns if has_numbers(table) else THINNED_NS
         if slot_ns == THINNED_NS:
             self._add_pauses(times)
+        slot_ns = STEP_NS if has_labels else slot_ns
         slots = times // slot_ns
         starts = np.flatnonzero(np.diff(slots, prepend=-1)).tolist()
         for start, stop in zip(starts, [*starts[1:], times.size], strict=True):

@@ -281,9 +281,9 @@ def _end_s(window: TimeWindow) -> float:
 
 
 def _thinned_days(snapshot: Snapshot) -> JsonObject:
-    """Returns the spans of thinned days, where there are some."""
-    days = snapshot.timeline.thinned
-    return {"thinned": [[_s(day.start), _s(day.end)] for day in days]} if days else {}
+    """Returns the times of thinned days, where there are some."""
+    times = snapshot.timeline.thinned_times
+    return {"thinned": [[_s(start), _s(stop)] for start, stop in times]} if times else {}
 
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:

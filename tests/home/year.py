@@ -1,0 +1,111 @@
+"""A home's first days, and what follows them for a year, as the recorder's housekeeping leaves it.
+
+What follows is another life in the same flat: the robot begins it a minute after its first days.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.bag_dir.layout import is_thinned
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
+from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.storage.mcap.writer import McapWriter
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.home import world
+from tests.home.days import Scale
+from tests.home.recording import write
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import HOUR, PLENTY, own_all
+from tests.support.memories import shipped_extractor
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    import pytest
+
+    from tests.home.questions import Question
+
+DAY_S: Final = 86_400
+_LATER_S: Final = 60
+"""A robot's clock is set by some seconds in its first days."""
+_BOUNDED: Final = frozenset({"find_things", "find_matches", "visits"})
+
+
+def write_later_days(
+    first: Scale, begin: int, days: int, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Writes the bags of so many days from a day on; the world's first days come before it."""
+    later = replace(first, seed=first.seed + 1, days=days)
+    with monkeypatch.context() as patched:
+        patched.setattr(world, "START_S", world.START_S + begin * DAY_S + _LATER_S)
+        write(later, folder)
+
+
+class Year:
+    """A bag directory with `memory.keep` in which bags stay for an hour, on its robot's clock."""
+
+    def __init__(self, bag_dir: Path, split_s: float) -> None:
+        self._bag_dir = bag_dir
+        self._clock = SettableClock(0)
+        reader, writer, own = BagDirReader(McapReader()), McapWriter(), own_all(bag_dir)
+        self._house = Housekeeping(
+            bag_dir,
+            reader,
+            writer,
+            self._clock,
+            RetentionLimits(PLENTY, HOUR, keeps_foreign=True),
+            is_synchronised=lambda: True,
+            split_duration_s=split_s,
+            own=own,
+            static_topics=("/tf_static",),
+            memory=MemoryDays(
+                bag_dir,
+                reader,
+                writer,
+                own,
+                shipped_extractor(),
+                limits=MemoryLimits(texts=("*",), labels=("person",)),
+                static_topics=("/tf_static",),
+            ),
+        )
+
+    def add(self, later: Path, day: int) -> None:
+        """Has the robot record the bags of a later day (0 is the world's first)."""
+        until = (world.START_S + (day + 1) * DAY_S + _LATER_S) * NS_PER_S
+        for recording in sorted(later.iterdir()):
+            bags = sorted(recording.glob("*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
+            if bags[0].stat().st_mtime_ns >= until:
+                break
+            shutil.move(recording, self._bag_dir / f"later_{recording.name}")
+        own_all(self._bag_dir)
+
+    def age(self, day: int) -> None:
+        """Deletes, an hour after a day, what is older than an hour."""
+        self._clock.at = (world.START_S + (day + 1) * DAY_S + 3600) * NS_PER_S
+        left: list[tuple[Path, int]] = []
+        while left != (left := self._bags()):
+            self._house.apply()
+
+    @property
+    def size(self) -> int:
+        """The bytes of all thinned days."""
+        return sum(size for path, size in self._bags() if is_thinned(path))
+
+    def _bags(self) -> list[tuple[Path, int]]:
+        return [(path, path.stat().st_size) for path in sorted(self._bag_dir.rglob("*.mcap"))]
+
+
+def about(question: Question, first: Scale) -> Question:
+    """Returns a question about a world's days, also when it is asked much later."""
+    window = {"start": world.START_S, "end": world.START_S + first.days * DAY_S + _LATER_S}
+    calls = [
+        call._replace(arguments={**window, **call.arguments}) if call.tool in _BOUNDED else call
+        for call in question.calls
+    ]
+    return replace(question, calls=tuple(calls))
