@@ -23,6 +23,7 @@ from tests.unit.recorder.memory.test_days import days_of, keep_all, messages_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from ros2_memory.storage.base import Record
