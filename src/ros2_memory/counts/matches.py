@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import IntervalPart, joined
+from ros2_memory.analysis.intervals import IntervalPart, joined, united
 from ros2_memory.analysis.topic_events import joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import listed
@@ -196,19 +196,20 @@ def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueInter
     """Returns when a thing with a label was in view; None where there are no labels at all."""
     if not any(part.visible.labels for part in parts):
         return None
-    of_label = [
-        IntervalPart(part.first, part.last, _of_label(part.visible, condition))
+    of_labels = [
+        IntervalPart(part.first, part.last, _of_labels(part.visible, condition))
         for part in parts
         if part.first <= part.last
     ]
-    seen = joined(of_label).visible.intervals()
+    # Each label's first: only of one label it is known whether a message lay between.
+    seen = united([joined(of_labels).visible.under_one_label("")]).intervals()
     return TrueIntervals.of([(each.first, each.last, True) for each in seen])
 
 
-def _of_label(visible: IntervalTable, condition: Condition) -> IntervalTable:
-    """Returns the intervals of all labels that meet a condition, as those of one label."""
+def _of_labels(visible: IntervalTable, condition: Condition) -> IntervalTable:
+    """Returns the intervals of all labels that meet a condition."""
     others = [label for label in visible.labels if not condition.test.matches(label)]
-    return visible.without(others).under_one_label("")
+    return visible.without(others)
 
 
 def _flag_held(

@@ -138,10 +138,17 @@ def empty_track() -> RobotTrack:
 
 
 def thinned(times: Times) -> NDArray[np.intp]:
-    """Returns which of some poses, in order of time, count: the first and last of each slot."""
-    slots = times // _SLOT_NS
+    """Returns which of some poses, in order of time, count: the first and last of each slot.
+
+    Of several of one time the first.
+    """
+    first = np.flatnonzero(np.diff(times, prepend=times.min(initial=0) - 1) > 0)
+    slots = times[first] // _SLOT_NS
     new = np.diff(slots) > 0
-    return np.flatnonzero(np.append([True], new) | np.append(new, [True]))[: len(times)]
+    chosen: NDArray[np.intp] = first[
+        (np.append([True], new) | np.append(new, [True]))[: len(first)]
+    ]
+    return chosen
 
 
 def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0) -> TrackPart:

@@ -140,3 +140,14 @@ def test_poses_that_are_no_place_are_left_out() -> None:
 def test_without_a_pose_there_is_no_track() -> None:
     assert not len(empty_track().times)
     assert not len(track_by([]).times)
+
+
+def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None:
+    times = np.array([0, 1, 1, 2], np.int64) * S + START
+    x = np.array([0.0, 1.0, 5.0, 2.0])
+    still = np.zeros(4)
+    assert track_of(times, x, still, still).x.tolist() == [0.0, 2.0]
+    parts = [
+        track_part(times[rows], x[rows], still[rows], still[rows]) for rows in ([0, 1], [2, 3])
+    ]
+    assert same(track_by([joined_part(parts)]), track_of(times, x, still, still))
