@@ -119,12 +119,18 @@ def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[st
         (sights.spots, Spot.FIRST, Spot.LAST),
         (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
     )
-    if sights.topics and not any(len(_during(window, *table)) for table in tables):
+    is_empty = not any(len(_during(window, *table)) for table in tables)
+    if sights.topics and is_empty and _reaches_back(known, window):
         yield (
             f"{listed(sights.topics)} published nothing in this window: whether things were there "
             "is not known"
         )
     yield from describe_silences(view, sights.topics, window)
+
+
+def _reaches_back(known: KnownThings, window: TimeWindow) -> bool:
+    """Returns whether things are known of a whole window: else nothing is said of what it lacks."""
+    return known.since is None or known.since <= window.start
 
 
 def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
@@ -183,7 +189,8 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
         meant = f"; did you mean {close[0]}?" if close else ""
         label = abbreviate(asked.labels[key])
         if names:
-            text = f"no detector reported {label}; there are: {listed(shown)}{meant}"
+            since = "" if known.since is None else f" since {unix_text(known.since)}"
+            text = f"no detector reported {label}{since}; there are: {listed(shown)}{meant}"
             yield repeating(text, shown)
         return
     _, count, low, unplaced, *_ = _detected(known, key, asked.window)
@@ -199,6 +206,6 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
             f"it was detected {counted(count, 'time')} in this time, but does not count "
             f"as a thing{asked.inside}: find_matches lists single detections"
         )
-    if not count + low + unplaced:
+    if not count + low + unplaced and _reaches_back(known, asked.window):
         every = sum(_detected(known, key, TimeWindow.everything())[1:4])
         yield f"it was detected {counted(every, 'time')} in all, and not once in this window"

@@ -161,3 +161,20 @@ def test_a_call_without_an_end_compares_all(
     labels, notes = labels_and_notes(crowded, Deadline.never())
     assert labels == {label for label, *_ in THINGS}
     assert notes == []
+
+
+def test_of_a_window_before_what_was_compared_no_never_is_said(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
+    start_s = float(begin_of(0))
+    for labels in ((), ("thing 0",), ("thing 7",)):
+        found = find_things(
+            crowded, Call(Deadline.after(60)), labels, start_s=start_s, end_s=start_s + 600
+        )
+        assert not found.things
+        assert any("too many sightings" in note for note in found.notes)
+        text = " ".join(found.notes)
+        assert "published nothing" not in text
+        assert "not once" not in text
+        assert "no detector reported" not in text or '"thing 0" since' in text
