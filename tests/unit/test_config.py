@@ -79,6 +79,7 @@ class TestDefaults:
                 "keep": False,
                 "texts": (),
                 "labels": (),
+                "people": (),
                 "max_share": 0.2,
                 "max_age_d": 400.0,
             },

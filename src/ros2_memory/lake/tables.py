@@ -31,7 +31,7 @@ from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from datetime import date
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
@@ -193,7 +193,7 @@ def _encodable(value: object) -> object:
 
 def _is(kind: type[BooleanExpression], column: str, value: object) -> BooleanExpression:
     # The constructors are not those that Pydantic's plugin for mypy takes them to have.
-    return kind(column, value)  # type: ignore[call-arg,misc]
+    return cast("Callable[[str, object], BooleanExpression]", kind)(column, value)
 
 
 def of_robots(robots: Collection[str], day: date) -> BooleanExpression:

@@ -271,7 +271,8 @@ async def test_a_scan_that_fails_is_logged_and_tried_again(tmp_path: Path) -> No
             tasks.start_soon(keep_fresh, replace(memory, index=failing), 0.001)
             await again.wait()
             tasks.cancel_scope.cancel()
-    assert logs[0]["event"] == "index_refresh_failed"
+    # A thread of another test may log beside it.
+    assert "index_refresh_failed" in {line["event"] for line in logs}
 
 
 async def test_what_it_says_is_bounded_however_much_is_amiss(tmp_path: Path) -> None:
