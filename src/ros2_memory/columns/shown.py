@@ -67,7 +67,7 @@ class Kept(NamedTuple):
 
 
 def nowhere(size: int) -> Kept:
-    """Returns that it stands in none of so many rows or elements."""
+    """Returns the column of a field that none of so many rows or elements has."""
     return Kept(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 

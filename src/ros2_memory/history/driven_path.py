@@ -298,7 +298,7 @@ def length_notes(path: Trajectory) -> Iterator[str]:
         poses = counted(path.invalid, "pose")
         yield f"{poses} left out: their coordinates are not valid (NaN or out of range)"
     if path.is_noisy:
-        # Without its number, which is in the reply, it is said once for several windows.
+        # Without the number, which the reply has, the note of several windows is one.
         yield (
             "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
         )

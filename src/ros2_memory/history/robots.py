@@ -368,12 +368,10 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[B
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
+    recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
-    spans = [
-        (*span, path)
-        for path, span in view.timeline.recordings(topic).items()
-        if path != view.bag_dir / MEMORY_FOLDER
-    ]
+    recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
+    spans = [(*span, path) for path, span in recordings.items()]
     for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
         open_spans = [each for each in open_spans if each[1] >= first]
         for since, until, other in open_spans:

@@ -129,7 +129,7 @@ def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[st
 
 
 def _reaches_back(known: KnownThings, window: TimeWindow) -> bool:
-    """Returns whether things are known of a whole window: else nothing is said of what it lacks."""
+    """Returns whether the things of a whole window are known; else nothing is missing for sure."""
     return known.since is None or known.since <= window.start
 
 

@@ -62,7 +62,7 @@ class DuckdbEngine(LakeEngine):
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             # Its sentence alone: a traceback with variables would show the keys of a store.
             log.warning("lake_engine_failed", reason=f"{type(error).__name__}: {error}")
-            # Who asked is told nothing that may name a path or a key.
+            # The error may name a path or a key: the client does not see it.
             raise RefusedError(
                 f"the lake cannot be read ({type(error).__name__}); the server's log has the reason"
             ) from error
