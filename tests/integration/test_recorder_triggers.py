@@ -46,7 +46,9 @@ def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: P
         f"recording.split_duration_s={SPLIT_S}",
         "recording.session_duration_s=7",
     )
-    with publishing_robot(site.env, tmp_path / "truth.json", "--hz", "10") as robot:
+    # It bumps once, when it is told: by its own clock it might do so unrecorded.
+    drive = ("--hz", "10", "--bump", "inf")
+    with publishing_robot(site.env, tmp_path / "truth.json", *drive) as robot:
         recorder = site.record("robot", *given)
         recorder.wait_for("trigger_fired", rule="turned")
         recorder.wait_for("rotated", 2)
@@ -55,7 +57,6 @@ def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: P
         recorder = site.record("robot", *given)
         recorder.wait_for("trigger_fired", rule="restarted")
         recorder.wait_for_subscriptions()
-        # Whenever that is on this machine: by the robot's clock it might bump unrecorded.
         robot.bump()
         recorder.wait_for("trigger_fired", rule="bumper")
         recorder.wait_for("rotated", 1)
@@ -69,7 +70,7 @@ def test_rules_fire_once_through_rotations_and_a_kill(site: Machine, tmp_path: P
         recorder.stop()
     [bumper] = [each for each in moments if each.moment.rule == "bumper"]
     assert bumper.moment.matches == 1
-    # How long the robot goes unrecorded after the kill is the machine's: it may reach the bumper.
+    # How long the robot goes unrecorded after the kill is the machine's: the bump may be near it.
     bags = [McapReader().summarize(each) for each in bag_files(recorder.bag_dir)]
     starts_s = [bag.start / 1e9 for bag in bags if not bag.empty]
     again_s = min(start for start in starts_s if start > killed_s)

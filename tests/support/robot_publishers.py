@@ -93,9 +93,9 @@ def is_due(topic: str, tick: int, hz: float) -> bool:
 class Messages:
     """The messages of one robot, serialized."""
 
-    def __init__(self, t0: int) -> None:
+    def __init__(self, t0: int, bumps_s: float = math.inf) -> None:
         self._t0 = t0
-        self.bumps_s = 25.0
+        self.bumps_s = bumps_s
 
     def payload(self, topic: str, t: float) -> bytes:
         """The message published on `topic` t seconds after T0, as CDR."""
@@ -269,14 +269,14 @@ class Robot:
         while not self._stop and any(p.get_subscription_count() < count for p in waiting):
             time.sleep(0.02)
 
-    def drive(self, hz: float, duration_s: float) -> None:
+    def drive(self, hz: float, duration_s: float, bumps_s: float) -> None:
         """Publishes for `duration_s` of the robot's time, or until a signal, and leaves."""
         for topic in self._publishers:
             # The first of its type is slow to make.
             Messages(0).payload(topic, 0.0)
         t0 = time.time_ns() // 10**6 * 10**6
         begin = time.monotonic()
-        messages, published = Messages(t0), Counter[str]()
+        messages, published = Messages(t0, bumps_s), Counter[str]()
         self._tell(t0, published, 0)
         tick = 0
         first = next(iter(self._publishers.values()))
@@ -316,6 +316,7 @@ class Robot:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--duration", type=float, default=math.inf, help="s")
+    parser.add_argument("--bump", type=float, default=25.0, help="when it does untold; s")
     parser.add_argument("--hz", type=float, default=20.0, help="ticks a second")
     default = [topic for topic in TYPES if topic not in UNASKED]
     parser.add_argument("--topics", nargs="+", default=default, choices=list(TYPES))
@@ -329,7 +330,7 @@ def main() -> None:
         signal.signal(number, robot.stop)
     signal.signal(signal.SIGUSR1, robot.bump)
     robot.await_subscribers(given.subscribers)
-    robot.drive(given.hz, given.duration)
+    robot.drive(given.hz, given.duration, given.bump)
     rclpy.shutdown()
 
 
