@@ -23,6 +23,7 @@ from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.index.segment import in_time
 from ros2_memory.storage.base import RELATCHED_NS
 
 if TYPE_CHECKING:
@@ -143,15 +144,13 @@ class Scan:
         self._compared: set[Ns] = set()
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
-        self._delays: dict[int, tuple[float, float]] | None = None
         self._together: list[PartHead] = []
         reach = asked.window
         if asked.relatches:
             reach = TimeWindow.everything()
         elif self._shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
-        found = self._settled(reach)
-        self._sources = sorted(found, key=lambda source: (source.first, source.last))
+        self._sources = self._ordered(self._settled(reach))
         self._firsts = np.array([source.first for source in self._sources], np.int64)
         self._lasts = np.array([source.last for source in self._sources], np.int64)
         self._latest = np.maximum.accumulate(self._lasts)
@@ -182,7 +181,7 @@ class Scan:
         """
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
-            sources = sorted(sources, key=lambda source: (source.last, source.first), reverse=True)
+            sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
         window, may_match = self._asked.window, self._asked.may_match
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
         sources = [s for s in sources if window.overlaps(s.first, s.last)]
@@ -245,8 +244,22 @@ class Scan:
         return [*found, *between(self._asked.window.start)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
-        """Returns the whole parts that all rows in a window are of; None where others are, too."""
-        if self._coverage is None or self._asked.relatches:
+        """Returns the whole parts that all rows in a window are of; None where others are, too.
+
+        With them those that latched messages in the window may have been received in before.
+        """
+        parts = self._whole_parts(window)
+        late = [part for part in parts or () if self._asked.relatches and self._may_be_late(part)]
+        if not late:
+            return parts
+        published = min(self._published[part][0] for part in late)
+        if published < window.start - STRETCH_NS:
+            return None
+        since = min(int(published) - COPY_HORIZON_NS, window.start)
+        return self._whole_parts(TimeWindow(since, window.stop))
+
+    def _whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
+        if self._coverage is None:
             return None
         begin = int(np.searchsorted(self._latest, window.start))
         end = int(np.searchsorted(self._firsts, window.stop))
@@ -257,8 +270,7 @@ class Scan:
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
-        assert self._coverage is not None  # noqa: S101 - there are no parts without one
-        bag = self._coverage.bag(int(self._heads[part].bags[0]))
+        bag = self._first_bag(self._heads[part])
         if bag is None:
             raise GoneError
         return bag.recording
@@ -364,6 +376,24 @@ class Scan:
                 if reach.overlaps(first, last):
                     yield _Source(first, last, None, bag)
 
+    def _ordered(self, found: Iterable[_Source]) -> list[_Source]:
+        """Returns sources in order of time; of those of the same times as their bags are."""
+        sources = sorted(found, key=lambda source: (source.first, source.last))
+        if len({(source.first, source.last) for source in sources}) == len(sources):
+            return sources
+
+        def order(source: _Source) -> tuple[Ns, Ns, tuple[Ns, Ns, str] | tuple[()]]:
+            bag = source.bag if source.part is None else self._first_bag(source.part)
+            return source.first, source.last, () if bag is None else in_time(bag)
+
+        return sorted(sources, key=order)
+
+    def _first_bag(self, part: PartHead) -> BagFile | None:
+        """Returns the first bag of a part of which rows count, if any."""
+        assert self._coverage is not None  # noqa: S101 - there are no parts without one
+        counting = self._coverage.of_part(part.number, part.bags)
+        return self._coverage.bag(int(counting[0])) if counting.size else None
+
     def _units(self, source: _Source) -> Iterable[Unit]:
         if source.part is None and self._asked.stored:
             return ()
@@ -406,11 +436,12 @@ class Scan:
 
     def _holding_copies(self) -> list[tuple[Ns, Ns]]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        known = self._bounds(PUBLISH_TIME)
         found: list[tuple[Ns, Ns]] = []
         for start, stop in self._shared:
             published = sorted(
-                (-math.inf, math.inf) if source.part is None else known[source.part.number]
+                (-math.inf, math.inf)
+                if source.part is None
+                else self._published[source.part.number]
                 for source in self._sources_in(TimeWindow(start, stop))
             )
             if any(before[1] >= after[0] for before, after in pairwise(published)):
@@ -437,7 +468,7 @@ class Scan:
         """Finds the copies in a part of a shared span."""
         around = part.widened(2 * COPY_HORIZON_NS).intersect(span)
         units = [*self._units_in(around)]
-        if len({unit.recording for unit in units}) < 2:
+        if len({unit.first_bag.recording for unit in units}) < 2:
             return
         rows = [self._rows_in(unit, around) for unit in units]
         messages = self._messages(units, rows)
@@ -481,14 +512,20 @@ class Scan:
             self._relatched[unit.key] = some[again[begin : begin + some.size]]
             begin += some.size
 
+    @cached_property
+    def _delays(self) -> dict[int, tuple[float, float]]:
+        return self._bounds(DELAY)
+
+    @cached_property
+    def _published(self) -> dict[int, tuple[float, float]]:
+        return self._bounds(PUBLISH_TIME)
+
     def _bounds(self, path: str) -> dict[int, tuple[float, float]]:
         heads = [source.part for source in self._sources if source.part is not None]
         return self._scanner.bounds(heads, path)
 
     def _may_be_late(self, part: int | None) -> bool:
         """Returns whether a part may have messages that were received long after."""
-        if self._delays is None:
-            self._delays = self._bounds(DELAY)
         return part is None or self._delays[part][1] > RELATCHED_NS
 
     def _sources_in(self, window: TimeWindow) -> list[_Source]:
@@ -509,11 +546,11 @@ class Scan:
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
         # By their names: of messages of one time that counts which lies in the first recording.
-        recordings = sorted({unit.recording for unit in units}, key=str)
+        recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
         numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, some in zip(units, rows, strict=True):
-            recording = numbers[unit.recording]
+            recording = numbers[unit.first_bag.recording]
             published, hashes = self._identities(unit, some)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.errors import BusyError
+from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator, Mapping
@@ -50,9 +51,9 @@ class BagUnit:
         self._bag = bag
 
     @property
-    def recording(self) -> Path:
-        """The bag's recording."""
-        return self._bag.recording
+    def first_bag(self) -> BagFile:
+        """The bag."""
+        return self._bag
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -112,9 +113,9 @@ class PartUnit:
         self._all_count = counting.size == head.bags.size
 
     @cached_property
-    def recording(self) -> Path:
-        """The recording that all the rows are of."""
-        return self._bag_of(int(self._counting[0])).recording
+    def first_bag(self) -> BagFile:
+        """The first bag of which rows count; all are of one recording."""
+        return self._bag_of(int(self._counting[0]))
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -193,12 +194,14 @@ class Rows:
     @property
     def recording(self) -> Path:
         """The recording that the rows are of."""
-        return self._unit.recording
+        return self._unit.first_bag.recording
 
     @property
-    def order(self) -> tuple[str, str, Ns, Ns]:
-        """Sorts tables whose rows have one log time: by recording, as copies, and by type."""
-        return str(self.recording), self.table.channel.type, self.first, self.last
+    def order(self) -> tuple[str, str, Ns, Ns, tuple[Ns, Ns, str]]:
+        """Sorts tables whose rows have one log time: by recording, as copies, type and bag."""
+        bag = self._unit.first_bag
+        span = self._unit.first, self._unit.last
+        return str(bag.recording), self.table.channel.type, *span, in_time(bag)
 
     @property
     def first(self) -> Ns:

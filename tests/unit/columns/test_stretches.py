@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
-from tests.support.bags import Msg, boolean, odom, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import World, store_file
 
 if TYPE_CHECKING:
@@ -117,6 +118,58 @@ def test_answers_are_the_same_with_and_without_what_is_joined(world: World) -> N
         for each in (view, plain)
     )
     assert one == other
+
+
+@pytest.fixture
+def latched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> World:
+    """Three recordings of two stretches each; each begins with what was said 5 s before."""
+    for module in (scan, backfill):
+        monkeypatch.setattr(module, "STRETCH_NS", LENGTH)
+    layout = McapLayout(latched=frozenset({"/docked"}))
+    for number in range(72):
+        start = T0 + number * 100 * S
+        messages = [odom(start + n * 5 * S, number, 0.1) for n in range(20)]
+        messages += [boolean(start + n * 5 * S, n % 7 > 3, "/docked") for n in range(20)]
+        if number and not number % 24:
+            last = boolean(start - 5 * S, 19 % 7 > 3, "/docked")
+            messages.insert(1, replace(last, log_time=start + 1, publish_time=start - 5 * S))
+        write_mcap(tmp_path / f"rec_{number // 24}" / f"{number:02}.mcap", messages, layout)
+    world = World.of(tmp_path)
+    world.fill()
+    return world
+
+
+def latched_stretches(world: World) -> dict[int, tuple[int, ...] | None]:
+    opened = open_scan(View(world.memory, Call()), "/docked", WINDOW)
+    return {one.window.start: one.parts for one in opened.stretches()}
+
+
+def test_what_was_received_again_is_of_the_parts_that_had_it_before(latched: World) -> None:
+    parts = latched_stretches(latched)
+    own = [parts[T0 + n * LENGTH] or () for n in range(5)]
+    assert all(own)
+    # The third stretch begins a recording, with what the second ends with.
+    assert [len({*one} & {*other}) for one, other in pairwise(own)] == [0, 1, 0, 1]
+
+
+def test_what_was_received_again_counts_once_its_first_recording_is_gone(
+    latched: World, tmp_path: Path
+) -> None:
+    def rows(world: World) -> list[int]:
+        opened = open_scan(View(world.memory, Call()), "/docked", WINDOW)
+        return [len(one) for one in opened.rows(among=TimeWindow(T0 + 2 * LENGTH, WINDOW.stop))]
+
+    def events(world: World) -> object:
+        return events_in(View(world.memory, Call()), "/docked", WINDOW)
+
+    before = rows(latched)
+    assert latched_stretches(latched)[T0 + 2 * LENGTH]
+    assert events(latched) == events(latched.unstored())
+    (tmp_path / "rec_0" / "23.mcap").unlink()
+    again = World.of(tmp_path)
+    assert (rows(again)[0], rows(again)[1:]) == (before[0] + 1, before[1:])
+    assert latched_stretches(again).get(T0 + 2 * LENGTH) is None
+    assert events(again) == events(again.unstored())
 
 
 def test_what_is_joined_is_made_while_filling_and_goes_with_any_part(

@@ -154,6 +154,7 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
 @example(seed=377827213, part=1.0, has_types=True)
 @example(seed=3788236090, part=1.0, has_types=True)
 @example(seed=205486330, part=1.0, has_types=False)
+@example(seed=718524919, part=0.5, has_types=False)
 def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
     seed: int, part: float, has_types: bool
 ) -> None:
