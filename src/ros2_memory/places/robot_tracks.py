@@ -20,7 +20,7 @@ from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
     RobotTrack,
     TrackPart,
-    joined_part,
+    joined_parts,
     jumps,
     thinned,
     track_by,
@@ -54,6 +54,8 @@ from ros2_memory.history.transforms import (
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
     from ros2_memory.analysis.frames import Edges, Floats, Frames, Mask, Times
     from ros2_memory.analysis.poses import Poses
@@ -169,10 +171,15 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in found)
-        one, others = _by_robot(found)
+        whole, numbers, is_beside = _by_robot(found)
         fastest = view.limits.max_plausible_speed_mps
-        tracks = tuple(track_by([part], fastest) for part in others)
-        return JoinedTrack(track_by(one, fastest), since, left_out, tracks)
+
+        def track(index: NDArray[np.intp]) -> RobotTrack:
+            return track_by(whole.some(index), numbers[index], fastest)
+
+        others = np.unique(numbers[is_beside])
+        tracks = (track(np.flatnonzero(is_beside & (numbers == number))) for number in others)
+        return JoinedTrack(track(np.flatnonzero(~is_beside)), since, left_out, tuple(tracks))
 
     def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the tracks of parts in a window and beside it, the newest first.
@@ -481,15 +488,8 @@ def _inside(times: Times, window: TimeWindow) -> Times:
     return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
-class _Pieces(NamedTuple):
-    """When a recording places a robot: from each of the starts to a stop (ns, inclusive)."""
-
-    starts: Times
-    stops: Times
-
-
-def _by_robot(found: Sequence[TrackPart]) -> tuple[list[TrackPart], list[TrackPart]]:
-    """Returns what of each recording is in the track, and what of it lies beside that.
+def _by_robot(found: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
+    """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
 
     Where several recordings place a robot at a time, that which began first is in the track; of
     those that began at one time the first by name.
@@ -498,23 +498,22 @@ def _by_robot(found: Sequence[TrackPart]) -> tuple[list[TrackPart], list[TrackPa
     for part in found[::-1]:
         if len(part.times):
             by_recording[part.recording].append(part)
-    recordings = [joined_part(parts) for parts in by_recording.values()]
-    recordings.sort(key=lambda part: (int(part.times[0]), part.recording))
-    kept: list[TrackPart] = []
-    others: list[TrackPart] = []
-    placed: list[_Pieces] = []
-    for part in recordings:
-        # No later one reaches back to those that are over.
-        placed = [pieces for pieces in placed if pieces.stops[-1] >= part.times[0]]
-        is_beside = np.zeros(len(part.times), np.bool_)
-        for pieces in placed:
-            nth = np.searchsorted(pieces.starts, part.times, side="right") - 1
-            is_beside |= (nth >= 0) & (part.times <= pieces.stops[nth])
-        kept.append(part.some(np.flatnonzero(~is_beside)))
-        if is_beside.any():
-            others.append(part.some(np.flatnonzero(is_beside)))
-        placed.append(_Pieces(*pieces_of(part.times, part.times)))
-    return kept, others
+    recordings = sorted(
+        by_recording.values(),
+        key=lambda parts: (min(int(part.times[0]) for part in parts), parts[0].recording),
+    )
+    whole, numbers = joined_parts(recordings)
+    ends = np.searchsorted(numbers, np.arange(len(recordings) + 1))
+    firsts, lasts = whole.times[ends[:-1]], whole.times[ends[1:] - 1]
+    is_beside = np.zeros(len(whole.times), np.bool_)
+    for nth in np.flatnonzero(firsts[1:] <= np.maximum.accumulate(lasts)[:-1]) + 1:
+        here = slice(*ends[nth : nth + 2])
+        for other in np.flatnonzero(lasts[:nth] >= firsts[nth]):
+            placed = whole.times[slice(*ends[other : other + 2])]
+            starts, stops = pieces_of(placed, placed)
+            piece = np.searchsorted(starts, whole.times[here], side="right") - 1
+            is_beside[here] |= (piece >= 0) & (whole.times[here] <= stops[piece])
+    return whole, numbers, is_beside
 
 
 def _without_jumps(parts: Parts, every: Mask) -> Parts:

@@ -119,7 +119,7 @@ class TrackPart(NamedTuple):
 
 
 def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
-    """Returns the vertices of some parts, of which there is one at least, as of the first one."""
+    """Returns the vertices of some parts, one at least, in their order; as of the first one."""
     return TrackPart(
         np.concatenate([part.times for part in parts]),
         np.concatenate([part.x for part in parts]),
@@ -134,21 +134,30 @@ def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
 
 def empty_track() -> RobotTrack:
     """Returns a track without a vertex."""
-    return track_of(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0))
+    return track_by(*joined_parts([]))
 
 
-def thinned(times: Times) -> NDArray[np.intp]:
-    """Returns which of some poses, in order of time, count: the first and last of each slot.
+def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
+    """Returns which of some poses count: the first and last of each slot.
 
-    Of several of one time the first.
+    Of several of one time the first. They are in order of time, or of recordings and then of time.
     """
-    first = np.flatnonzero(np.diff(times, prepend=times.min(initial=0) - 1) > 0)
-    slots = times[first] // _SLOT_NS
-    new = np.diff(slots) > 0
-    chosen: NDArray[np.intp] = first[
-        (np.append([True], new) | np.append(new, [True]))[: len(first)]
-    ]
-    return chosen
+    numbers = np.broadcast_to(recordings, times.shape)
+    first = np.flatnonzero(_differ(times, numbers))
+    is_new = _differ(times[first] // _SLOT_NS, numbers[first])
+    return first[is_new | _is_last(is_new)]
+
+
+def _differ(*columns: Times) -> Mask:
+    """Returns which rows differ from the row before; the first one does."""
+    differ = np.ones(len(columns[0]), np.bool_)
+    differ[1:] = np.logical_or.reduce([np.diff(column) != 0 for column in columns])
+    return differ
+
+
+def _is_last(is_first: Mask) -> Mask:
+    """Returns which rows are the last of a group."""
+    return np.append(is_first[1:], [True])[: len(is_first)]
 
 
 def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0) -> TrackPart:
@@ -163,44 +172,53 @@ def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: in
     settled = (slices > slices[:1].sum()) & (slices < slices[-1:].sum())
     turns = _continuous(turns, np.zeros(len(times), np.bool_))
     part = TrackPart(times, x, y, turns, known, settled, left_out)
-    return part.some(_vertices(part, keeps=~settled))
+    return part.some(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
 
 
 def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
     """Returns the track of poses in log-time order; those that are no place are left out."""
-    return track_by([joined_part([track_part(times, x, y, heading)])])
+    return track_by(*joined_parts([[track_part(times, x, y, heading)]]))
 
 
-def track_by(recordings: Sequence[TrackPart], fastest_mps: float = math.inf) -> RobotTrack:
-    """Returns the track by the whole parts of recordings; of two of one time the first counts."""
-    if not recordings:
-        return empty_track()
-    of = np.repeat(np.arange(len(recordings)), [len(one.times) for one in recordings])
-    whole = united_parts(recordings)
-    if len(recordings) > 1:
-        order = _in_time(whole.times)
-        whole, of = whole.some(order), of[order]
-    turns = _continuous(whole.turns, np.diff(of, prepend=-1) == 0)
+def track_by(whole: TrackPart, recordings: Times, fastest_mps: float = math.inf) -> RobotTrack:
+    """Returns the track by the vertices of recordings; of two of one time the first counts.
+
+    `recordings`: the number of the recording of each vertex.
+    """
+    order = _in_time(whole.times)
+    whole, recordings = whole.some(order), recordings[order]
+    turns = _continuous(whole.turns, ~_differ(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
-def joined_part(parts: Sequence[TrackPart]) -> TrackPart:
-    """Returns the track by the poses of all tables of one recording, of which there is one."""
-    whole = united_parts(parts)
-    if len(parts) > 1:
-        whole = whole.some(_in_time(whole.times))
-        whole = whole.some(thinned(whole.times))
-    among = whole.settled & np.append([False], whole.settled[:-1])[: len(whole.settled)]
-    whole = whole._replace(turns=_continuous(whole.turns, among))
-    return whole.some(_vertices(whole, keeps=whole.settled))
+def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, Times]:
+    """Returns the tracks by the poses of all tables of recordings, one track after the other.
+
+    With the number of the recording of each vertex. All at once: a week has thousands of them.
+    """
+    every = [part for parts in recordings for part in parts]
+    if not every:
+        times, none = np.zeros(0, np.int64), np.zeros(0)
+        return track_part(times, none, none, none), times
+    sizes = [sum(len(part.times) for part in parts) for parts in recordings]
+    whole, numbers = united_parts(every), np.repeat(np.arange(len(recordings)), sizes)
+    order = _in_time(whole.times, numbers)
+    order = order[thinned(whole.times[order], numbers[order])]
+    whole, numbers = whole.some(order), numbers[order]
+    are_known = whole.settled & ~_differ(numbers)
+    are_known[1:] &= whole.settled[:-1]
+    whole = whole._replace(turns=_continuous(whole.turns, are_known))
+    vertices = _vertices(whole, whole.settled, numbers)
+    return whole.some(vertices), numbers[vertices]
 
 
-def _in_time(times: Times) -> NDArray[np.intp]:
-    """Returns the order of some times, of equal ones the first alone."""
-    order = np.argsort(times, kind="stable")
-    return order[np.diff(times[order], prepend=times.min(initial=0) - 1) > 0]
+def _in_time(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
+    """Returns the order of times in each recording, of equal ones the first alone."""
+    numbers = np.broadcast_to(recordings, times.shape)
+    order = np.lexsort((times, numbers))
+    return order[_differ(times[order], numbers[order])]
 
 
 def _continuous(turns: Times, are_known: Mask) -> Times:
@@ -212,14 +230,11 @@ def _continuous(turns: Times, are_known: Mask) -> Times:
     return whole
 
 
-def _vertices(part: TrackPart, keeps: Mask) -> NDArray[np.intp]:
+def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
     """Returns which poses are vertices: those to keep, and what their slices need besides."""
     times = part.times
-    if not len(times):
-        return np.zeros(0, np.intp)
-    kept = keeps.copy()
-    new = np.diff(times // TRACK_SLICE_NS) > 0
-    kept |= np.append([True], new) | np.append(new, [True])
+    is_first = _differ(times // TRACK_SLICE_NS, recordings)
+    kept = keeps | is_first | _is_last(is_first)
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
     waiting = np.flatnonzero(~kept)
     while waiting.size:

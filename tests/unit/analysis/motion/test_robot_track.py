@@ -17,7 +17,7 @@ from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     TrackPart,
     empty_track,
-    joined_part,
+    joined_parts,
     thinned,
     track_by,
     track_of,
@@ -95,10 +95,10 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
         times, x, y, heading = some
         return track_part(times, x, y, heading)
 
-    whole = track_by([joined_part([part(0, 1500)])])
+    whole = track_by(*joined_parts([[part(0, 1500)]]))
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
-    assert same(track_by([joined_part(parts)]), whole)
-    assert same(track_by([joined_part(parts[::-1])]), whole)
+    assert same(track_by(*joined_parts([parts])), whole)
+    assert same(track_by(*joined_parts([parts[::-1]])), whole)
 
 
 def test_turns_on_the_spot_add_up() -> None:
@@ -139,7 +139,7 @@ def test_poses_that_are_no_place_are_left_out() -> None:
 
 def test_without_a_pose_there_is_no_track() -> None:
     assert not len(empty_track().times)
-    assert not len(track_by([]).times)
+    assert not len(track_by(*joined_parts([])).times)
 
 
 def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None:
@@ -150,4 +150,4 @@ def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None
     parts = [
         track_part(times[rows], x[rows], still[rows], still[rows]) for rows in ([0, 1], [2, 3])
     ]
-    assert same(track_by([joined_part(parts)]), track_of(times, x, still, still))
+    assert same(track_by(*joined_parts([parts])), track_of(times, x, still, still))
