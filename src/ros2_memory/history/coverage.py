@@ -458,14 +458,16 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     earliest, latest = snapshot.earliest, snapshot.latest
     if earliest is None or latest is None:
         return None
-    bags = [each for each in snapshot.timeline.overlapping(asked) if not is_carried(each.file)]
-    if not any(bag.file in snapshot.dating.misdated for bag in bags):
+    misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
+    if not any(asked.overlaps(bag.start, bag.end) for bag in misdated):
         for first, last in view.gaps(asked):
             if first < asked.start and asked.stop <= last:
                 return first, last
-    start, end = asked.asked()
-    if bags:
+    segments = snapshot.timeline.segments_in(asked)
+    bags = (bag for segment in segments for bag in segment.bags if not is_carried(bag.file))
+    if any(asked.overlaps(bag.start, bag.end) for bag in bags):
         return None
+    start, end = asked.asked()
     if end < earliest:
         return None, earliest
     return (latest, None) if start > latest else None
