@@ -183,6 +183,12 @@ class Sights:
         """Returns these sights with other fixes."""
         return replace(self, tables=(*self.tables[:-1], fixes))
 
+    def only(self, *kinds: type[IntEnum]) -> Sights:
+        """Returns these sights with the rows of some tables alone."""
+        every = zip(TABLES, self.tables, strict=True)
+        tables = (table if kind in kinds else table[:0].copy() for kind, table in every)
+        return replace(self, tables=tuple(tables))
+
     @property
     def spots(self) -> Ints:
         """Where labels were seen (`Spot`)."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Look, Score, Spot
+from ros2_memory.analysis.sights import SCORE_BINS, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, places_at
 from ros2_memory.core.text import abbreviate
@@ -413,7 +413,7 @@ class _Finder:
             _, looks, missed = self.known.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
-        looked = self.known.estimate.sights.looks[:, Look.LAST]
+        looked = self.known.estimate.cells.last
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
         return StillThere("not_looked_at_since", last)

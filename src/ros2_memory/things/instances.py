@@ -134,6 +134,7 @@ class Estimate:
     """The things in sights, sorted by label and place."""
 
     sights: Sights
+    """Without what is in `cells` and `hits`, and what only an estimate needs."""
     instances: list[Instance]
     movers: list[Mover]
     counts: Ints
@@ -244,7 +245,7 @@ def estimate(
         elif _is_seen(group, seen):
             movers.append(Mover(group.key, group.epoch, group.rows))
     found = Estimate(
-        sights=sights,
+        sights=sights.only(Spot, Score, Unplaced),
         instances=instances,
         movers=movers,
         counts=seen.counts,

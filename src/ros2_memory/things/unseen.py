@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Look, Spot, Unplaced
+from ros2_memory.analysis.sights import Spot, Unplaced
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
 from ros2_memory.core.timebase import MAX_NS
@@ -113,9 +113,9 @@ def vague_notes(
 
 def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    sights = known.estimate.sights
+    sights, cells = known.estimate.sights, known.estimate.cells
     tables = (
-        (sights.looks, Look.FIRST, Look.LAST),
+        (np.stack((cells.first, cells.last), axis=1), 0, 1),
         (sights.spots, Spot.FIRST, Spot.LAST),
         (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
     )
