@@ -432,11 +432,16 @@ def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterat
 
 def _creeping(blocks: Blocks, chain: Ints, still: Marks) -> Marks:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
-    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
+    is_new = np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])]
+    run, begins = np.cumsum(is_new), np.flatnonzero(is_new)
     centres, noises = (blocks.lows + blocks.highs) / 2, blocks.noises
+    across = np.maximum.reduceat(centres, begins) - np.minimum.reduceat(centres, begins)
+    # In most runs the robot stands: no block is that far from another.
+    moved = np.flatnonzero(_lengths(across)[run - 1] > LARGEST_M)
     nearest = np.full(len(blocks), -1)
     for lag in range(1, _CREEP_BLOCKS):
-        waiting = np.flatnonzero((nearest[lag:] < 0) & (run[lag:] == run[:-lag])) + lag
+        waiting = moved[(moved >= lag) & (nearest[moved] < 0)]
+        waiting = waiting[run[waiting] == run[waiting - lag]]
         before = waiting - lag
         near = blocks.numbers[waiting] - blocks.numbers[before] < _CREEP_BLOCKS
         apart_m = _lengths(centres[waiting] - centres[before])
