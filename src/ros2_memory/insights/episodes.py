@@ -13,7 +13,6 @@ from itertools import islice, takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
@@ -23,7 +22,7 @@ from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import View, open_span
-from ros2_memory.places.pose_frames import robot_at
+from ros2_memory.places.pose_frames import recording_at, robot_at
 from ros2_memory.results import Changes, Episode, Spell
 
 if TYPE_CHECKING:
@@ -161,11 +160,9 @@ def spell_of(held: Held) -> Spell:
 
 def with_robot(view: View, topic: str, found: Episode, frame_id: str | None) -> Episode:
     """Returns an episode with where the robot was when it began."""
-    at = TimeWindow(found.first, found.first + 1)
-    bags = view.stream.overlapping_bags([topic], at)
-    if not bags:
+    recording = recording_at(view, topic, found.first)
+    if recording is None:
         return found
-    recording = min(each.bag.recording for each in bags)
     return replace(found, robot=robot_at(view, found.first, recording, frame_id))
 
 

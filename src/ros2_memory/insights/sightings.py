@@ -49,13 +49,12 @@ from ros2_memory.insights.goals import goals_asked
 from ros2_memory.insights.sighting_search import find_runs
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.places.pose_frames import pose_in, robot_at
+from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.conditions import Condition
@@ -327,7 +326,8 @@ def _sighting(
     thing, labels = _matching(seen, condition), {each.label for each in seen}
     robot_at_first = thing is None and run.begun
     at = run.first if robot_at_first else newest.time
-    robot = robot_at(view, at, _recording_at(view, newest, at), frame_id)
+    own = newest.bag.recording
+    robot = robot_at(view, at, recording_at(view, newest.topic, at, own) or own, frame_id)
     return Sighting(
         topic=run.topic,
         first=run.first,
@@ -391,14 +391,6 @@ def _with_fields(
     if refused and len(refused) == len(extended):
         raise refused[0]
     return tuple(extended)
-
-
-def _recording_at(view: View, newest: StoredMessage, at: Ns) -> Path:
-    """Returns the recording of a sighting's message at a time: its last may be of a later one."""
-    topic, own = newest.topic, newest.bag.recording
-    bags = view.stream.overlapping_bags([topic], TimeWindow(at, at + 1))
-    every = {each.bag.recording for each in bags}
-    return own if own in every else min(every, default=own)
 
 
 def _spot_of(

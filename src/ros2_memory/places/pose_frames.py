@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.analysis.motion.trajectory import Waypoint
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
@@ -97,6 +97,18 @@ def newest_pose(
     return found, view.extractor.pose(message, found.type)
 
 
+def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
+    """Returns a recording that has a topic before and after a time: `own` if it does.
+
+    Else the first of them by name, or `own`. By whole recordings: which of their bags reaches over
+    a time depends on how they were split.
+    """
+    spans = view.timeline.recordings(topic)
+    if own is not None and own in spans and spans[own][0] <= at <= spans[own][1]:
+        return own
+    return min((path for path, span in spans.items() if span[0] <= at <= span[1]), default=own)
+
+
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
     """Returns the robot's newest pose at or before a moment; None where it is not known.
 
@@ -140,10 +152,12 @@ def placed_waypoints(
     found: list[Waypoint] = []
     known_to_lead = False
     for each in waypoints:
-        bags = view.stream.overlapping_bags([topic], TimeWindow(each.time, each.time + 1))
+        recording = recording_at(view, topic, each.time)
         half = math.nan if each.yaw_rad is None else each.yaw_rad / 2
         pose = Pose(each.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-        there = None if not bags else _pose_near(view, pose, frame_id, each.time, bags[0])
+        there = None
+        if recording is not None:
+            there = _pose_near(view, pose, frame_id, each.time, recording)
         if there is None or there.orientation is None:
             # Asked once: to look for a frame that nothing leads to at each time takes long.
             if not (found or known_to_lead) and not connects(view, (frame_id, own_frame)):
@@ -160,10 +174,10 @@ def placed_waypoints(
     return tuple(found)
 
 
-def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, bag: BagSpan) -> Pose | None:
+def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
     """Returns a pose by the transforms of its time, or of the nearest one up to `HOLD_NS` off."""
     for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
-        found = pose_in(view, pose, frame_id, time + off, bag.bag.recording)
+        found = pose_in(view, pose, frame_id, time + off, recording)
         if found is not None:
             return found
     return None

@@ -374,6 +374,7 @@ def arrive(bag_dir: Path, splits: Splits, draw: Random) -> World:
 
 @settings(max_examples=examples(24))
 @given(seed=st.integers(0, 2**32), cuts=st.lists(st.floats(0, 1), max_size=4))
+@example(6671, [0.9375, 0.5, 0.03125, 0.25])  # A sighting goes on in another recording.
 def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[float]) -> None:
     draw = random.Random(seed)
     recordings = draw_recordings(draw)
