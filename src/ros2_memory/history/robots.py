@@ -57,8 +57,8 @@ _MAX_TREES: Final = 32
 """Recordings of which static transforms are compared, the newest."""
 _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
-_APART: Final[Key[dict[tuple[Path, Path], str | None]]] = Key()
-"""Of a memory: for pairs of recordings, the topic on which they differ. The past stays."""
+_APART: Final[Key[dict[tuple[Path, Path], tuple[Overlapping, str | None]]]] = Key()
+"""Of a memory: by two recordings, how they overlapped, and the topic on which they differed."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
@@ -117,14 +117,17 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     steps = _steps_back(view)
     for pair in overlapping_recordings(view.snapshot):
         key = (pair.first, pair.second)
+        before, topic = known.get(key, (None, None))
         by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
-        if key not in known and not by_clock and len(found) < _MAX_PAIRS:
+        # A bag that is being copied grows.
+        if before != pair and not by_clock and len(found) < _MAX_PAIRS:
             bags = bags or recordings_of(view.snapshot)
             try:
-                known[key] = _differing_topic(view, pair, bags)
+                topic = _differing_topic(view, pair, bags)
             except QueryTimeoutError:
                 break
-        found.append(Mixed(pair, known.get(key)))
+            known[key] = pair, topic
+        found.append(Mixed(pair, topic))
     return tuple(found)
 
 

@@ -236,10 +236,11 @@ def _sweep(
                     continue
                 pair = (other, own) if other < own else (own, other)
                 last = min(until, end)
-                first, until_then, shared = pairs.get(pair, (start, last, 0))
-                pairs[pair] = (first, max(last, until_then), shared + last - start)
+                first, until_then, shared = pairs.get(pair, (start, start, 0))
+                more = max(last - max(start, until_then), 0)
+                pairs[pair] = (first, max(last, until_then), shared + more)
+        spans[own] = spans.get(own, 0) + max(end - max(start, before or start), 0)
         reach[own] = end if before is None or end > before else before
-        spans[own] = spans.get(own, 0) + end - start
     return spans, pairs
 
 

@@ -336,8 +336,9 @@ def alike(reply: Any) -> Any:
     kept["notes"] = [
         note
         for note in reply.get("notes", ())
-        # These name bags, or silences.
-        if "dated by a wrong clock" not in note and not note.startswith("silent while")
+        # These name bags or silences, or are of a minute ago, before the last bags came.
+        if "dated by a wrong clock" not in note
+        and not note.startswith(("silent while", "robots are mixed"))
     ]
     if "topic_s" in reply.get("columns", ()):  # how long there were bags with the topic
         at = reply["columns"].index("topic_s")
