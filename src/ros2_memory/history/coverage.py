@@ -520,11 +520,12 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
     reach = snapshot.earliest, snapshot.latest
     if window.overlaps(*reach):
         return reach
-    faulty = [
-        fault.bag for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
-    ]
-    if not faulty:
+    misdated = [fault.bag for fault in snapshot.misdated]
+    shown = {bag.recording for bag in misdated if window.overlaps(bag.start, bag.end)}
+    if not shown:
         return reach
+    # Of whole recordings: where their bags end says nothing.
+    faulty = [bag for bag in misdated if bag.recording in shown]
     return min(bag.start for bag in faulty), max(bag.end for bag in faulty)
 
 
