@@ -125,7 +125,8 @@ def _things(
 ) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
     limits = view.limits
-    known = known_things(view, limits.min_score, limits.labels)
+    both = TimeWindow(min(one.start for one in windows), max(one.stop for one in windows))
+    known = known_things(view, limits.min_score, limits.labels, both)
     note_other_frames(view, known, where)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))
     frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])

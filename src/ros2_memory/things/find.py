@@ -14,7 +14,7 @@ from ros2_memory.analysis.sights import SCORE_BINS, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, places_at
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
@@ -87,7 +87,7 @@ def find_things(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
     note_robots(view, view.pose_topic, window)
-    known = known_things(view, lowest, limits.labels)
+    known = known_things(view, lowest, limits.labels, window)
     view.notes.retract_outside(asked_for)
     note_other_frames(view, known, region)
     asked = {known.labels.key(each): each for each in labels}
@@ -120,7 +120,7 @@ def find_things(
         total=totals.total(),
         labels=tuple(sorted(totals.items())),
         now=now,
-        all_counted=known.since is None,
+        all_counted=known.reaches_back(window),
         notes=(
             *view.notes.sentences(),
             *describe_held(being_written(view.snapshot, asked_for)),
@@ -401,7 +401,7 @@ class _Finder:
         x, y, yaw = pose
         return x / _MM, y / _MM, math.radians((yaw + 180) % 360 - 180)
 
-    def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere:
+    def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
         """Returns the state of a thing since it was last seen in the window."""
         spots = self.known.estimate.sights.spots
         last = int(spots[rows, Spot.LAST].max())
@@ -416,7 +416,9 @@ class _Finder:
         looked = self.known.estimate.cells.last
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
-        return StillThere("not_looked_at_since", last)
+        # Of a later look nothing is known where the estimate ends.
+        is_whole = self.known.until == MAX_NS
+        return StillThere("not_looked_at_since", last) if is_whole else None
 
 
 def _place(stay: PlacedStay) -> tuple[float, float, float]:

@@ -1,7 +1,8 @@
 """The things of a memory: estimated from the sights of all its bags, once for each timeline.
 
 Where gathering sights takes too long the estimate begins later, and says so. So it does where there
-are too many sightings: a detector that sees things everywhere has thousands in an hour.
+are too many sightings: a detector that sees things everywhere has thousands in an hour. Of a window
+before it there is then another estimate, of the sightings until its end.
 """
 
 from __future__ import annotations
@@ -13,16 +14,17 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import Watching
+from ros2_memory.things.seen import SIGHTS_NS, Watching
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
 
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
@@ -47,6 +49,7 @@ class KnownThings:
         has_map: whether any sights are in the map.
         since: how far back it reaches, where not all bags could be read in time; else None.
         crowded: whether it begins there because there are too many sightings before.
+        until: where it ends; later sightings are none of it.
     """
 
     estimate: Estimate
@@ -55,35 +58,65 @@ class KnownThings:
     since: Ns | None = None
     has_map: bool = True
     crowded: bool = False
+    until: Ns = MAX_NS
+
+    @property
+    def reach(self) -> str:
+        """Of which time it is, as the end of a sentence; empty where it is of all."""
+        if self.until == MAX_NS:
+            return "" if self.since is None else f" since {unix_text(self.since)}"
+        since = "" if self.since is None else f" from {unix_text(self.since)}"
+        return f"{since} until {unix_text(self.until)}"
+
+    def reaches_back(self, window: TimeWindow) -> bool:
+        """Returns whether the things of a whole window are known."""
+        return self.since is None or self.since <= window.start
 
 
 def known_things(
-    view: View, min_score: float, spellings: Mapping[str, Sequence[str]]
+    view: View, min_score: float, spellings: Mapping[str, Sequence[str]], window: TimeWindow
 ) -> KnownThings:
     """Returns the things of all bags of a view; of what could not be read a note says so.
+
+    Where there are too many sightings to compare all, they are the newest; or, for a window that
+    these do not reach back to, those until its end.
 
     Raises:
         QueryTimeoutError: the call's time is over before any bag was read.
     """
+    latest = view.snapshot.latest
+    known = _known_until(view, min_score, spellings, MAX_NS)
+    until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
+    if known.crowded and not known.reaches_back(window) and until <= (latest or until):
+        known = _known_until(view, min_score, spellings, until)
+    if known.crowded or known.until < MAX_NS:
+        view.notes.complete &= known.reaches_back(window)
+        others = "other" if known.until < MAX_NS else "older"
+        view.notes.add(
+            f"things are known{known.reach} only: there are too many sightings to compare {others} "
+            "ones, which find_matches finds"
+        )
+    return known
+
+
+def _known_until(
+    view: View, min_score: float, spellings: Mapping[str, Sequence[str]], until: Ns
+) -> KnownThings:
+    """Returns the things that were seen before a time; remembers those of now and of one other."""
     timeline, scanner = view.timeline, view.memory.columns
     described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
-    key = ("things", min_score, described, view.limits.map_frame, view.pose_topic)
-    kept = scanner.things.get(key)
-    if kept is not None and kept[0] is timeline and isinstance(kept[1], KnownThings):
-        known = kept[1]
-    else:
-        before = view.notes.added
-        known = _Loader(view, key).load(min_score, Labels(spellings))
-        is_read = known.since is None or known.crowded
-        is_whole = is_read and not view.call.used_active and view.notes.added == before
-        if is_whole:
-            scanner.things.put(key, (timeline, known), 1)
-    if known.crowded and known.since is not None:
-        view.notes.complete = False
-        view.notes.add(
-            f"things are known since {unix_text(known.since)} only: there are too many sightings "
-            "to compare older ones, which find_matches finds"
-        )
+    key = (min_score, described, view.limits.map_frame, view.pose_topic)
+    own = ("things", until == MAX_NS, *key)
+    before = scanner.things.get(own)
+    if before is not None and before[0] is timeline:
+        known = before[1]
+        if isinstance(known, KnownThings) and known.until == until:
+            return known
+    noted = view.notes.added
+    known = _Loader(view, key, until).load(min_score, Labels(spellings))
+    is_read = known.since is None or known.crowded
+    if is_read and not view.call.used_active and view.notes.added == noted:
+        scanner.things.put(own, (timeline, known), 1)
     return known
 
 
@@ -108,11 +141,13 @@ class _Loader:
     Args:
         view: has the bags.
         key: tells estimates with other settings apart.
+        until: later sights are left out.
     """
 
-    def __init__(self, view: View, key: tuple[Hashable, ...]) -> None:
+    def __init__(self, view: View, key: tuple[Hashable, ...], until: Ns) -> None:
         self._view = view
         self._key = ("most spots", *key)
+        self._until = until
         self._since: Ns | None = None
 
     def load(self, min_score: float, labels: Labels) -> KnownThings:
@@ -154,7 +189,7 @@ class _Loader:
         until = self._view.call.partial_after(READING_S)
         spots = 0
         try:
-            for part in Watching(self._view).newest_first():
+            for part in Watching(self._view).newest_first(self._until):
                 if spots >= most:
                     return parts[::-1], True
                 if parts and until.expired():
@@ -195,9 +230,8 @@ class _Loader:
         since = self._since
         if crowded:
             since = max(stretches[0].start, MIN_NS if since is None else since)
-        return KnownThings(
-            found, labels, names, since, bool(sights.topics) and 0 in epochs, crowded
-        )
+        has_map = bool(sights.topics) and 0 in epochs
+        return KnownThings(found, labels, names, since, has_map, crowded, self._until)
 
     def _epochs(self, stretches: Sequence[Stretch]) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each stretch, and the frame of each epoch.

@@ -192,13 +192,13 @@ class Watching:
         self._lasts = not view.stream.may_be_relatched(self._topics)
         self._followed: tuple[object, str] = None, ""
 
-    def newest_first(self) -> Iterator[list[Stretch]]:
-        """Yields the sights of all sessions in each stretch that has some.
+    def newest_first(self, until: Ns = MAX_NS) -> Iterator[list[Stretch]]:
+        """Yields the sights of all sessions in each stretch with some that begins before a time.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for around in self._stretches_in(TimeWindow.everything()):
+        for around in self._stretches_in(TimeWindow(MIN_NS, until)):
             sessions = [one.own for one in around.sessions]
             if found := self._unpacked(around.window.start, sessions, self._known(around)):
                 yield found

@@ -120,17 +120,12 @@ def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[st
         (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
     )
     is_empty = not any(len(_during(window, *table)) for table in tables)
-    if sights.topics and is_empty and _reaches_back(known, window):
+    if sights.topics and is_empty and known.reaches_back(window):
         yield (
             f"{listed(sights.topics)} published nothing in this window: whether things were there "
             "is not known"
         )
     yield from describe_silences(view, sights.topics, window)
-
-
-def _reaches_back(known: KnownThings, window: TimeWindow) -> bool:
-    """Returns whether the things of a whole window are known; else nothing is missing for sure."""
-    return known.since is None or known.since <= window.start
 
 
 def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
@@ -189,8 +184,7 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
         meant = f"; did you mean {close[0]}?" if close else ""
         label = abbreviate(asked.labels[key])
         if names:
-            since = "" if known.since is None else f" since {unix_text(known.since)}"
-            text = f"no detector reported {label}{since}; there are: {listed(shown)}{meant}"
+            text = f"no detector reported {label}{known.reach}; there are: {listed(shown)}{meant}"
             yield repeating(text, shown)
         return
     _, count, low, unplaced, *_ = _detected(known, key, asked.window)
@@ -206,6 +200,7 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
             f"it was detected {counted(count, 'time')} in this time, but does not count "
             f"as a thing{asked.inside}: find_matches lists single detections"
         )
-    if not count + low + unplaced and _reaches_back(known, asked.window):
+    if not count + low + unplaced and known.reaches_back(asked.window):
         every = sum(_detected(known, key, TimeWindow.everything())[1:4])
-        yield f"it was detected {counted(every, 'time')} in all, and not once in this window"
+        when = known.reach or " in all"
+        yield f"it was detected {counted(every, 'time')}{when}, and not once in this window"

@@ -168,13 +168,34 @@ def test_of_a_window_before_what_was_compared_no_never_is_said(
 ) -> None:
     monkeypatch.setattr(known, "_MOST_SPOTS", 3)
     start_s = float(begin_of(0))
-    for labels in ((), ("thing 0",), ("thing 7",)):
+    for labels, seen in (((), THINGS[2:5]), (("thing 0",), ()), (("thing 7",), ())):
         found = find_things(
-            crowded, Call(Deadline.after(60)), labels, start_s=start_s, end_s=start_s + 600
+            crowded, Call(Deadline.after(60)), labels, start_s=start_s, end_s=begin_of(5) - 1
         )
-        assert not found.things
+        assert {thing.label for thing in found.things} == {label for label, *_ in seen}
+        assert not found.all_counted
         assert any("too many sightings" in note for note in found.notes)
         text = " ".join(found.notes)
         assert "published nothing" not in text
         assert "not once" not in text
-        assert "no detector reported" not in text or '"thing 0" since' in text
+        assert "no detector reported" not in text or f'" from {begin_of(2)}' in text
+
+
+def test_of_a_window_before_what_was_compared_what_was_seen_until_its_end_is_compared(
+    crowded: Memory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(known, "_MOST_SPOTS", 3)
+    for _ in range(2):  # the second time it is known
+        for nth in range(4):
+            start_s = float(begin_of(nth))
+            found = find_things(
+                crowded, Call(Deadline.after(60)), start_s=start_s, end_s=start_s + 599
+            )
+            [thing] = found.things
+            assert (thing.label, found.total) == (THINGS[nth][0], 1)
+            # Nothing is said of what came after: it was not looked at.
+            assert thing.still_there is None or thing.still_there.state == "in_view"
+            [note] = [note for note in found.notes if "too many sightings" in note]
+            assert f"until {begin_of(nth) + 600}" in note
+    labels, [note] = labels_and_notes(crowded, Deadline.after(60))
+    assert labels == {label for label, *_ in THINGS[5:]}
