@@ -237,6 +237,19 @@ def _seconds_out(asked: Asked) -> Series:
     return Series(out)
 
 
+def _lowest_battery(asked: Asked) -> Series:
+    found: dict[str, Expected] = {}
+    cut = asked.world.life.power_cut[0]
+    for number, day in enumerate(asked.truth.days):
+        within = 0.02
+        if number * DAY <= cut < (number + 1) * DAY:
+            # Of the split that the power cut ended a part is lost.
+            before, after = asked.world.battery(np.array([cut - asked.split_s, cut])).tolist()
+            within += abs(before - after)
+        found[day.date] = Number(day.lowest_battery, within)
+    return Series(found)
+
+
 def _each_day(asked: Asked) -> list[Question]:
     days = asked.truth.days
     weekdays: dict[str, float] = {}
@@ -271,11 +284,7 @@ def _each_day(asked: Asked) -> list[Question]:
             "battery",
             "routine",
             "How low was your battery on each day?",
-            {
-                "lowest_fraction": Series(
-                    {day.date: Number(day.lowest_battery, 0.02) for day in days}
-                )
-            },
+            {"lowest_fraction": _lowest_battery(asked)},
             ask(
                 "get_topic_in_range",
                 topic=_BATTERY,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from itertools import groupby
 from typing import TYPE_CHECKING, Final
 
 from tests.home import replies
@@ -15,7 +16,7 @@ from tests.home.things import NEVER_SEEN
 from tests.home.world import VISION
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from ros2_memory.core.model import JsonValue
     from tests.home.judging import Answer, Expected
@@ -237,9 +238,11 @@ def _moved(asked: Asked) -> list[Question]:
             "mug-places",
             "change",
             "In which rooms has the mug been, in order?",
-            {"rooms": Order(tuple(_room_of(stay) for stay in mug))},
+            {"rooms": Order(_without_repeats(map(_room_of, mug)))},
             ask("find_things", label="mug"),
-            lambda found: {"rooms": [replies.place(each) for each in replies.stays(_one(found))]},
+            lambda found: {
+                "rooms": [*_without_repeats(map(replies.place, replies.stays(_one(found))))]
+            },
         ),
         Question(
             "ball-moves",
@@ -251,6 +254,11 @@ def _moved(asked: Asked) -> list[Question]:
         ),
     ]
     return found
+
+
+def _without_repeats(rooms: Iterable[str]) -> tuple[str, ...]:
+    """Returns rooms in order: a thing that is moved within one is in it once."""
+    return tuple(room for room, _ in groupby(rooms))
 
 
 def _room_of(stay: PlaceOfThing) -> str:
