@@ -203,7 +203,7 @@ def _silences_of(
                 break
             until = span[1]
             first, last = max(span[0], start), min(span[1], stop)
-            recorded = last - first - _length_in(gaps, first, last)
+            recorded = last - first - length_in(gaps, first, last)
             if recorded > limit:
                 pieces.append((first, last))
                 length += recorded
@@ -212,7 +212,7 @@ def _silences_of(
             yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
 
 
-def _length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
+def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
     """Returns how much of a time lies in gaps."""
     begin = bisect_right(gaps, first, key=itemgetter(1))
     end = bisect_left(gaps, last, key=itemgetter(0))

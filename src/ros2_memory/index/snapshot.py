@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import chain
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import (
@@ -12,6 +12,7 @@ from ros2_memory.analysis.silences import (
     Presence,
     Silence,
     joined,
+    length_in,
     shortest_silence,
     silences,
     usual_period,
@@ -145,6 +146,18 @@ class Snapshot:
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic of `silences` must have no message to count as silent."""
         return shortest_silence(usual_period(self._presences[topic]) or 0)
+
+    def longest_silence(self, topic: str) -> Ns:
+        """Returns for how long others were recorded, at most, between two messages of a topic.
+
+        From bag to bag: what is silent within one is not known.
+        """
+        presence = self._presences.get(topic)
+        pauses = () if presence is None else pairwise(presence.runs)
+        return max(
+            (stop - start - length_in(self.gaps, start, stop) for (_, start), (stop, _) in pauses),
+            default=0,
+        )
 
     @cached_property
     def newest_stretch(self) -> Ns | None:

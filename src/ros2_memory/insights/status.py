@@ -230,7 +230,8 @@ def missing_data(view: View) -> Iterator[str]:
 def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     """Yields topics that had messages often, and none when the newest data was recorded.
 
-    Not those of before a long gap: that may be another robot's recording.
+    Not those of before a long gap: that may be another robot's recording. Nor those that were
+    silent for as long before, as those of a robot that drives are whenever it is docked.
     """
     latest, latching = snapshot.dating.latest, memory.limits.latching
     begin = snapshot.newest_stretch
@@ -245,7 +246,8 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         if messages < _MIN_MESSAGES or last < begin:
             continue
         usual = (last - first) // (messages - 1)
-        is_long = latest - last > max(SILENT_AFTER_NS, _SILENT_PERIODS * usual)
+        longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
+        is_long = latest - last > max(SILENT_AFTER_NS, longest)
         since = TimeWindow(last + 1, latest + 1)
         if is_long and not was_cut(memory.index.bag_dir, topic, since):
             yield SilentTopic(topic, last, usual)

@@ -274,6 +274,21 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
     assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S, S),)
 
 
+@pytest.mark.parametrize(("docked_s", "fell"), [(190, []), (260, ["/odom"])])
+def test_what_a_docked_robot_does_not_say_did_not_fall_silent(
+    tmp_path: Path, docked_s: int, fell: list[str]
+) -> None:
+    """It drives for 100 s and is docked for 200 s, again and again; then for as long, or longer."""
+    for nth in range(40 + docked_s // 10):
+        seconds = range(10 * nth, 10 * nth + 10)
+        messages = [boolean(BEGIN + t * S, True) for t in seconds]
+        if nth < 40:
+            messages += [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in seconds if t % 300 < 100]
+        write_mcap(tmp_path / "a" / f"a_{nth}.mcap", messages)
+    answer = memory_status(memory_of(tmp_path), Call())
+    assert [each.topic for each in answer.fell_silent] == fell
+
+
 @pytest.mark.parametrize(("later", "fell"), [(0, ["/bumper"]), (S, [])])
 def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
     tmp_path: Path, later: int, fell: list[str]
