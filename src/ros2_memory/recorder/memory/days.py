@@ -94,6 +94,8 @@ _FIRST_DAY: Final = "2014"
 _QOS: Final = "offered_qos_profiles"
 MONTH_NS: Final[Ns] = 31 * 86_400 * NS_PER_S
 """The numbers of older days have one message a minute."""
+_BY_MINUTE: Final = ("ros2_memory_numbers_s", "60")
+"""In the metadata of each channel of such a day: it is not read again to thin it."""
 GRACE_S: Final = 86_400.0
 """So long the recorder runs before days are deleted that nobody wants: `memory.keep` may have been
 lost by accident."""
@@ -220,8 +222,12 @@ class MemoryDays:
         for path in self._days():
             if path.name < month_ago and path not in self._minutes:
                 self._minutes.add(path)
-                self._thin_to_minutes(path)
-                break
+                channels = self._reader.channels(path)
+                is_thinned = all(_BY_MINUTE in channel.metadata for channel in channels)
+                # A damaged day written anew would not tell that something is missing.
+                if not is_thinned and self._is_whole(path):
+                    self._thin_to_minutes(path)
+                    break
 
     def _delete(self, path: Path) -> None:
         path.unlink()
@@ -236,12 +242,9 @@ class MemoryDays:
                 key = (table.channel.topic, table.channel.type)
                 numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
         stays = {key: {*one.times().tolist()} for key, one in numbers.items()}
-        known = self._reader.summarize(path).topics
-        before = [one.count for one in known if (one.topic, one.type) in stays]
-        if sum(before) > sum(map(len, stays.values())):
-            left = (one for one in self._joined(path, ()) if _stays(one, stays))
-            self._write_beside(path, left).replace(path)
-            flush(self._folder)
+        left = (_by_minute(one) for one in self._joined(path, ()) if _stays(one, stays))
+        self._write_beside(path, left).replace(path)
+        flush(self._folder)
 
     def clear(self) -> None:
         """Deletes all days where nothing is to stay (`memory.keep`), a day after saying so.
@@ -422,10 +425,13 @@ class MemoryDays:
             if not path.exists():
                 return path
             with suppress(BagError):
-                summary = self._reader.summarize(path)
-                if summary.complete and not summary.notes and self._own.owns_bag(path):
+                if self._is_whole(path) and self._own.owns_bag(path):
                     return path
             number += 1
+
+    def _is_whole(self, path: Path) -> bool:
+        summary = self._reader.summarize(path)
+        return summary.complete and not summary.notes
 
     def _joined(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
         """Yields the messages of a day and others, hour by hour and topic by topic, copies once.
@@ -502,6 +508,13 @@ def _stays(record: Record, stays: Mapping[tuple[str, str], Collection[Ns]]) -> b
     """Returns whether a message is one of those, or of a topic that is not thinned."""
     key = (record.channel.topic, record.channel.type)
     return key not in stays or record.log_time in stays[key]
+
+
+def _by_minute(record: Record) -> Record:
+    """Returns a message whose channel states that its day is thinned, once."""
+    channel = record.channel
+    metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
+    return record._replace(channel=replace(channel, metadata=(*metadata,)))
 
 
 def _by_topic(record: Record) -> tuple[str, Ns]:

@@ -552,6 +552,49 @@ def test_after_a_month_numbers_have_one_message_a_minute(bag_dir: Path) -> None:
     )
 
 
+def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    now, path = T0 + MONTH_NS + 2 * 86_400 * S, bag_dir / DAY_FILE
+    unthinned = path.stat().st_ino
+    days_of(bag_dir).limit(now)
+    thinned = path.stat().st_ino
+    assert thinned != unthinned
+    read: list[object] = []
+
+    def batches(_: BagDirReader, *of: object, **__: object) -> Iterator[object]:
+        read.append(of)
+        return iter(())
+
+    with monkeypatch.context() as patched:
+        patched.setattr(BagDirReader, "batches", batches)
+        days_of(bag_dir).limit(now)
+    assert not read
+    assert path.stat().st_ino == thinned
+    split(bag_dir, 60, name="rec_B")
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    before = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
+    days_of(bag_dir).limit(now)
+    after = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
+    assert len(after) < len(before)
+    assert len({*after}) == len(after)
+
+
+def test_a_damaged_day_is_not_thinned_so_that_it_still_says_so(bag_dir: Path) -> None:
+    split(bag_dir, 0)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    path = bag_dir / DAY_FILE
+    whole = path.read_bytes()
+    path.write_bytes(damaged := whole[:300] + bytes(100) + whole[400:])
+    days_of(bag_dir).limit(T0 + MONTH_NS + 2 * 86_400 * S)
+    assert path.read_bytes() == damaged
+
+
 def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     """Splits of 13:20 to 14:40; at 14:10 plus a day the hour from 13:00 is too old."""
     for nth in range(80):
