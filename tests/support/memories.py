@@ -60,11 +60,13 @@ def memory_of(
     limits: QuerySettings | None = None,
     include_active: bool = False,
     setting: str = BAG_DIR_SETTING,
+    recalls: bool = False,
 ) -> Memory:
     """The memory over `bag_dir`, which `setting` names, rescanned at every question.
 
     Unless a clock is given it is later by an hour, and than all that tests write: what is
-    unfinished was left so by a crash, and nothing is dated in the future.
+    unfinished was left so by a crash, and nothing is dated in the future. One that `recalls` has
+    stored the columns of its closed bags.
     """
     if reader is None:
         reader = McapReader() if storage == "mcap" else Rosbag2Reader()
@@ -80,7 +82,12 @@ def memory_of(
     )
     settings = limits or QuerySettings()
     columns = Scanner(None, bag_dir)
-    return Memory(index, reader, extractor(), timed, settings, columns=columns)
+    memory = Memory(index, reader, extractor(), timed, settings, columns=columns)
+    return with_store(memory, bag_dir) if recalls else memory
+
+
+each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+"""Asked of the bags alone, and of columns that are stored."""
 
 
 SCHEMA_FILE = Path(__file__).resolve().parents[2] / "config" / "message_schemas.yaml"

@@ -27,7 +27,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,8 +36,6 @@ S = 10**9
 T0_S = 1_784_000_000
 T0 = T0_S * S
 YAW = math.radians(30)
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def pose_stamped(ns: int, x: float, y: float, topic: str = "/pose") -> Msg:

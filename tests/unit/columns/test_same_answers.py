@@ -122,7 +122,7 @@ def test_every_question_is_answered_as_without_a_store(clock: str, seed: int, pa
         moments = write_history(bag_dir, draw).moments
         limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
-        recalled = with_store(replace(plain), bag_dir, part=part)
+        recalled = with_store(plain, bag_dir, part=part)
         for asked, ask in questions(moments, draw):
             assert answer(recalled, ask) == answer(plain, ask), (seed, part, asked)
 
@@ -142,7 +142,7 @@ def test_what_is_stored_of_many_bags_changes_no_answer(
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        filling = with_store(replace(plain), bag_dir)
+        filling = with_store(plain, bag_dir)
         assert filling.columns is not None
         # As another process: nothing is in memory.
         recalled = replace(plain, columns=Scanner(filling.columns.store, bag_dir))
@@ -162,7 +162,7 @@ def test_the_newest_message_is_the_first_of_the_stream_that_is_newest_first(seed
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        recalled = with_store(replace(plain), bag_dir)
+        recalled = with_store(plain, bag_dir)
         for _ in range(60):
             stop = draw.choice(moments) + draw.choice([0, 1, 10**6])
             start = draw.choice([MIN_NS, stop - draw.choice([1, 10**8, 3 * 10**9, 10**11])])
@@ -190,7 +190,7 @@ def test_a_latched_message_received_again_is_no_event_with_a_store_either(
         tmp_path / "b" / "b_0.mcap", [odom(600 * S, 0, 0), *again, odom(601 * S, 0, 0)], layout
     )
     plain = memory_of(tmp_path)
-    recalled = with_store(replace(plain), tmp_path)
+    recalled = with_store(plain, tmp_path)
     told = [
         recap(memory, Call(), TimeRange(start_s=600.0, end_s=610.0)) for memory in (plain, recalled)
     ]

@@ -33,7 +33,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import keeper_of
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import each_way, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,8 +45,6 @@ MS = 10**6
 T0 = 1_790_000_000 * S
 MAP, TELEMETRY, ROSOUT = "/map_name", "/fmu/out/vehicle_status", "/rosout"
 TRANSIENT = McapLayout(latched=frozenset({MAP, TELEMETRY, ROSOUT, "/tf_static"}))
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def log_line(at: int) -> Msg:
@@ -83,8 +81,7 @@ def record(folder: Path, messages: list[Msg], layout: McapLayout = TRANSIENT) ->
 
 
 def remembered(root: Path, *, recalls: bool = False, **limits: Any) -> Memory:
-    memory = memory_of(root, limits=QuerySettings(**limits))
-    return with_store(replace(memory), root) if recalls else memory
+    return memory_of(root, limits=QuerySettings(**limits), recalls=recalls)
 
 
 def reply(memory: Memory, topic: str, at: int) -> dict[str, Any]:

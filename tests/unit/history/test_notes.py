@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from ros2_memory.core.text import Reason
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -24,8 +24,6 @@ T0_S = 1_784_000_000
 T0 = T0_S * S
 OBJECTS = "/vision/scene/scene_objects"
 CUP = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def write_protobuf(path: Path, topics: int) -> None:
@@ -123,9 +121,7 @@ def test_a_message_that_cannot_be_decoded_ends_no_sighting_and_is_none(
     for split in range(3):
         path = tmp_path / "rec" / f"rec_{split}.mcap"
         write_mcap(path, messages[10 * split : 10 * split + 10])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     reply = asked(memory, tmp_path, "find_matches", **CUP)
     seen = [n for n in range(20) if n not in damaged]
     [sighting] = reply["sightings"]
@@ -146,9 +142,7 @@ def test_a_slow_detector_is_not_silent_while_its_messages_cannot_be_decoded(
     )
     seen = [detections(T0 + at * S, ["cup"]) for at in (0, 16, 40)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [seen[0], torn, *seen[1:]])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     sightings = asked(memory, tmp_path, "find_matches", **CUP)["sightings"]
     spans = [(each["first_seen"] - T0_S, each["last_seen"] - T0_S) for each in sightings]
     assert spans == [(40, 40), (0, 16)]

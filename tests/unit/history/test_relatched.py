@@ -198,7 +198,7 @@ def test_questions_get_equal_answers_with_and_without_the_store(seed: int) -> No
         root = Path(folder)
         write_recordings(root, random.Random(seed))
         plain = memory_of(root, reader=McapReader())
-        recalled = with_store(replace(plain), root)
+        recalled = with_store(plain, root)
         for question in QUESTIONS:
             assert question(plain, root) == question(recalled, root)
 

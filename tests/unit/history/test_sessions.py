@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -27,7 +26,7 @@ from ros2_memory.queries import (
 )
 from tests.support.bags import Msg, detections, make, odom, tf, write_mcap
 from tests.support.bags import transform as stamped
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import each_way, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +37,6 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000 * S
 DAY = 86_400 * S
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def static(at: int, parent: str, child: str, x: float) -> Msg:
@@ -70,8 +67,7 @@ def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
 
 
 def remembered(root: Path, *, recalls: bool) -> Memory:
-    memory = memory_of(root)
-    return with_store(replace(memory), root) if recalls else memory
+    return memory_of(root, recalls=recalls)
 
 
 def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:

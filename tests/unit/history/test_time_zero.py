@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.history.context import QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, each_way, memory_of, replied
 from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
@@ -25,7 +25,6 @@ SEARCH = {"condition_type": "equals", "value": True}
 NEVER = {"condition_type": "contains", "value": "never recorded"}
 PLACE = {"condition_type": "near_position", "value": {"x": 0.0, "y": 0.0}}
 
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 each_now = pytest.mark.parametrize("now", ["wall", "latest"])
 
 
@@ -93,8 +92,9 @@ def bag_dir(tmp_path: Path) -> Path:
 
 
 def memory_at(bag_dir: Path, recalls: bool, now: Now = "wall") -> Memory:
-    memory = memory_of(bag_dir, clock=SettableClock(9 * S), limits=QuerySettings(now=now))
-    return with_store(memory, bag_dir) if recalls else memory
+    return memory_of(
+        bag_dir, clock=SettableClock(9 * S), limits=QuerySettings(now=now), recalls=recalls
+    )
 
 
 @each_way
@@ -158,8 +158,7 @@ def test_a_window_below_zero_is_clamped_at_both_ends(
     messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
     clock = SettableClock((begin_s + 9) * S)
-    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(now=now))
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(now=now), recalls=recalls)
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "recap", **window)
     assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
@@ -177,8 +176,7 @@ def test_no_span_that_was_searched_ends_before_it_begins(
 ) -> None:
     begin = 1_784_000_000 * S
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
     if not end > begin / S > start:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -20,7 +19,7 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, each_way, memory_of, replied
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000 * S
 RUNNING, SUCCEEDED, ABORTED = 2, 4, 6
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def at(seconds: float) -> int:
@@ -58,9 +55,7 @@ def write(folder: Path, messages: list[Msg], split_s: float = 20.0) -> None:
 
 
 def before(folder: Path, around: float, *, recalls: bool = False, **given: float) -> dict[str, Any]:
-    memory = memory_of(folder)
-    if recalls:
-        memory = with_store(replace(memory), folder)
+    memory = memory_of(folder, recalls=recalls)
     reply: dict[str, Any] = asked(memory, folder, "recap", around=BEGIN / S + around, **given)
     return reply
 
@@ -106,9 +101,7 @@ def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool)
 @each_way
 def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recalls: bool) -> None:
     write(tmp_path, ALL)
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert [each["text"] for each in stop["before"]] == [

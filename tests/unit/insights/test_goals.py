@@ -35,9 +35,7 @@ def told(
 ) -> list[Told]:
     for number, at in enumerate(range(0, len(messages), cut)):
         write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", messages[at : at + cut])
-    memory = memory_of(bag_dir)
-    if recalls:
-        memory = with_store(memory, bag_dir)
+    memory = memory_of(bag_dir, recalls=recalls)
     found = recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
     return [row(each) for each in found.events if "goal" in each.kind]
 

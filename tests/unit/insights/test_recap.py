@@ -44,7 +44,7 @@ from tests.support.bags import (
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.moving_map import write_moving_map
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def over(memory: Memory, begin: float, end: float) -> Recap:
@@ -73,9 +71,7 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: 
     session = SESSIONS["session_mcap"]
     for bag in session.folder.glob("*.mcap"):
         (tmp_path / bag.name).write_bytes(bag.read_bytes())
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
     assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
     assert answer.stood == 0
@@ -105,9 +101,7 @@ def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
     recorder = DemoRecorder(tmp_path / "flat", MessageSchedule(BEGIN, BEGIN), clock=FixedClock(now))
     recorder.write_until(now)
     recorder.stop()
-    memory = memory_of(tmp_path, clock=SettableClock(now))
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, clock=SettableClock(now), recalls=recalls)
     span = TimeRange(start_s=BEGIN / S + 5.0, end_s=BEGIN / S + 95.0)
     answer = recap(memory, Call(), span, frame_id="odom")
     assert answer.frame_id == "odom"
@@ -163,9 +157,7 @@ def _drive(
 @each_way
 def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> None:
     [(began, ended)] = _drive(tmp_path, [(8.745, 0.5), (8.0, 0.0), (9.0, 0.5)], begin=260)
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 260, 286)
     [stop] = [each for each in answer.events if each.kind == "stop"]
     assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
@@ -181,9 +173,7 @@ def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
     tmp_path: Path, recalls: bool
 ) -> None:
     _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5)], begin=0.37)
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     for begin, end, stood in [(13.27, 20, 3.1), (14.37, 22, 2.0), (0.4, 8.37, 2.0), (9, 9.5, 0.5)]:
         assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
 
@@ -252,9 +242,7 @@ def test_stops_under_noise_do_not_last_longer_than_the_window(
     ]
     for nth, at in enumerate(range(0, len(messages), 9 * hz)):
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 9 * hz])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     whole = over(memory, 0, 180)
     parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
     for answer in (whole, *parts):
@@ -299,9 +287,7 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         for stands, drives in legs:
             driven += [(stands, 0.0), (drives, 0.5)]
         _drive(bag_dir, driven)
-        memory = memory_of(bag_dir)
-        if recalls:
-            memory = with_store(replace(memory), bag_dir)
+        memory = memory_of(bag_dir, recalls=recalls)
         end = sum(length for length, _ in driven)
         # No part is so short that no pose is in it.
         inner = {round(0.1 + part * (end - 0.2), 1) for part in parts}
@@ -317,9 +303,7 @@ def test_a_robot_that_creeps_is_not_taken_to_stand(
     tmp_path: Path, recalls: bool, speed: float
 ) -> None:
     _drive(tmp_path, [(60.0, speed)], hz=20)
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     for span in ((0, 60), (10, 20), (45, 60)):
         answer = over(memory, *span)
         assert answer.stood == 0
@@ -338,9 +322,7 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
     ]
     for nth, at in enumerate(range(0, len(messages), 60 * hz)):
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 60 * hz])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 300)
     reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
     assert reply["stood_s"] is None
@@ -373,9 +355,7 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
             for nth in range(100, 300)
         ],
     )
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     none = over(memory, 0, 9.95)
     assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
     assert none.notes == (
@@ -458,9 +438,7 @@ def test_every_boolean_of_a_status_message_is_followed(
                 for at in (bag * 10 + nth * 0.5 for nth in range(20))
             ],
         )
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 40)
     assert times(answer.events, "flip") == [
         (f"/fmu/out/vehicle_status {flag} became true", 13.0),
@@ -476,9 +454,7 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
     write_mcap(
         tmp_path / "bag.mcap", [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
     )
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
     more = 600 - MOST[FLAG]
     assert note == (
@@ -490,9 +466,7 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
 def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
     labels = [f"thing {nth}" for nth in range(MOST[LABEL] + 3)]
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     assert any("one message: 3 more" in note for note in over(memory, 0, 10).notes)
 
 
@@ -501,9 +475,7 @@ def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path, recalls: 
     """All 40 booleans flip four times in one bag."""
     messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
     write_mcap(tmp_path / "bag.mcap", messages)
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 10)
     assert dict(answer.counts) == {"on/off changes": 4 * 40}
     assert any(
@@ -551,9 +523,7 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     messages.sort(key=lambda each: each.log_time)
     for nth in range(0, len(messages), 100):
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth : nth + 100])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 65)
     assert answer.throughout == ("table",)
     assert times(answer.events, "thing") == [("scissors in view", 12.0)]
@@ -602,7 +572,7 @@ def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        memory = with_store(replace(plain), bag_dir, part=part)
+        memory = with_store(plain, bag_dir, part=part)
         everything = (min(moments) - S, max(moments) + S)
         parts = [sorted(draw.choices(moments, k=2)) for _ in range(3)]
         # What was joined of everything serves when it is asked for again.
@@ -776,8 +746,7 @@ def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
             messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
             messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
 
     def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
         span = {"start": BEGIN / S - 20, "end": BEGIN / S + 60}
@@ -812,8 +781,7 @@ def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
     for nth in range(4):
         inside = [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth]
         write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", inside)
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 40)
     [drop] = [each for each in answer.events if each.kind == "drop"]
     assert drop.text == "slowed down suddenly from 0.50 to 0.05 m/s"

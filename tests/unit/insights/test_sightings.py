@@ -46,7 +46,7 @@ from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
 from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -59,8 +59,6 @@ S = 10**9
 BEGIN = 1_784_000_000 * S
 OBJECTS = "/vision/scene/scene_objects"
 PLACES = {"table": (1.5, 3.5, 0.4), "cup": (1.4, 3.6, 0.8), "scissors": (-2.5, 1.0, 0.75)}
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 @needs_recorded
@@ -109,7 +107,7 @@ def recalling_elsewhere(memory: Memory, folder: Path) -> Memory:
     for bag in session.glob("*"):
         (folder / bag.name).write_bytes(bag.read_bytes())
     copied = memory_of(folder)
-    return with_store(replace(copied), folder)
+    return with_store(copied, folder)
 
 
 def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
@@ -174,9 +172,7 @@ def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
         tmp_path / "bag.mcap",
         [detections(BEGIN + at * S, ["cup"], score=score) for at, score in enumerate(scores)],
     )
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     assert seconds(memory, "cup", OBJECTS) == [(0, 5)]
     assert seconds(memory, "cup", OBJECTS, min_score=0.4) == [(0, 4)]
     assert seconds(memory, "cup", OBJECTS, min_score=0.9) == [(4, 4), (0, 1)]
@@ -204,7 +200,7 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 @pytest.mark.parametrize("recalls", [False, True])
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recalls: bool) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
-    memory = with_store(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     place: JsonValue = {"x": 9.0, "y": 9.0}
     asked = (memory, Call(), "/odom", "near_position", place)
     note = (
@@ -258,8 +254,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
     poses = [odom(BEGIN + at * S, 0.5 * at, 0.0) for at in range(3)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
     for frame_id in (None, "odom"):
         answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
         [sighting] = answer.sightings
@@ -307,9 +302,7 @@ def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path, rec
     ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages[:4])
     write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[4:])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     state = {"topic": "/mode", "condition_type": "equals", "value": "busy"}
     began = BEGIN / S
 
@@ -559,7 +552,7 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
-        memory = with_store(replace(plain), bag_dir, part=part)
+        memory = with_store(plain, bag_dir, part=part)
         for topic, kind, value in ASKED:
             try:
                 expected = grouped(plain, topic, kind, value)
@@ -583,9 +576,7 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
     logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
     state = diagnostics(BEGIN + 5 * S, motor=(1, "hot"))
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*logged, state])
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
 
     def texts(kind: str, value: JsonValue) -> list[object]:
         call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}
@@ -705,8 +696,7 @@ def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
         messages = [odom(at, step * 0.1, float(nth)) for at, step in steps]
         messages += [boolean(at, nth == 1 or step >= 200) for at, step in steps if step % 5 == 0]
         write_mcap(tmp_path / f"run_{nth}" / f"run_{nth}_0.mcap", messages)
-    memory = memory_of(tmp_path)
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(tmp_path, recalls=recalls)
     asks = {"topic": "/bumper", "condition_type": "equals", "value": True}
     [found] = asked(memory, tmp_path, "find_matches", **asks)["sightings"]
     assert found["first_seen"] == BEGIN / S + 40

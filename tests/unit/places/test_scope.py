@@ -84,7 +84,7 @@ def test_matches_of_a_topic_with_two_types_count_whichever_came_last(
     flags = [boolean(BEGIN + second * S, True, topic="/mixed") for second in range(3)]
     words = [text(BEGIN, "undocked", "/dock"), text(BEGIN + 5 * S, "cup", "/mixed")]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*flags, *words])
-    memory = with_store(memory_of(tmp_path), tmp_path) if recalls else memory_of(tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     undocked = WhileCondition("/dock", "contains", "undocked")
     [found] = find_matches(
         memory, Call(), "/mixed", "contains", "cup", during=(undocked,)

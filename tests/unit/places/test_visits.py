@@ -34,7 +34,7 @@ from tests.support.bags import Msg, odom, tf, transform, write_mcap
 from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, written_session
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
@@ -43,8 +43,6 @@ if TYPE_CHECKING:
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
@@ -91,9 +89,7 @@ def test_visits_of_a_session_are_the_closed_form(
             (tmp_path / bag.name).write_bytes(bag.read_bytes())
     else:
         session = written_session(tmp_path / "written")
-    memory = memory_of(tmp_path)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, recalls=recalls)
     answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
     lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
     middles = [lap / 2 + lap * nth for nth in range(3)]
@@ -120,9 +116,7 @@ def test_the_demos_robot_was_at_the_kitchen_counter_when_its_lap_says(
     recorder = DemoRecorder(tmp_path / "flat", MessageSchedule(BEGIN, BEGIN), clock=FixedClock(now))
     recorder.write_until(now)
     recorder.stop()
-    memory = memory_of(tmp_path, clock=SettableClock(now))
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = memory_of(tmp_path, clock=SettableClock(now), recalls=recalls)
     counter = demo_robot.KITCHEN_COUNTER
     answer = visits(memory, Call(), counter.x, counter.y)
     assert answer.frame_id == "map"
@@ -222,7 +216,7 @@ def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_pat
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert [each.restarts for each in answer.visits] == [0, 1]
     assert any("odometry restarted" in note for note in answer.notes)
-    recalled = with_store(replace(memory), tmp_path)
+    recalled = with_store(memory, tmp_path)
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
@@ -232,13 +226,13 @@ def test_a_restart_of_odometry_inside_one_bag_is_seen_with_a_catalogue_too(tmp_p
     memory = remembering(tmp_path, [*first, *second], split_s=5000.0)
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=1.0)
     assert [each.restarts for each in answer.visits] == [0, 1]
-    recalled = with_store(replace(memory), tmp_path)
+    recalled = with_store(memory, tmp_path)
     assert visits(recalled, Call(), 0.0, 0.0, radius_m=1.0) == answer
 
 
 def test_a_robot_that_drives_on_through_a_long_bag_did_not_restart(tmp_path: Path) -> None:
     memory = remembering(tmp_path, line((8, 0.5), (7, -0.2)), split_s=20.0)
-    recalled = with_store(replace(memory), tmp_path)
+    recalled = with_store(memory, tmp_path)
     for each in (memory, recalled):
         answer = visits(each, Call(), 0.0, 0.0, radius_m=1.0)
         assert [visit.restarts for visit in answer.visits] == [0]
@@ -306,8 +300,7 @@ def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bo
         for at in (BEGIN + t * S // 2 for t in range(81))
     ]
     memory = remembering(tmp_path, [*poses, *moves])
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
     answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
     [visit] = answer.visits
     assert answer.frame_id == "map"
@@ -342,8 +335,7 @@ def test_a_robot_that_passes_over_a_place_was_no_farther_than_its_nearest_pose(
     tmp_path: Path, split_s: float, recalls: bool
 ) -> None:
     memory = remembering(tmp_path, line((20, 0.25), x=-2.5), split_s=split_s)
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
     [visit] = visits(memory, Call(), 0.0, 0.0, radius_m=5.0).visits
     assert visit.closest_m == pytest.approx(0.0, abs=1e-9)
     assert visit.closest_at == BEGIN + 10 * S
@@ -454,8 +446,7 @@ def test_a_visit_that_was_under_way_says_so(tmp_path: Path) -> None:
 def test_total_counts_the_visits_that_are_not_shown_too(tmp_path: Path, recalls: bool) -> None:
     there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
     memory = remembering(tmp_path, line(*there_and_back))
-    if recalls:
-        memory = with_store(replace(memory), tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
     answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=1)
     assert len(answer.visits) == 1
     assert answer.more
@@ -471,7 +462,7 @@ def test_visits_are_the_same_whatever_the_catalogue_knows(seed: int, part: float
         bag_dir = Path(folder)
         write_history(bag_dir, draw)
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        memory = with_store(replace(plain), bag_dir, part=part)
+        memory = with_store(plain, bag_dir, part=part)
         for radius in (0.5, 3.0):
             place = (draw.uniform(-2, 2), draw.uniform(-1, 1))
             assert _answer(memory, place, radius) == _answer(plain, place, radius)
@@ -491,8 +482,7 @@ def test_a_newest_pose_that_cannot_be_decoded_hides_no_visit(
     way = line((20.0, 0.1))
     way[-1] = replace(way[-1], body=way[-1].payload[:40])
     memory = remembering(tmp_path, way)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
@@ -506,8 +496,7 @@ def test_a_pose_in_between_that_cannot_be_decoded_is_reported(
     way = line((20.0, 0.1))
     way[3] = replace(way[3], body=way[3].payload[:40])
     memory = remembering(tmp_path, way)
-    if recalls:
-        memory = with_store(memory, tmp_path)
+    memory = with_store(memory, tmp_path) if recalls else memory
     found = visits(memory, Call(), 0.0, 0.0)
     assert len(found.visits) == 1
     assert [note for note in found.notes if "cannot be decoded" in note]
@@ -559,8 +548,9 @@ def test_what_is_a_jump_for_the_path_is_one_for_visits(
 ) -> None:
     """The robot stands, and is 1.4 m farther after 0.2 s: at 7 m/s it passes what lies between."""
     write_mcap(tmp_path / "rec" / "rec_0.mcap", line((5, 0.0), (0.2, 7.0), (5, 0.0)))
-    memory = memory_of(tmp_path, limits=QuerySettings(max_plausible_speed_mps=fastest_mps))
-    memory = with_store(memory, tmp_path) if recalls else memory
+    memory = memory_of(
+        tmp_path, limits=QuerySettings(max_plausible_speed_mps=fastest_mps), recalls=recalls
+    )
     span = {"start": BEGIN // S, "end": BEGIN // S + 12}
     way = asked(memory, tmp_path, "trajectory_summary", **span)
     assert way["distance_m"] == pytest.approx(driven_m)

@@ -29,7 +29,7 @@ from tests.support.bags import (
 from tests.support.clocks import SettableClock
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 S = 10**9
 T0_S = 1_784_000_000
 T0 = T0_S * S
-
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 
 
 def log(ns: int, level: int, msg: str) -> Msg:
@@ -68,8 +66,7 @@ def numbers(ns: int, *held: int) -> Msg:
 
 def recalling(bag_dir: Path, recalls: bool, **more: Any) -> Memory:
     """A memory of the bags, which has stored their columns where it recalls them."""
-    memory = memory_of(bag_dir, **more)
-    return with_store(memory, bag_dir) if recalls else memory
+    return memory_of(bag_dir, **more, recalls=recalls)
 
 
 def last(bag_dir: Path, recalls: bool, topic: str, kind: str, value: JsonValue, **more: Any) -> Any:
@@ -179,8 +176,7 @@ def test_a_robot_that_records_is_answered_null_where_every_closed_bag_was_search
         include_active=include_active,
     )
     assert memory.index.snapshot().active
-    if recalls:
-        memory = with_store(memory, bag_dir)
+    memory = with_store(memory, bag_dir) if recalls else memory
     assert never(memory, bag_dir, tool) is None
 
 

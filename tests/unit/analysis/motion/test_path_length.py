@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +23,7 @@ from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import each_way, memory_of
 from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
@@ -281,9 +280,6 @@ def test_slow_poses_follow_each_other_up_to_five_usual_periods() -> None:
         assert found.totals.gap_m == (missing + 1 if gaps else 0)
 
 
-each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
-
-
 def history(
     folder: Path, legs: Sequence[tuple[float, float, float]], *, split_s: float = 5.0
 ) -> list[list[Msg]]:
@@ -304,9 +300,7 @@ def history(
 
 def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, Any]]:
     """What trajectory_summary and recap say of everything."""
-    memory = memory_of(folder)
-    if recalls:
-        memory = with_store(replace(memory), folder)
+    memory = memory_of(folder, recalls=recalls)
     span = TimeRange(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
     shown = Replies(folder, 24_000)
     way = json.loads(shown.answer(trajectory_summary(memory, Call(), span)).text)
