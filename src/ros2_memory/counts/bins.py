@@ -23,7 +23,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.no_data import no_data_between
-from ros2_memory.results import Bins, Usual
+from ros2_memory.results import Bins
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.counts.time_bins import TimeBins, TrueIntervals
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
-    from ros2_memory.results import BinColumn
+    from ros2_memory.results import BinColumn, Usual
 
 By: TypeAlias = Literal["day", "hour", "weekday", "place"]
 Values: TypeAlias = "Sequence[float | None]"
@@ -169,11 +169,8 @@ class BinnedWindow:
 
     def usual_of(self, times: NDArray[np.int64]) -> Usual | None:
         """Returns the usual time of day of the first of these times in each day."""
-        usual = usual_time(first_of_days(self.bins, times)) if len(times) else None
-        if usual is None:
-            return None
-        recorded = self._days_recorded()
-        return Usual(usual.median_s, usual.earliest_s, usual.latest_s, usual.days, recorded)
+        firsts = first_of_days(self.bins, times)
+        return usual_time(firsts, self._days_recorded()) if firsts else None
 
     def _days_recorded(self) -> int:
         """Returns how many local days have something recorded."""

@@ -21,7 +21,7 @@ from ros2_memory.columns.numbers import FieldNumbers, column_of, numbers
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
-from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.context import READING_S
@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.outline import Totals
+    from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.storage.base import Definition, IntArray, Record
+    from ros2_memory.storage.base import Definition, IntArray
 
 _LARGEST: Final = sys.float_info.max
 _SUMMARY: Final = frozenset({"bytes", "numbers"})
@@ -287,7 +289,7 @@ class PieceNumbers:
             read = [
                 (found.time, sample)
                 for found in messages_of(self._view, rows.some(positions))
-                if (sample := self._sample(found.record)) is not None
+                if (sample := self._sample(found)) is not None
             ]
             if not read:
                 continue
@@ -296,15 +298,12 @@ class PieceNumbers:
             samples = [[sample[nth] for _, sample in read] for nth in range(len(self._fields))]
             self._add_found(whole, [*map(_of_samples, samples)], self._pieces(whole, since))
 
-    def _sample(self, record: Record) -> list[list[float]] | None:
+    def _sample(self, found: StoredMessage) -> list[list[float]] | None:
         """Returns the numbers of each field in a message; None where it cannot be decoded."""
-        try:
-            message = self._view.memory.reader.decode(record)
-        except UndecodableError as error:
-            # A new one, since the one that was raised keeps the message by its traceback.
-            self.failures.append(UndecodableError(error.topic, error.type_name, error.reason))
+        message = self._view.bags.decode(found, self.failures)
+        if message is None:
             return None
-        at = partial(self._view.extractor.exact_at, message, record.channel.type)
+        at = partial(self._view.extractor.exact_at, message, found.type)
         return [[*numbers_in(at(field))] for field in self._fields]
 
     def _settled(self, field: int, sign: int, extreme: Extreme) -> Extreme:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.results import Usual
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -205,16 +206,6 @@ class TrueIntervals:
         return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
 
 
-@dataclass(frozen=True, slots=True)
-class UsualTime:
-    """When something first happened in a day, in seconds since local midnight, over many days."""
-
-    median_s: int
-    earliest_s: int
-    latest_s: int
-    days: int
-
-
 def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
     """Returns the first of these times in each local day that has one, in order.
 
@@ -228,10 +219,8 @@ def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
     return [int(each) for each in ordered[first]]
 
 
-def usual_time(times: Sequence[Ns], offset: Offset = local_offset) -> UsualTime | None:
-    """Returns the usual time of day of one time from each of several days; None without any."""
-    if not times:
-        return None
+def usual_time(times: Sequence[Ns], of_days: int, offset: Offset = local_offset) -> Usual:
+    """Returns the usual time of day of one time from each of several days, of so many recorded."""
     clock = sorted((at // NS_PER_S + offset(at // NS_PER_S)) % _DAY_S for at in times)
     median = (clock[(len(clock) - 1) // 2] + clock[len(clock) // 2]) // 2
-    return UsualTime(median, clock[0], clock[-1], len(clock))
+    return Usual(median, clock[0], clock[-1], len(clock), of_days)

@@ -142,11 +142,11 @@ def is_routine(change: PastChange) -> bool:
 
 def topics_with_changes(view: View) -> list[str]:
     """Returns the topics whose events show changes: those with events, and the commands."""
-    timeline, commands = view.timeline, _commands(view)
+    timeline, command = view.timeline, _command(view)
     return [
         topic
         for topic in timeline.topics()
-        if any(map(has_events, timeline.types_of(topic))) or topic in commands
+        if any(map(has_events, timeline.types_of(topic))) or topic == command
     ]
 
 
@@ -163,7 +163,7 @@ def changes_in(
     timeline = view.timeline
     joined: dict[str, TopicEvents] = {}
     looked_at: list[str] = []
-    commands = _commands(view)
+    command = _command(view)
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
         found = known[topic] if topic in known else events_in(view, topic, window)
@@ -174,12 +174,15 @@ def changes_in(
             looked_at += [topic] if _is_recorded(view, topic, window) else []
     changes: list[_Change] = []
     for topic, events in joined.items():
-        if topic not in commands:
+        if topic != command:
             changes += _changes(topic, events)
-    goals = _ActiveGoals(joined.values())
-    for topic in commands:
-        if topic in joined:
-            changes += _stopped_commands(topic, joined[topic], goals)
+    if command in joined:
+        actions = [[*_activity(events)] for events in joined.values()]
+        changes += [
+            _Change(stop.time, stop.time, f"{command} went to zero while a goal was active")
+            for stop in joined[command].of_kind(COMMAND)[1]
+            if not stop.value and any(_is_active(action, stop.time) for action in actions)
+        ]
     return ChangesBefore(
         changes,
         tuple(looked_at),
@@ -193,8 +196,8 @@ def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
     return any(view.timeline.extents(topic, window.widened(_AROUND_NS)))
 
 
-def _commands(view: View) -> set[str]:
-    """Returns the topic of velocities that command the robot's base; None if there is none.
+def _command(view: View) -> str:
+    """Returns the topic of velocities that command the robot's base; empty if there is none.
 
     Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
     """
@@ -205,7 +208,7 @@ def _commands(view: View) -> set[str]:
         if topic.rsplit("/", 1)[-1].startswith("cmd_vel")
         and not VELOCITIES.isdisjoint(timeline.types_of(topic))
     ]
-    return {min(found, key=lambda topic: (len(topic), topic))} if found else set()
+    return min(found, key=lambda topic: (len(topic), topic), default="")
 
 
 def _with_lead(
@@ -275,21 +278,6 @@ def _reported(report: Report) -> str:
     return Quoted(f"{report.text} ({report.reports} times in {span:.0f} s)")
 
 
-class _ActiveGoals:
-    """Whether the newest goal of some action was active at a time."""
-
-    def __init__(self, events: Iterable[TopicEvents]) -> None:
-        self._actions = [action for each in events if (action := [*_activity(each)])]
-
-    def at(self, time: Ns) -> bool:
-        """Returns whether one was."""
-        for action in self._actions:
-            nth = bisect_right(action, (time, True)) - 1
-            if nth >= 0 and action[nth][1]:
-                return True
-        return False
-
-
 def _activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
     """Yields, whenever the status of a goal changes, whether the newest one is active from then on.
 
@@ -309,11 +297,10 @@ def _activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
         yield time, bool(active)
 
 
-def _stopped_commands(topic: str, events: TopicEvents, goals: _ActiveGoals) -> Iterator[_Change]:
-    for change in events.of_kind(COMMAND)[1]:
-        if not change.value and goals.at(change.time):
-            text = f"{topic} went to zero while a goal was active"
-            yield _Change(change.time, change.time, text)
+def _is_active(action: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
+    """Returns whether the newest goal of an action was active at a time; see `_activity`."""
+    nth = bisect_right(action, (time, True)) - 1
+    return nth >= 0 and action[nth][1]
 
 
 def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]]:

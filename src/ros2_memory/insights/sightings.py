@@ -267,21 +267,16 @@ def read_sightings(
         NoDataError: there is no such topic, or none of its messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
-    goals = goals_asked(view, matching_topics(view, pattern), condition, scope)
+    topics = matching_topics(view, pattern)
+    goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
         return [(each.first, each.last) for each in reversed(goals)], None
-    topics = matching_topics(view, pattern)
     if says_episodes(view, topics):
         return episode_times(view, topics[0], condition, scope)
     found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if found.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    is_log = view.timeline.is_log
-    logs = {topic for topic in topics if is_log(topic)}
-    spans = [
-        (run.first, run.last if run.topic in logs else _until(view, run, scope))
-        for run in reversed(found.runs)
-    ]
+    spans = [(run.first, _until(view, run, scope)) for run in reversed(found.runs)]
     return spans, spans[0][0] if found.is_over else None
 
 

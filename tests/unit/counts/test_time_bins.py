@@ -19,6 +19,7 @@ from ros2_memory.counts.time_bins import (
     time_bins,
     usual_time,
 )
+from ros2_memory.results import Usual
 
 if TYPE_CHECKING:
     from ros2_memory.counts.time_bins import ClockBin, Offset
@@ -148,12 +149,6 @@ def test_the_usual_time_is_the_median_of_the_first_ones() -> None:
         "04 07:00",
         "05 08:00",
     ]
-    usual = usual_time(firsts, zone("UTC"))
-    assert usual is not None
-    assert (usual.median_s, usual.earliest_s, usual.latest_s, usual.days) == (
-        7 * H + 55 * 60,
-        7 * H,
-        8 * H + 1800,
-        4,
-    )
-    assert usual_time([]) is None
+    usual = usual_time(firsts, 5, zone("UTC"))
+    assert usual == Usual(7 * H + 55 * 60, 7 * H, 8 * H + 1800, days=4, of_days=5)
+    assert not first_of_days(bins, [])
