@@ -14,7 +14,7 @@ from __future__ import annotations
 import errno
 import sqlite3
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -25,7 +25,7 @@ from ros2_memory.core.errors import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
     from pathlib import Path
     from types import TracebackType
 
@@ -179,6 +179,18 @@ MAX_CHUNKS: Final = 150_000
 MAX_COMPRESSION_RATIO: Final = 100
 """Nothing large that a robot records compresses better than this."""
 _ALWAYS_ALLOWED: Final = 32 << 20
+
+
+class SizeLimit(NamedTuple):
+    """How large a chunk or a message may be, decompressed.
+
+    Attributes:
+        max_bytes: the size up to which one is read.
+        take_turn: is called before one takes more than `LARGE_BYTES`.
+    """
+
+    max_bytes: int
+    take_turn: Callable[[], None] = lambda: None
 
 
 def max_decompressed_bytes(compressed: int) -> int:

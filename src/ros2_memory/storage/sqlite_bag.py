@@ -41,6 +41,7 @@ from ros2_memory.storage.errors import (
     MAX_NAMES_CHARS,
     MAX_TEXTS_BYTES,
     ContradictionError,
+    SizeLimit,
     UnreadableError,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
@@ -146,7 +147,7 @@ class SqliteBags:
 
     def __init__(self, max_message_mb: int = MAX_CHUNK_MB, large: LargeReads | None = None) -> None:
         self._large = large or LargeReads()
-        self._max_message_bytes = max_message_mb << 20
+        self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
         # Whether the indexes of a file agree with its table.
         self._proven: ByteLru[bool] = ByteLru(_CACHE_BYTES)
@@ -247,9 +248,7 @@ class SqliteBags:
         channel = wanted[number]
         if len(found[0]) > LARGE_BYTES:
             self._large.acquire()
-        payload = uncompressed_payload(
-            channel, found[0], self._max_message_bytes, self._large.acquire
-        )
+        payload = uncompressed_payload(channel, found[0], self._limit)
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
@@ -281,7 +280,7 @@ class SqliteBags:
                 raise UnreadableError("it was replaced while it was being opened")
             # A name that is not UTF-8 must not hide the others.
             base.text_factory = partial(str, encoding="utf-8", errors="replace")
-            guard(base, self._max_message_bytes, size)
+            guard(base, self._limit.max_bytes, size)
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.errors import SizeLimit
 
 # As large as a block, so that the data before a damaged block is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE
@@ -109,15 +110,14 @@ class _Own(threading.local):
 _OWN: Final = _Own()
 
 
-def decompress_zstd(
-    compressed: bytes, max_bytes: int, take_turn: Callable[[], None] = lambda: None
-) -> bytes:
-    """Decompresses one zstd frame; calls `take_turn` before that takes more than `LARGE_BYTES`.
+def decompress_zstd(compressed: bytes, limit: SizeLimit) -> bytes:
+    """Decompresses one zstd frame.
 
     Raises:
-        UnreadableError: it decompresses to more than `max_bytes`, or states more than its blocks
-            can decompress to.
+        UnreadableError: it decompresses to more than the limit, or states more than its blocks can
+            decompress to.
     """
+    max_bytes, take_turn = limit
     stated = zstandard.frame_content_size(compressed)
     if stated > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
@@ -144,19 +144,17 @@ def zstd_front(compressed: bytes, size: int) -> bytes:
         return stream.read(size)
 
 
-def uncompressed_payload(
-    channel: Channel, payload: bytes, max_bytes: int, take_turn: Callable[[], None]
-) -> bytes:
+def uncompressed_payload(channel: Channel, payload: bytes, limit: SizeLimit) -> bytes:
     """Returns a serialized message as it was before rosbag2's message compression.
 
     Nothing but the magic of the frame marks a compressed payload; no CDR message begins with it. A
-    payload that cannot be decompressed, or not into `max_bytes`, is returned as it is: decoding
+    payload that cannot be decompressed, or not within the limit, is returned as it is: decoding
     reports it.
     """
     if channel.encoding != "cdr" or payload[:4] != FRAME_MAGIC:
         return payload
     try:
-        return decompress_zstd(payload, max_bytes, take_turn)
+        return decompress_zstd(payload, limit)
     except (UnreadableError, zstandard.ZstdError, MemoryError):
         return payload
 

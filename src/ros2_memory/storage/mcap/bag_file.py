@@ -40,6 +40,7 @@ from ros2_memory.storage.errors import (
     MAX_CHUNK_MB,
     ContradictionError,
     LostError,
+    SizeLimit,
     UnreadableError,
     as_unreadable,
     reason_of,
@@ -76,11 +77,11 @@ from ros2_memory.storage.mcap.records import (
     RECORD,
     Declarations,
     closing_of,
+    file_records,
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
 from ros2_memory.storage.mcap.summary import Chunk, DoubtError
-from ros2_memory.storage.mcap.walk import file_records
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
@@ -140,11 +141,8 @@ class McapBags:
         max_chunk_mb: int = MAX_CHUNK_MB,
         large: LargeReads | None = None,
     ) -> None:
-        self._max_chunk_bytes = max_chunk_mb << 20
-        self._large = large or LargeReads()
-        self._uncompressed = partial(
-            uncompressed_payload, max_bytes=self._max_chunk_bytes, take_turn=self._large.acquire
-        )
+        self._limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
+        self._uncompressed = partial(uncompressed_payload, limit=self._limit)
         self._indexes: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
         self._chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self._contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
@@ -280,7 +278,7 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        for group in read_groups(file, chunks.together, self._max_chunk_bytes, self._large.acquire):
+        for group in read_groups(file, chunks.together, self._limit):
             yield from self._batches_of_group(file, group, wanted, window, passed)
             del group  # before the next is read
         for chunk in chunks.alone:
@@ -295,8 +293,7 @@ class McapBags:
         self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
     ) -> Iterator[Batch | LostError]:
         """Yields the messages outside chunks."""
-        loose = [column for channel, column in index.loose.items() if channel in wanted]
-        column = joined([part.between(window.start, window.stop) for part in loose])
+        column = _loose(index, wanted, window)
         fetch = _fetch_loose(file, wanted, self._uncompressed)
         pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
         return batched((loose_place(place), fetch(place, time)) for place, time in pairs)
@@ -444,8 +441,7 @@ class McapBags:
 
         for chunk in self._chunks_with(file, index, wanted, window):
             yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
-        loose = [column for channel, column in index.loose.items() if channel in wanted]
-        column = joined([part.between(window.start, window.stop) for part in loose])
+        column = _loose(index, wanted, window)
         if column.times.size:
             fetch = _fetch_loose(file, wanted, self._uncompressed)
             rows = _rows(column, fetch, newest_first=newest_first)
@@ -458,9 +454,13 @@ class McapBags:
         reason = self._contradictions.get(file.key)
         if reason is not None:
             return self._index_without_indexes(file, reason)
-        return self._cache_index(
-            file, _read_index(file, self._max_chunk_bytes, self._large.acquire)
-        )
+        if not is_finished(file):
+            return self._cache_index(file, index_by_scan(file, self._limit))
+        try:
+            index = index_from_summary(file)
+        except DoubtError as doubt:
+            index = index_by_scan(file, self._limit, str(doubt))
+        return self._cache_index(file, index)
 
     def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
         self._indexes.put(file.key, index, index.memory_bytes)
@@ -626,25 +626,16 @@ class McapBags:
         return self._index_without_indexes(file, reason)
 
     def _index_without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
-        index = index_by_scan(file, self._max_chunk_bytes, reason, self._large.acquire)
+        index = index_by_scan(file, self._limit, reason)
         return self._cache_index(file, index._replace(contradiction=reason))
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
         data = self._chunks.get(key)
         if data is None:
-            data = chunk_data(file, chunk, self._max_chunk_bytes, self._large.acquire)
+            data = chunk_data(file, chunk, self._limit)
             self._chunks.put(key, data, len(data))
         return data
-
-
-def _read_index(file: OpenFile, max_chunk_bytes: int, take_turn: Callable[[], None]) -> McapIndex:
-    if not is_finished(file):
-        return index_by_scan(file, max_chunk_bytes, take_turn=take_turn)
-    try:
-        return index_from_summary(file)
-    except DoubtError as doubt:
-        return index_by_scan(file, max_chunk_bytes, str(doubt), take_turn)
 
 
 def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:
@@ -674,6 +665,12 @@ def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
         for number, channel in index.channels.items()
         if channel.topic in topics and number in index.totals
     }
+
+
+def _loose(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Column:
+    """Returns the wanted messages outside chunks."""
+    loose = [column for channel, column in index.loose.items() if channel in wanted]
+    return joined([column.between(window.start, window.stop) for column in loose])
 
 
 def _overlaps(chunk: Chunk, window: TimeWindow) -> bool:

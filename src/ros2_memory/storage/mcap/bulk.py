@@ -30,10 +30,11 @@ from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import Channel, IntArray, Mask
+    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import Column
     from ros2_memory.storage.mcap.summary import Chunk
@@ -98,19 +99,12 @@ class ReadChunks(NamedTuple):
     indexes: Sequence[bytes] = ()
 
 
-def read_groups(
-    file: OpenFile,
-    chunks: Sequence[Chunk],
-    max_chunk_bytes: int,
-    take_turn: Callable[[], None],
-) -> Iterator[ReadChunks]:
+def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> Iterator[ReadChunks]:
     """Yields chunks, decompressed in groups of up to `BATCH_BYTES`; a larger one comes alone.
-
-    `take_turn` is called before a group takes more than `LARGE_BYTES`.
 
     Raises:
         OSError, MemoryError: the disk or the machine fails.
-        EpisodicError: what `take_turn` raises.
+        EpisodicError: what `limit.take_turn` raises, which groups call likewise.
     """
     whole = _at_once(file, chunks)
     begin = 0
@@ -129,11 +123,11 @@ def read_groups(
                 end += 1
                 head = chunk_head(body)
                 compressed = body[head.data_at : head.data_at + head.data_size]
-                parts.append(decompressed_chunk(head, compressed, max_chunk_bytes, take_turn))
+                parts.append(decompressed_chunk(head, compressed, limit))
                 indexes.append(index)
                 left -= len(parts[-1])
                 if BATCH_BYTES - left > LARGE_BYTES:
-                    take_turn()
+                    limit.take_turn()
             del body
             buffer = parts[0] if len(parts) == 1 else b"".join(parts)
         except (OSError, MemoryError, EpisodicError):

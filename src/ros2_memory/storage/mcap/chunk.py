@@ -22,7 +22,12 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import (
     MAX_CHUNK_DECLARATIONS,
     MAX_CHUNK_MESSAGES,
+    MAX_CHUNKS,
+    MAX_COMPRESSION_RATIO,
+    MESSAGE_BYTES,
     UnreadableError,
+    as_unreadable,
+    max_decompressed_bytes,
     too_large,
 )
 from ros2_memory.storage.mcap.records import (
@@ -36,7 +41,9 @@ from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
+    from ros2_memory.storage.mcap.records import FileRecord
 
 Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
@@ -408,56 +415,45 @@ def chunk_head(body: bytes) -> ChunkHead:
     return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
 
 
-def decompressed_chunk(
-    head: ChunkHead,
-    compressed: bytes,
-    max_bytes: int,
-    take_turn: Callable[[], None] = lambda: None,
-) -> bytes:
+def decompressed_chunk(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
     """Decompresses a whole chunk, and verifies its checksum if it has one.
 
-    Nothing is allocated by the size that the chunk states. `take_turn` is called before it takes
-    more than `LARGE_BYTES`.
+    Nothing is allocated by the size that the chunk states.
 
     Raises:
-        UnreadableError: it is damaged, larger than `max_bytes`, or its compression is unknown.
+        UnreadableError: it is damaged, larger than allowed, or its compression is unknown.
     """
     if len(compressed) != head.data_size:
         raise UnreadableError("damaged: a chunk is shorter than it states")
-    data = _decompressed(head.compression, compressed, max_bytes, take_turn)
-    if len(data) > max_bytes:
-        raise UnreadableError(too_large("a chunk", max_bytes))
+    data = _decompressed(head.compression, compressed, limit)
+    if len(data) > limit.max_bytes:
+        raise UnreadableError(too_large("a chunk", limit.max_bytes))
     if head.crc and zlib.crc32(data) != head.crc:
         raise UnreadableError("damaged: a chunk does not match its checksum")
     return data
 
 
-def decompressed_prefix(
-    head: ChunkHead,
-    compressed: bytes,
-    max_bytes: int,
-    take_turn: Callable[[], None] = lambda: None,
-) -> bytes:
+def decompressed_prefix(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
     """Decompresses the front of a chunk that its file ends in."""
+    max_bytes, take_turn = limit
     if head.compression == "zstd":
         data = zstd_front(compressed, min(LARGE_BYTES, max_bytes))
         if len(data) < LARGE_BYTES:
             return data
         take_turn()
         return zstd_front(compressed, max_bytes)
-    return _decompressed(head.compression, compressed, max_bytes, take_turn)[:max_bytes]
+    return _decompressed(head.compression, compressed, limit)[:max_bytes]
 
 
-def _decompressed(
-    compression: str, compressed: bytes, max_bytes: int, take_turn: Callable[[], None]
-) -> bytes:
-    """Returns at most one byte more than `max_bytes`, so that the caller sees the excess."""
+def _decompressed(compression: str, compressed: bytes, limit: SizeLimit) -> bytes:
+    """Returns at most one byte more than allowed, so that the caller sees the excess."""
+    max_bytes, take_turn = limit
     if not compression:
         if len(compressed) > LARGE_BYTES:
             take_turn()
         return compressed
     if compression == "zstd":
-        return decompress_zstd(compressed, max_bytes, take_turn)
+        return decompress_zstd(compressed, limit)
     if compression == "lz4":
         data = _lz4_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
         if LARGE_BYTES < len(data) <= max_bytes:
@@ -469,3 +465,57 @@ def _decompressed(
 
 def _lz4_front(compressed: bytes, size: int) -> bytes:
     return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, size))
+
+
+class OpenedChunk(NamedTuple):
+    """A chunk of a file, decompressed as far as the file reaches.
+
+    Attributes:
+        data: the decompressed records; only the first `content.usable` bytes are whole records.
+        content: what the records hold.
+        data_at: where the compressed data begins in the body of the chunk record.
+        compression: how it was compressed; empty where it was not.
+    """
+
+    data: bytes
+    content: ChunkContent
+    data_at: int
+    compression: str
+
+
+class ChunkOpener:
+    """Decompresses the chunks of one file, and stops where they come to more than a robot's do.
+
+    A file of some MB can hold chunks that decompress to terabytes.
+    """
+
+    def __init__(self, file: OpenFile, limit: SizeLimit) -> None:
+        self._file = file
+        self._limit = limit
+        self._bytes = 0
+        self._chunks = 0
+
+    def open(self, record: FileRecord) -> OpenedChunk:
+        """Decompresses a chunk; one that the file ends in, as far as the file reaches.
+
+        Raises:
+            UnreadableError: the chunk is damaged or too large, or the chunks before it were.
+        """
+        if self._chunks >= MAX_CHUNKS:
+            raise UnreadableError(f"it has more than {MAX_CHUNKS} chunks")
+        if self._bytes > max_decompressed_bytes(self._file.size):
+            raise UnreadableError(
+                f"its chunks hold more than {MAX_COMPRESSION_RATIO} times what the file does"
+            )
+        in_file = min(record.end, self._file.size) - record.body_at
+        decompress = decompressed_chunk if record.end <= self._file.size else decompressed_prefix
+        with as_unreadable():
+            head, compressed = read_compressed_chunk(
+                self._file, record.body_at, in_file, self._limit.max_bytes
+            )
+            data = decompress(head, compressed, self._limit)
+            self._bytes += len(data)
+            content = walk_chunk(data)
+        self._bytes += MESSAGE_BYTES * content.messages
+        self._chunks += 1
+        return OpenedChunk(data, content, head.data_at, head.compression)

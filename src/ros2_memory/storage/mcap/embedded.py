@@ -15,9 +15,8 @@ from mcap.records import Metadata
 
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap.records import MAGIC_SIZE
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, file_records
 from ros2_memory.storage.mcap.salvage import decode_record
-from ros2_memory.storage.mcap.walk import file_records
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

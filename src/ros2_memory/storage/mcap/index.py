@@ -49,13 +49,14 @@ from ros2_memory.storage.mcap.summary import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from mcap.records import Statistics
 
     from ros2_memory.core.pauses import Pauses
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
 
 _CHUNK: Final = int(Opcode.CHUNK)
@@ -238,19 +239,17 @@ def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
     return file.read(chunk.offset + chunk.length, chunk.index_length)
 
 
-def chunk_data(
-    file: OpenFile, chunk: Chunk, max_bytes: int, take_turn: Callable[[], None] = lambda: None
-) -> bytes:
+def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     """Returns the decompressed records of a chunk; see `decompressed_chunk`.
 
     Raises:
-        UnreadableError: the chunk is damaged or larger than `max_bytes`.
+        UnreadableError: the chunk is damaged or larger than allowed.
     """
     body_at, body_size = chunk.offset + RECORD.size, chunk.length - RECORD.size
-    head, compressed = read_compressed_chunk(file, body_at, body_size, max_bytes)
+    head, compressed = read_compressed_chunk(file, body_at, body_size, limit.max_bytes)
     if chunk.usable is not None:
-        return decompressed_prefix(head, compressed, max_bytes, take_turn)[: chunk.usable]
-    return decompressed_chunk(head, compressed, max_bytes, take_turn)
+        return decompressed_prefix(head, compressed, limit)[: chunk.usable]
+    return decompressed_chunk(head, compressed, limit)
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:

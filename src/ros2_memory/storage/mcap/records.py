@@ -3,6 +3,9 @@
 A file is magic, records, magic; a record is an opcode (1 byte), a length (8 bytes, little endian)
 and a body. Records that every file is full of are read with `struct`; those that the bags of one
 robot have in common, and those that are seldom read, with the `mcap` package.
+
+The scan, the salvage of a file that was cut short and the reader of embedded metadata share one
+walk, `file_records`, so that all of them stop at the same byte.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import struct
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
@@ -26,6 +29,7 @@ from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
+    MAX_SECTION_BYTES,
     UnreadableError,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE
@@ -215,3 +219,65 @@ def require_mcap(file: OpenFile) -> None:
         raise UnreadableError("not an MCAP file: it does not begin as one")
     if file.size < MAGIC_SIZE:
         raise UnreadableError(f"only its first {file.size} bytes had reached the disk")
+
+
+_BLOCK_BYTES: Final = 8 << 10
+"""Read at once: loose messages and schemas are small and lie close together."""
+
+
+class FileRecord(NamedTuple):
+    """A record of a file, without its body.
+
+    Only the last record that a walk yields can end past the end of its file, and only if it is a
+    chunk: the messages at its front may be whole.
+
+    Attributes:
+        opcode: the type of the record.
+        offset: where it begins in the file.
+        end: where it ends, as its length states.
+        head: its first bytes; of a message, all fields before the payload.
+    """
+
+    opcode: int
+    offset: int
+    end: int
+    head: bytes
+
+    @property
+    def body_at(self) -> int:
+        """Where the body begins in the file."""
+        return self.offset + RECORD.size
+
+    def body(self, file: OpenFile, max_bytes: int = MAX_SECTION_BYTES) -> bytes:
+        """Returns the body.
+
+        Raises:
+            UnreadableError: it is larger than `max_bytes`, or not all there.
+        """
+        if self.end - self.body_at > max_bytes:
+            raise UnreadableError("damaged: a record is larger than any can be")
+        return file.read(self.body_at, self.end - self.body_at)
+
+
+def file_records(file: OpenFile) -> Iterator[FileRecord]:
+    """Yields the records up to the footer, or up to the first that is not whole.
+
+    Raises:
+        UnreadableError: the file is not MCAP, or ends within its magic.
+    """
+    require_mcap(file)
+    offset, block, block_at = MAGIC_SIZE, b"", 0
+    while offset + RECORD.size <= file.size:
+        if not block_at <= offset <= block_at + len(block) - MESSAGE.size:
+            block_at, block = offset, file.read(offset, min(_BLOCK_BYTES, file.size - offset))
+        head = block[offset - block_at : offset - block_at + MESSAGE.size]
+        opcode, length = RECORD.unpack_from(head)
+        end = offset + RECORD.size + length
+        # Opcode 0 is invalid: blocks that never reached the disk read as zeros.
+        if opcode in {0, Opcode.FOOTER} or (opcode == Opcode.MESSAGE and length < MESSAGE_FIELDS):
+            return
+        if end <= file.size or opcode == Opcode.CHUNK:
+            yield FileRecord(opcode, offset, end, head)
+        if end > file.size:
+            return
+        offset = end

@@ -18,15 +18,20 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.errors import MAX_SECTION_BYTES, UnreadableError, as_unreadable
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, section_records
-from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
+from ros2_memory.storage.errors import (
+    MAX_SECTION_BYTES,
+    SizeLimit,
+    UnreadableError,
+    as_unreadable,
+)
+from ros2_memory.storage.mcap.chunk import ChunkOpener
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, file_records, section_records
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.walk import FileRecord
+    from ros2_memory.storage.mcap.records import FileRecord
 
 _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] = {
     Opcode.HEADER: mcap_records.Header.read,
@@ -51,7 +56,7 @@ class Salvage:
     def __init__(self, file: OpenFile, max_chunk_bytes: int) -> None:
         self._file = file
         self._max_chunk_bytes = max_chunk_bytes
-        self._opener = ChunkOpener(file, max_chunk_bytes)
+        self._opener = ChunkOpener(file, SizeLimit(max_chunk_bytes))
         self.lost_bytes = 0
 
     def records(

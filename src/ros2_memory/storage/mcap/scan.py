@@ -22,7 +22,7 @@ from ros2_memory.storage.errors import (
     as_unreadable,
     too_large,
 )
-from ros2_memory.storage.mcap.chunk import column_of
+from ros2_memory.storage.mcap.chunk import ChunkOpener, column_of
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     McapIndex,
@@ -35,44 +35,39 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE,
     Declarations,
     closing_of,
+    file_records,
     statistics,
 )
 from ros2_memory.storage.mcap.summary import Chunk
-from ros2_memory.storage.mcap.walk import ChunkOpener, file_records
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable
 
     from mcap.records import Statistics
 
     from ros2_memory.core.pauses import Pauses
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import ChunkContent, Column, Extent
-    from ros2_memory.storage.mcap.walk import FileRecord
+    from ros2_memory.storage.mcap.records import FileRecord
 
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 
 
-def index_by_scan(
-    file: OpenFile,
-    max_chunk_bytes: int,
-    note: str = "",
-    take_turn: Callable[[], None] = lambda: None,
-) -> McapIndex:
+def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex:
     """Returns the index of the messages that can be read.
 
     Args:
         file: the open file.
-        max_chunk_bytes: the decompressed size up to which a chunk is read; larger ones are noted.
+        limit: up to which chunks and messages are read; larger ones are noted.
         note: why the summary section was not used; empty where no user needs to know.
-        take_turn: is called before a chunk takes more than `LARGE_BYTES`.
 
     Raises:
         UnreadableError: the file is not MCAP, or is empty.
     """
-    scan = _Scan(file, max_chunk_bytes, ChunkOpener(file, max_chunk_bytes, take_turn))
+    scan = _Scan(file, limit.max_bytes, ChunkOpener(file, limit))
     for record in file_records(file):
         scan.add(record)
     return scan.index(note)
@@ -81,7 +76,7 @@ def index_by_scan(
 @dataclass(slots=True)
 class _Scan:
     file: OpenFile
-    max_chunk_bytes: int
+    max_bytes: int
     opener: ChunkOpener
     read_to: int = MAGIC_SIZE
     data_ended: bool = False
@@ -120,8 +115,8 @@ class _Scan:
         self.read_to = record.end
 
     def _add_message(self, record: FileRecord) -> None:
-        if record.end - record.offset > self.max_chunk_bytes:
-            raise UnreadableError(too_large("a message", self.max_chunk_bytes))
+        if record.end - record.offset > self.max_bytes:
+            raise UnreadableError(too_large("a message", self.max_bytes))
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
         times, places = self.loose.setdefault(channel, (array("Q"), array("q")))
         times.append(log_time)
