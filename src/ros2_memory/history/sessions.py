@@ -55,6 +55,8 @@ class _Recorded(NamedTuple):
 
 _RECORDED: Final[Key[_Recorded]] = Key()
 """Of a timeline: sidecars are read for it."""
+_RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]]]] = Key()
+"""Of a timeline: by topics, then by where they were recorded, the recordings that hold them."""
 _LINKED: Final[Key[set[tuple[tuple[str, str], Session | None]]]] = Key()
 """Of a timeline: what one call found, the next need not look for."""
 
@@ -87,7 +89,7 @@ class Sessions:
         self.edges: tuple[FrameEdge, ...] | None = None
         self._parts: dict[Session, tuple[Session, Session]] = {}
         self._lending: dict[tuple[str, Ns], Session] = {}
-        self._recordings: dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]] = {}
+        self._recordings = view.timeline.memo.of(_RECORDINGS, dict)
 
     def folder(self, recording: Path) -> str:
         """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
