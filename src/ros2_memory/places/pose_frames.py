@@ -100,13 +100,14 @@ def newest_pose(
 def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
     """Returns a recording that has a topic before and after a time: `own` if it does.
 
-    Else the first of them by name, or `own`. By whole recordings: which of their bags reaches over
-    a time depends on how they were split.
+    Else the shortest of them, as one that began with an unset clock spans years; or `own`. By whole
+    recordings: which of their bags reaches over a time depends on how they were split.
     """
     spans = view.timeline.recordings(topic)
     if own is not None and own in spans and spans[own][0] <= at <= spans[own][1]:
         return own
-    return min((path for path, span in spans.items() if span[0] <= at <= span[1]), default=own)
+    around = [(last - first, path) for path, (first, last) in spans.items() if first <= at <= last]
+    return min(around)[1] if around else own
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
