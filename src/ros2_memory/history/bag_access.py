@@ -86,7 +86,7 @@ class BagAccess:
         coverage = self.memory.columns.coverage(self.snapshot.timeline)
         if coverage is None:
             return ""
-        bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.bags)
+        bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.timeline.bags)
         missing = sum(bag.state is BagState.CLOSED for bag in coverage.missing)
         if missing * 100 <= bags:
             return ""

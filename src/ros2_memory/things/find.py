@@ -124,7 +124,7 @@ def find_things(
         notes=(
             *view.notes.sentences(),
             *describe_held(being_written(view.snapshot, asked_for)),
-            *notes_on(view, known, question),
+            *notes_on(view, known.by_all, question),
         ),
     )
 
@@ -402,23 +402,27 @@ class _Finder:
         return x / _MM, y / _MM, math.radians((yaw + 180) % 360 - 180)
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
-        """Returns the state of a thing since it was last seen in the window."""
-        spots = self.known.estimate.sights.spots
-        last = int(spots[rows, Spot.LAST].max())
+        """Returns the state of a thing since it was last seen in the window, by all sightings."""
+        spots, looked = self.known.estimate.sights.spots[rows], self.known.estimate.cells.last
+        last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
+        if by_all is not self.known:
+            newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
+            now = by_all.estimate.stay_with(spots[newest_first])
+            if now is None:
+                return None
+            instance, stay = now
         if stay.last > last:
             return StillThere("seen_since", stay.last)
         if stay is instance.stays[-1]:
             looks, missed = instance.looks, instance.missed_by
         else:
-            _, looks, missed = self.known.estimate.missing(instance, stay)
+            _, looks, missed = by_all.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
-        looked = self.known.estimate.cells.last
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
             return StillThere("in_view", last)
         # Of a later look nothing is known where the estimate ends.
-        is_whole = self.known.until == MAX_NS
-        return StillThere("not_looked_at_since", last) if is_whole else None
+        return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None
 
 
 def _place(stay: PlacedStay) -> tuple[float, float, float]:

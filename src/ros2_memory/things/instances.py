@@ -199,6 +199,21 @@ class Estimate:
         place = self.evidence[instance.key, instance.epoch][stay.place]
         return chance_of_missing(self.cells, place, stay.stay, stay.last)
 
+    def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
+        """Returns the thing and its stay of which is the first of some spots that is of any.
+
+        `seen` are rows of the `Sights.spots` of another estimate, of some of the same bags.
+        """
+        alike = [Spot.N, Spot.X, Spot.Y, Spot.FIRST, Spot.LAST]
+        spots = np.ascontiguousarray(self.sights.spots[:, alike])
+        for spot in seen[:, alike]:
+            rows = np.flatnonzero((spots == spot).all(axis=1))
+            for instance in self.instances:
+                for stay in instance.stays:
+                    if np.isin(rows, stay.spots).any():
+                        return instance, stay
+        return None
+
 
 @dataclass(slots=True)
 class _Group:

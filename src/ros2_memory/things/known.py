@@ -1,14 +1,16 @@
 """The things of a memory: estimated from the sights of all its bags, once for each timeline.
 
-Where gathering sights takes too long the estimate begins later, and says so. So it does where there
-are too many sightings: a detector that sees things everywhere has thousands in an hour. Of a window
-before it there is then another estimate, of the sightings until its end.
+Of a window that ended in the past they are estimated from the sightings until its end, so that an
+answer about it stays what it was: a thing that was moved since is where it was then.
+
+Where gathering sights takes too long an estimate begins later, and says so. So it does where there
+are too many sightings: a detector that sees things everywhere has thousands in an hour.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
@@ -50,6 +52,7 @@ class KnownThings:
         since: how far back it reaches, where not all bags could be read in time; else None.
         crowded: whether it begins there because there are too many sightings before.
         until: where it ends; later sightings are none of it.
+        later: the things by all sightings, of an estimate that ends before the last one.
     """
 
     estimate: Estimate
@@ -59,6 +62,12 @@ class KnownThings:
     has_map: bool = True
     crowded: bool = False
     until: Ns = MAX_NS
+    later: KnownThings | None = None
+
+    @property
+    def by_all(self) -> KnownThings:
+        """The things by all sightings; where there are too many of these, by those of this one."""
+        return self.later or self
 
     @property
     def reach(self) -> str:
@@ -76,10 +85,7 @@ class KnownThings:
 def known_things(
     view: View, min_score: float, spellings: Mapping[str, Sequence[str]], window: TimeWindow
 ) -> KnownThings:
-    """Returns the things of all bags of a view; of what could not be read a note says so.
-
-    Where there are too many sightings to compare all, they are the newest; or, for a window that
-    these do not reach back to, those until its end.
+    """Returns the things as they were known at a window's end; of what could not be read says so.
 
     Raises:
         QueryTimeoutError: the call's time is over before any bag was read.
@@ -87,8 +93,11 @@ def known_things(
     latest = view.snapshot.latest
     known = _known_until(view, min_score, spellings, MAX_NS)
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
-    if known.crowded and not known.reaches_back(window) and until <= (latest or until):
-        known = _known_until(view, min_score, spellings, until)
+    if (known.crowded or known.since is None) and until <= (latest or until):
+        then = _known_until(view, min_score, spellings, until)
+        if known.reaches_back(window):
+            return replace(then, later=known) if then.reaches_back(window) else known
+        known = then
     if known.crowded or known.until < MAX_NS:
         view.notes.complete &= known.reaches_back(window)
         others = "other" if known.until < MAX_NS else "older"

@@ -240,6 +240,46 @@ def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path)
     assert ask(tmp_path, label="mug", end=BEGIN - 5)["reason"] == "outside_range"
 
 
+LATER: list[list[Seen]] = [
+    [("mug", 3.25, 0.5), ("chair", 4.0, -1.0)],
+    [("mug", 3.0, 0.5), ("mug", 3.3, 0.6), ("mug", 3.6, 0.4), ("chair", 4.2, -1.1)],
+    [("coffee mug", 3.1, 0.5), ("chair", 4.0, -0.7), ("chair", 4.0, -1.3)],
+    [("bottle", 3.0, 0.5), ("person", 4.0, -1.0)],
+    [],
+]
+
+
+@pytest.mark.parametrize("seen", LATER)
+def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[Seen]) -> None:
+    before = [("mug", 3.0, 0.5), ("chair", 4.0, -1.0)]
+    side = (3.0, -3.0, math.pi / 2)
+    write(tmp_path, [*looked(0, 20, HERE, *before), *looked(20, 40, side, *before)])
+    windows = {"start": BEGIN + 20, "end": BEGIN + 39, "with_start": BEGIN, "with_end": BEGIN + 19}
+    questions = {"find_things": {"start": BEGIN, "end": BEGIN + 39}, "compare": windows}
+
+    def answers() -> dict[str, Any]:
+        memory = memory_of(tmp_path, limits=NAMED)
+        return {tool: asked(memory, tmp_path, tool, **q) for tool, q in questions.items()}
+
+    then = answers()
+    days = [
+        [*looked(at, at + 20, HERE, *seen), *looked(at + 20, at + 40, side, *seen)]
+        for at in range(86_400, 5 * 86_400, 86_400)
+    ]
+    write(tmp_path, [message for day in days for message in day], name="later")
+    now = answers()
+    since = {thing["label"]: thing.pop("still_there") for thing in now["find_things"]["things"]}
+    assert all(thing.pop("still_there") for thing in then["find_things"]["things"])
+    assert now["find_things"]["things"] == then["find_things"]["things"]
+    assert now["compare"]["things"] == then["compare"]["things"]
+    assert since.keys() == {"mug", "chair"}
+    last = BEGIN + 4 * 86_400 + 39
+    if not seen:
+        assert all("not_seen_where_expected" in state for state in since.values())
+    if seen and seen[0][:2] == ("coffee mug", 3.1):
+        assert since["mug"] == {"seen_since": last}
+
+
 def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
     walk = [
         message
