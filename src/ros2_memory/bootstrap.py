@@ -104,8 +104,7 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
     Raises:
         ConfigError: it cannot be built.
     """
-    node = settings.recorder
-    return instantiated("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
+    return instantiated("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
 
 
 def instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
@@ -196,12 +195,11 @@ def _topic_cutter_of(settings: Settings, bag_dir: Path, reader: BagReader) -> To
     ]
     if not topic_ages:
         return None
-    writer = McapWriter(settings.reader.max_chunk_mb)
     return TopicCutter(
         bag_dir,
         topic_ages,
         reader,
-        writer,
+        McapWriter(settings.reader.max_chunk_mb),
         static_topics=settings.data.tf_static_topics,
         is_quiet=is_quiet,
     )
@@ -229,13 +227,12 @@ def _memory_days_of(
     )
     writer = McapWriter(settings.reader.max_chunk_mb)
     static = settings.data.tf_static_topics
-    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
     return MemoryDays(
         bag_dir,
         bags,
         writer,
         own,
-        extractor,
+        SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length),
         limits=limits if memory.keep else None,
         static_topics=static,
     )
@@ -360,12 +357,11 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
                 f"{path}: the rule {name!r}: {each.topic} is not recorded, so its value would be "
                 f"unknown at all times: list it in {recording.topics_file}"
             )
-        condition = _condition_of(settings, each, f"{path}: the rule {name!r}")
         rules.append(
             ExclusionRule(
                 name=name,
                 topic=each.topic,
-                condition=condition,
+                condition=_condition_of(settings, each, f"{path}: the rule {name!r}"),
                 margin=ns_from_unix(each.margin_s),
                 stale=ns_from_unix(each.stale_s),
                 excludes_unknown=each.on_unknown == "exclude",
@@ -633,7 +629,6 @@ def _backfill(
     scanner, store = memory.columns, settings.store
     if scanner.store is None:
         return Backfill(memory, None)
-    limits = StoreLimits(store.max_share, round(store.max_gb * GB))
     return Backfill(
         memory,
         Filling(
@@ -641,7 +636,7 @@ def _backfill(
             memory.reader,
             bag_dir,
             memory.clock,
-            limits,
+            StoreLimits(store.max_share, round(store.max_gb * GB)),
             are_files=are_files,
             large=memory.large,
         ),

@@ -226,8 +226,7 @@ class LazyCommand(TyperCommand):
             # Imported here, as the command is, since it imports much itself.
             from ros2_memory.cli.options import as_command  # noqa: PLC0415
 
-            command = as_command(self._name)(loaded)
-            parent.command(self._name, epilog=epilog(self._name))(command)
+            parent.command(self._name, epilog=epilog(self._name))(as_command(self._name)(loaded))
         return get_group(parent).commands[self._name]
 
 

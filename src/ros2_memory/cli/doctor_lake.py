@@ -84,8 +84,7 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         do = "ros2-memory ship makes it; was it there before, is its disk mounted?"
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
-        seen = f"{location.warehouse}; its newest commit is from {iso_local(committed)}"
-        yield ok(seen)
+        yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
     # A server that asks the lake ships nothing.
     if settings.lake.engine is None:
         yield from _check_writer(location, has_bags=committed is not None)

@@ -208,8 +208,7 @@ def draw_recap(
 def write_instead(axes: Axes, reason: str) -> None:
     """Writes why a part of a picture has nothing to show."""
     axes.set_axis_off()
-    wrapped = textwrap.fill(reason, 50)
-    axes.text(0.5, 0.5, wrapped, ha="center", va="center", color="#6b7280")
+    axes.text(0.5, 0.5, textwrap.fill(reason, 50), ha="center", va="center", color="#6b7280")
 
 
 def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:

@@ -134,8 +134,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     are_bags = False
     for name in robots or ("",):
         own = robot_settings(settings, name) if robots else settings
-        setting = ROBOTS_SETTING if robots else None
-        memory = open_memory(own, verbose=bags.verbose, setting=setting)
+        memory = open_memory(own, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None)
         reports[name] = report = _report(own, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:

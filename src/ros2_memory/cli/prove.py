@@ -278,8 +278,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     tools = {each.name: each for each in dispatcher.tools}
     if tool not in tools:
         raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
-    arguments = question_for(memory, tool, tools[tool], given)
-    (reply,) = call_tools(dispatcher, {tool: arguments})
+    (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools[tool], given)})
     answer: JsonValue = json.loads(reply.text)
     return answer
 

@@ -138,8 +138,7 @@ def watch(
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")
-    words = ["reader.include_active=true", *(bags.words or ())]
-    memory = replace(bags, words=words).memory()
+    memory = replace(bags, words=["reader.include_active=true", *(bags.words or ())]).memory()
     console = stdout_console()
     is_screen = console.is_terminal and not as_json
     screen = Live(console=console, auto_refresh=False) if is_screen else nullcontext()

@@ -40,8 +40,7 @@ def format_exchange(number: int, exchange: Exchange) -> str:
         subsequent_indent=f"{_INDENT}   ",
         break_on_hyphens=False,
     )
-    lines = [f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""]
-    return "\n".join(lines)
+    return "\n".join([f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""])
 
 
 def exchange_as_json(number: int, exchange: Exchange) -> str:

@@ -151,10 +151,9 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
         self.splits += 1
         writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="ros2-memory demo")
-        types = dict.fromkeys(stream.type for stream in STREAMS)
         schemas = {
             name: writer.register_schema(name, "ros2msg", definition(name).encode())
-            for name in types
+            for name in dict.fromkeys(stream.type for stream in STREAMS)
         }
         channels: dict[str, int] = {}
         for stream in STREAMS:

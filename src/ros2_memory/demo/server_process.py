@@ -165,8 +165,7 @@ def _answering(port: int) -> int | None:
     connection = http.client.HTTPConnection(HOST, port, timeout=2.0)
     try:
         connection.request("GET", "/health")
-        reply = connection.getresponse()
-        report = json.loads(reply.read(_LONGEST_REPORT))
+        report = json.loads(connection.getresponse().read(_LONGEST_REPORT))
         return int(report["pid"])
     except (OSError, http.client.HTTPException):
         return None

@@ -125,10 +125,9 @@ def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerPr
     resource = Resource.create()
     if str(resource.attributes.get(SERVICE_NAME, _UNNAMED)).startswith(_UNNAMED):
         resource = resource.merge(Resource({SERVICE_NAME: SERVICE}))
-    limits = SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS)
     provider = TracerProvider(
         resource=resource,
-        span_limits=limits,
+        span_limits=SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS),
         shutdown_on_exit=False,
         active_span_processor=BoundedSpanProcessor(arguments=arguments),
     )
@@ -156,11 +155,10 @@ def traces_from_environment(*, arguments: bool) -> Traces:
 
 
 def _attributes(call: Answered) -> dict[str, str | int | float]:
-    stages = {f"ros2_memory.stage.{name}_ms": spent for name, spent in call.stages_ms.items()}
     return {
         "gen_ai.tool.name": call.tool,
         "ros2_memory.outcome": call.outcome,
         "ros2_memory.reply_chars": call.chars,
         "ros2_memory.correlation_id": call.correlation_id,
-        **stages,
+        **{f"ros2_memory.stage.{name}_ms": spent for name, spent in call.stages_ms.items()},
     }

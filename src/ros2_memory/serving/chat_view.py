@@ -27,8 +27,7 @@ _SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
 
 def view() -> ReadResourceContents:
     """Returns the document."""
-    html = _joined(("chat.html",))
-    html = html.replace("<style></style>", f"<style>{_joined(_STYLES)}</style>")
+    html = _joined(("chat.html",)).replace("<style></style>", f"<style>{_joined(_STYLES)}</style>")
     html = html.replace("<script></script>", f"<script>{_joined(_SCRIPTS)}</script>")
     return ReadResourceContents(html, APP_MIME_TYPE, {"ui": {"prefersBorder": True}})
 

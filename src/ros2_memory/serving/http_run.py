@@ -48,8 +48,7 @@ def serve_http(
         access_log=False,
         timeout_graceful_shutdown=1,
     )
-    listening = bound(at)
-    anyio.run(_Listener(config, server, app, when_listening).serve, [listening])
+    anyio.run(_Listener(config, server, app, when_listening).serve, [bound(at)])
 
 
 class _Listener(uvicorn.Server):

@@ -222,9 +222,8 @@ class EpisodicServer(MCPServer[object]):
         if str(uri) == VIEW_URI:
             return [view()]
         name, arguments = self._resource_call(str(uri))
-        client = _client(context)
         reply = await self.dispatcher.answer(
-            name, arguments, client, for_resource=True, robots=_robots(context)
+            name, arguments, _client(context), for_resource=True, robots=_robots(context)
         )
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 

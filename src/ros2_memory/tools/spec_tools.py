@@ -66,10 +66,9 @@ def build_tools(
         "tolerance": f"{settings.time_tolerance_s:g}",
         "map_frame": settings.map_frame or "no map",
     }
-    declarations = (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
     return tuple(
         tool
-        for declaration in declarations
+        for declaration in (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
         if writing or not declaration.writes
         for tool in declaration.tools(defaults, plain_times=not additions)
     )

@@ -99,8 +99,7 @@ class Recordings:
             found = replace(memory, index=index, limits=limits, memo=Memo())
         snapshot = found.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
-            names = [str(each["name"]) for each in self._list(memory)]
-            near = get_close_matches(name, names, n=3)
+            near = get_close_matches(name, [str(each["name"]) for each in self._list(memory)], n=3)
             similar = f"; similar: {', '.join(near)}" if near else ""
             raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
         with self._lock:
@@ -160,8 +159,7 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
     rows = [_row(name, bags) for name, bags in found.items()]
     for folder, inside in folders.items():
         if len(inside) > 1 and folder not in found:
-            every = [*chain.from_iterable(inside)]
-            rows.append({**_row(folder, every), "holds": len(inside)})
+            rows.append({**_row(folder, [*chain.from_iterable(inside)]), "holds": len(inside)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
 
 

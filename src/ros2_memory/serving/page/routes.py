@@ -199,12 +199,11 @@ def moment_request(given: QueryParams) -> MomentRequest:
     Raises:
         InvalidArgumentsError: a number is invalid, or the label is too long.
     """
-    label = _short(given, "label", _LONGEST_LABEL)
     return MomentRequest(
         t_s=_number(given, "t"),
         start_s=_number(given, "start"),
         end_s=_number(given, "end"),
-        label=label,
+        label=_short(given, "label", _LONGEST_LABEL),
     )
 
 
