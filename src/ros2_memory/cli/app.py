@@ -276,25 +276,21 @@ def _options_of_all(
 
 
 def demo(
-    once: Annotated[
-        bool, typer.Option("--once", help="Exit after the answers; code 1 if one was wrong.")
-    ] = False,
+    once: Annotated[bool, "Exit after the answers; code 1 if one was wrong."] = False,
     *,
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 picks a free one.")] = 9203,
+    port: Annotated[int, "Port on 127.0.0.1; 0 picks a free one."] = 9203,
     bag_dir: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep the bags in this new or empty folder."),
+        "DIR",
+        "Keep the bags in this new or empty folder.",
     ] = None,
     duration: Annotated[
         float,
-        typer.Option(metavar="S", help="Seconds to record before the questions."),
+        "S",
+        "Seconds to record before the questions.",
     ] = 120.0,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", help="Show the server's log on stderr.")
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a line of JSON for each question.")
-    ] = False,
+    verbose: Annotated[bool, "Show the server's log on stderr."] = False,
+    as_json: Annotated[bool, "--json", "Print a line of JSON for each question."] = False,
 ) -> int:
     """Simulate a robot, record it, and ask the server questions about it.
 

@@ -31,7 +31,7 @@ config = typer.Typer(
 def config_show(
     words: Words = None,
     bag_dir: BagDir = None,
-    sources: Annotated[bool, typer.Option("--sources", help="Show what set each key.")] = False,
+    sources: Annotated[bool, "Show what set each key."] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the configuration as YAML, composed of files, environment and arguments; no secrets.

@@ -8,8 +8,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
-
 from ros2_memory.cli.options import AsJson, Bags, Times
 from ros2_memory.cli.output import print_json, print_line, print_notes, progress_bar
 from ros2_memory.core.errors import (
@@ -37,35 +35,30 @@ def export(
     *,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write this MCAP file, for Foxglove, ros2 bag and rosbags."
-        ),
+        "FILE",
+        "Write this MCAP file, for Foxglove, ros2 bag and rosbags.",
     ] = None,
     parquet: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
-        ),
+        "DIR",
+        "Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option(metavar="GLOB", help="Copy only these topics, such as /vision/*; repeatable."),
+        "GLOB",
+        "Copy only these topics, such as /vision/*; repeatable.",
     ] = None,
     times: Times,
     latched: Annotated[
         bool | None,
-        typer.Option(
-            "--latched/--no-latched",
-            help="Also copy the latched messages valid at the start: maps, static transforms "
-            "(default: for --mcap).",
-        ),
+        "--latched/--no-latched",
+        "Also copy the latched messages valid at the start: maps, static transforms "
+        "(default: for --mcap).",
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", help="Partition Parquet by robot, too: one dataset for a fleet."
-        ),
+        "NAME",
+        "Partition Parquet by robot, too: one dataset for a fleet.",
     ] = None,
     as_json: AsJson = False,
     bags: Bags,

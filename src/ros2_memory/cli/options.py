@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
 from functools import wraps
-from inspect import Signature, signature
+from inspect import Parameter, Signature, signature
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias, get_args
 
 import typer
 
@@ -73,9 +73,8 @@ _TIME_OF_DAY: Final = re.compile(
 
 BagDir = Annotated[
     Path | None,
-    typer.Option(
-        "--bag-dir", metavar="DIR", help="Use the bags in this folder instead of recording.bag_dir."
-    ),
+    "DIR",
+    "Use the bags in this folder instead of recording.bag_dir.",
 ]
 Overrides = Annotated[
     list[str] | None,
@@ -91,34 +90,32 @@ Words = Annotated[
 ]
 Recording = Annotated[
     str | None,
-    typer.Option(
-        "--recording",
-        metavar="NAME",
-        help="Use this recording only, by a name that `ros2-memory recordings` lists.",
-    ),
+    "NAME",
+    "Use this recording only, by a name that `ros2-memory recordings` lists.",
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="key=value", help="A setting, the same as for ros2-memory-server."
-    ),
+    "--set",
+    "key=value",
+    "A setting, the same as for ros2-memory-server.",
 ]
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
+    "--verbose",
+    "-v",
+    "Show the log on stderr, at logging.level.",
 ]
 Command: TypeAlias = Callable[..., int | None]  # type: ignore[explicit-any]  # each its own options
 LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+AsJson = Annotated[bool, "--json", "Print JSON."]
 Start = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help=f"Start time: {TIMES}; local time."),
+    "TIME",
+    f"Start time: {TIMES}; local time.",
 ]
-End = Annotated[
-    str | None, typer.Option(metavar="TIME", help="End time, inclusive, in the same formats.")
-]
+End = Annotated[str | None, "TIME", "End time, inclusive, in the same formats."]
 
 
 def _seconds(text: str) -> float:
@@ -467,6 +464,9 @@ def as_command(name: str) -> Callable[[Command], Command]:
 
     Its parameters of the types `Bags` and `Times` become the options of these, in their place. It
     returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
+
+    An annotation such as `Annotated[float, "S", "Seconds between updates."]` declares an option, by
+    the names that it has besides that of the parameter, what its value is, and the line of help.
     """
 
     def made(command: Command) -> Command:
@@ -486,7 +486,7 @@ def as_command(name: str) -> Callable[[Command], Command]:
                 raise typer.Exit(int(command(**given) or 0))
 
         options = [
-            option.replace(kind=option.KEYWORD_ONLY)
+            option.replace(kind=option.KEYWORD_ONLY, annotation=_declared(option))
             for name, parameter in parameters.items()
             for option in (
                 signature(groups[name]).parameters.values() if name in groups else [parameter]
@@ -496,6 +496,18 @@ def as_command(name: str) -> Callable[[Command], Command]:
         return run
 
     return made
+
+
+def _declared(option: Parameter) -> object:
+    """Returns the annotation of an option as Typer takes it; others as they are."""
+    kind, *more, line = get_args(option.annotation) or (None, None)
+    if not isinstance(line, str):
+        return option.annotation
+    names = [text for text in more if text.startswith("-")]
+    if kind is bool and not names:
+        names = [f"--{option.name.replace('_', '-')}"]
+    metavar = next((text for text in more if text not in names), None)
+    return Annotated[kind, typer.Option(*names, metavar=metavar, help=line)]
 
 
 @contextmanager

@@ -50,12 +50,10 @@ def prove(
     *,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.mcap|DIR",
-            help="Write this MCAP file, or a folder in which recordings stay apart.",
-        ),
+        "--output",
+        "-o",
+        "FILE.mcap|DIR",
+        "Write this MCAP file, or a folder in which recordings stay apart.",
     ],
     as_json: AsJson = False,
     bags: Bags,

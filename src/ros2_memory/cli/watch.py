@@ -7,7 +7,6 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.live import Live
@@ -125,8 +124,8 @@ class Observation:
 
 def watch(
     *,
-    every: Annotated[float, typer.Option(metavar="S", help="Seconds between updates.")] = 2.0,
-    count: Annotated[int | None, typer.Option(metavar="N", help="Exit after N updates.")] = None,
+    every: Annotated[float, "S", "Seconds between updates."] = 2.0,
+    count: Annotated[int | None, "N", "Exit after N updates."] = None,
     as_json: AsJson = False,
     bags: Bags,
 ) -> None:

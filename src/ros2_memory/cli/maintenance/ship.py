@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
-import typer
-
 from ros2_memory.bootstrap import shared_parts
 from ros2_memory.bootstrap_fleet import build_robots
 from ros2_memory.bootstrap_lake import lake_location
@@ -42,12 +40,11 @@ log = get_logger(__name__)
 def ship(
     overrides: Overrides = None,
     *,
-    once: Annotated[bool, typer.Option("--once", help="Ship what is there, and end.")] = False,
+    once: Annotated[bool, "Ship what is there, and end."] = False,
     forget: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROBOT", help="Forget the time from --start to --end of a robot, and end."
-        ),
+        "ROBOT",
+        "Forget the time from --start to --end of a robot, and end.",
     ] = None,
     start: Start = None,
     end: End = None,
