@@ -22,7 +22,12 @@ from hydra.utils import instantiate
 
 from ros2_memory import PACKAGE, package_version
 from ros2_memory.config import (
+    AdapterNode,
+    ExcludeRule,
+    KeepRule,
     NullRecorderNode,
+    PlaceShape,
+    Settings,
     load_exclusions,
     load_labels,
     load_message_schemas,
@@ -33,9 +38,9 @@ from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, ConfigError, InvalidArgumentsError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.telemetry import SILENT, Telemetry
+from ros2_memory.core.telemetry import SILENT, Observer, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
-from ros2_memory.recorder.base import Recorder
+from ros2_memory.recorder.base import Housekeeper, Recorder
 from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
@@ -46,14 +51,11 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.columns.fill import Progress
     from ros2_memory.columns.store import ColumnStore
-    from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.regions import Place, Region
-    from ros2_memory.core.telemetry import Observer
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.memory.days import MemoryDays
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper

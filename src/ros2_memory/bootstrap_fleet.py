@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bootstrap import (
+    SharedParts,
     build_columns_of_lake,
     build_memory,
     query_settings_of,
@@ -16,7 +17,7 @@ from ros2_memory.bootstrap import (
     shared_parts,
 )
 from ros2_memory.bootstrap_lake import open_lake, require_extra
-from ros2_memory.config import NullRecorderNode, is_robot_name
+from ros2_memory.config import NullRecorderNode, Settings, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
@@ -24,8 +25,6 @@ from ros2_memory.core.timebase import WallClock
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from ros2_memory.bootstrap import SharedParts
-    from ros2_memory.config import Settings
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
     from ros2_memory.lake.files import Lake

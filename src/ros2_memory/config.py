@@ -34,7 +34,7 @@ from typing import (
 )
 
 from hydra import compose, initialize_config_dir
-from omegaconf import ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 from pydantic.types import PathType
@@ -59,8 +59,6 @@ from ros2_memory.things.labels import plain, singular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-
-    from omegaconf import DictConfig
 
     from ros2_memory.core.model import JsonValue
 

@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from ros2_memory import package_version
 
 if TYPE_CHECKING:
     from typer._click import Command, Context  # Typer has no public names for these
-    from typer.core import TyperGroup
 
 INTERRUPTED: Final = 130
 TOOL_HELP: Final = "--tool-help"

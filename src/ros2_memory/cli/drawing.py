@@ -43,7 +43,7 @@ from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.patches import Circle as RoundPatch  # noqa: E402
 from matplotlib.patches import Polygon as PolygonPatch  # noqa: E402
 
-from ros2_memory.core.regions import Circle, Polygon  # noqa: E402
+from ros2_memory.core.regions import Circle, Place, Polygon  # noqa: E402
 from ros2_memory.core.text import shortened  # noqa: E402
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.cli.plot import DrawnPath, Signal, TimelineRow
-    from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
     "axes.spines.right": False,

@@ -35,6 +35,7 @@ from ros2_memory.demo.published_topics import (
     SCENE_DESCRIPTION,
     SCENE_OBJECTS,
     STREAMS,
+    Message,
 )
 from ros2_memory.demo.robot import Planar
 
@@ -42,7 +43,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.published_topics import Message
 
 Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
 Tell: TypeAlias = "Callable[[JsonValue, Message, str], str]"

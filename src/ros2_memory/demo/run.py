@@ -19,15 +19,13 @@ from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
 from ros2_memory.demo.answer_checks import CallContext
 from ros2_memory.demo.output import connection_hints, exchange_as_json, format_exchange
 from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.questions import QUESTIONS, Exchange, judge_reply
+from ros2_memory.demo.questions import QUESTIONS, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S
 from ros2_memory.demo.server_process import HOST, free_port, running_server
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-
-    from ros2_memory.demo.questions import Question
 
     _Show: TypeAlias = Callable[[int, Exchange], object]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from opentelemetry import trace
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
@@ -26,11 +26,8 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import SpanKind, Status, StatusCode
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.telemetry import Observer
+from ros2_memory.core.telemetry import Answered, Observer
 from ros2_memory.core.timebase import ns_from_unix
-
-if TYPE_CHECKING:
-    from ros2_memory.core.telemetry import Answered
 
 SERVICE: Final = "ros2-memory-server"
 MAX_CHARS: Final = 256

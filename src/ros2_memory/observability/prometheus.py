@@ -23,18 +23,15 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import generate_latest
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.core.telemetry import Exposition, Observer
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
+from ros2_memory.core.telemetry import Answered, Exposition, Observer
+from ros2_memory.core.timebase import Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from prometheus_client.metrics_core import Metric
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.telemetry import Answered
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.index.snapshot import Snapshot
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.reply import PLAIN, TIME, result
 from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.episodes import Changes, Episode, Spell
@@ -74,7 +74,6 @@ from ros2_memory.results.topics import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.errors import NoDataReason
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
 

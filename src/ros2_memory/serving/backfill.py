@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import anyio
 import anyio.to_thread
 
-from ros2_memory.columns.fill import Progress
+from ros2_memory.columns.fill import Batch, Filling, Progress
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.history.context import Call
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import Ns, ns_from_unix
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.transforms import make_statics
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
@@ -38,10 +38,6 @@ from ros2_memory.things.seen import Watching
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.columns.fill import Batch, Filling
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Memory
 
 T = TypeVar("T")
 

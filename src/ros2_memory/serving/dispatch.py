@@ -27,25 +27,22 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.large_reads import LargeReads, return_free_memory
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
+from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import Deadline, unix_from_ns
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
 from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.extra_tools import DECLARATIONS
-from ros2_memory.tools.replies import Reply
+from ros2_memory.tools.replies import Replies, Reply
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.telemetry import Telemetry
-    from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Question, Tool, ToolDeclaration
-    from ros2_memory.tools.replies import Replies
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2

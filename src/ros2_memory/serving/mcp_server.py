@@ -12,7 +12,7 @@ from urllib.parse import unquote
 import anyio
 import anyio.to_thread
 from mcp.server.apps import Apps
-from mcp.server.caching import CacheHint
+from mcp.server.caching import CacheableMethod, CacheHint
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
 from mcp.server.mcpserver.exceptions import ResourceNotFoundError
@@ -42,8 +42,6 @@ from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping
-
-    from mcp.server.caching import CacheableMethod
 
     from ros2_memory.columns.fill import Progress
     from ros2_memory.core.model import JsonValue

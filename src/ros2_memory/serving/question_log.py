@@ -12,13 +12,12 @@ from threading import Lock
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import abbreviate, shortened
-from ros2_memory.core.timebase import ns_from_unix
+from ros2_memory.core.timebase import Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from ros2_memory.core.telemetry import Answered
-    from ros2_memory.core.timebase import Ns
 
 LONGEST_ANSWER: Final = 2_000
 LONGEST_QUESTION: Final = 500

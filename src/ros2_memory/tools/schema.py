@@ -11,7 +11,13 @@ from pydantic import ValidationError
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.tools.arguments import FORMS_OF_TIME, REGION_KINDS, TIME_KINDS
+from ros2_memory.tools.arguments import (
+    FORMS_OF_TIME,
+    REGION_KINDS,
+    TIME_KINDS,
+    Arguments,
+    TimeArgument,
+)
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -19,7 +25,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.tools.arguments import Arguments, TimeArgument
 
 _MAX_UNKNOWN_NAMED: Final = 5
 _MAX_PROBLEMS_NAMED: Final = 10

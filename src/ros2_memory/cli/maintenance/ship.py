@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
-from ros2_memory.bootstrap import shared_parts
+from ros2_memory.bootstrap import SharedParts, shared_parts
 from ros2_memory.bootstrap_fleet import build_robots
 from ros2_memory.bootstrap_lake import lake_location
 from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
@@ -23,7 +23,6 @@ from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, rest_of_end_s
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.bootstrap import SharedParts
     from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
     from ros2_memory.lake.warehouse import LakeLocation

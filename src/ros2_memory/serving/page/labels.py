@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.intervals import united
-from ros2_memory.core.reply import rounded
+from ros2_memory.core.reply import JsonObject, rounded
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.view import View
 from ros2_memory.insights.recap import found_events
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.core.model import JsonValue, TimeWindow
-    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
 
 MOST_LABELS: Final = 60

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.reply import POSE_KEYS, Scope, render, rounded
+from ros2_memory.core.reply import POSE_KEYS, JsonObject, Scope, render, rounded
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import before
@@ -16,7 +16,6 @@ from ros2_memory.serving.page.span import event_shown
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Recap
 

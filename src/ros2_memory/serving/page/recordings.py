@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.robots import (
     ADVICE,
     contradicting_frames,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.index.timeline import Timeline

@@ -22,7 +22,7 @@ from starlette.routing import Route
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from ros2_memory.columns.fill import Progress
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.serving.dispatch import Dispatcher

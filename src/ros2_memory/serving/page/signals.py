@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.reply import rounded
-from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.core.reply import JsonObject, rounded
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.counts.column_numbers import PieceNumbers
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
@@ -17,9 +17,6 @@ from ros2_memory.history.view import View
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
 
 MOST_SIGNALS: Final = 4

@@ -21,9 +21,9 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Polygon
-from ros2_memory.core.reply import degrees, moment, render, rounded
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import Circle, Place, Polygon
+from ros2_memory.core.reply import JsonObject, degrees, moment, render, rounded
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_MS,
@@ -51,9 +51,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.fill import Progress
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.regions import Place
-    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing

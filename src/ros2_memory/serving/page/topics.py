@@ -11,22 +11,18 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.reply import rounded
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import JsonObject, rounded
+from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.no_data import topics_of_robot, topics_that_show_poses, topics_with
 from ros2_memory.history.scan import scan
-from ros2_memory.history.view import View
+from ros2_memory.history.view import Census, View
 from ros2_memory.insights.fields import fields_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import Census
 
 MOST_TOPICS: Final = 200
 MOST_NUMBERS: Final = 60
