@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.layout import (
     is_carried,
 )
 from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
-from ros2_memory.bootstrap_lake import lake_location
+from ros2_memory.bootstrap_fleet import lake_location
 from ros2_memory.cli.findings import Examined, Finding, error, ok, warning
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import ConfigError, LakeError

@@ -38,7 +38,7 @@ from ros2_memory.core.reply import (
 from ros2_memory.core.text import named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
-from ros2_memory.results.episodes import SAID, Episode, Spell
+from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -10,8 +10,11 @@ import math
 import threading
 import time
 import uuid
+from collections import deque
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
+from threading import Lock
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -28,12 +31,11 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.large_reads import LargeReads, return_free_memory
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
-from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import Deadline, unix_from_ns
+from ros2_memory.core.text import abbreviate, shortened
+from ros2_memory.core.timebase import Deadline, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
-from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.extra_tools import DECLARATIONS
 from ros2_memory.tools.replies import Replies, Reply
 from ros2_memory.tools.reply_size import to_json_text
@@ -43,6 +45,49 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.tools.declaration import Question, Tool, ToolDeclaration
+
+
+LONGEST_ANSWER: Final = 2_000
+LONGEST_QUESTION: Final = 500
+
+
+@dataclass(frozen=True, slots=True)
+class KeptQuestion:
+    """A tool call: when it came (wall clock), what was asked, and the begin of its reply."""
+
+    asked: Ns
+    tool: str
+    arguments: str
+    outcome: str
+    duration_s: float
+    answer: str
+
+
+class QuestionLog:
+    """Keeps the latest questions, `most` at most; none where that is 0. Thread-safe."""
+
+    def __init__(self, most: int, wall: Callable[[], Ns] = time.time_ns) -> None:
+        self._wall = wall
+        self._kept: deque[KeptQuestion] = deque(maxlen=most)
+        self._lock = Lock()
+        self.is_on = most > 0
+        self.count = 0
+
+    def add(self, name: str, arguments: Mapping[str, object], done: Answered, answer: str) -> None:
+        """Adds a call that is over, and drops the oldest one too many. Long texts are cut."""
+        asked = self._wall() - ns_from_unix(done.duration_s)
+        given = abbreviate(arguments, LONGEST_QUESTION)
+        cut = shortened(answer, LONGEST_ANSWER)
+        tool = name if done.tool == name else abbreviate(name)
+        with self._lock:
+            self.count += 1
+            self._kept.append(KeptQuestion(asked, tool, given, done.outcome, done.duration_s, cut))
+
+    def newest(self, most: int) -> tuple[KeptQuestion, ...]:
+        """Returns the latest questions, the newest first."""
+        with self._lock:
+            return tuple(reversed(self._kept))[:most]
+
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2

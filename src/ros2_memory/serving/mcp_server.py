@@ -1,4 +1,9 @@
-"""The MCP server: the tools as declared, the resources, and a prompt."""
+"""The MCP server: the tools as declared, the resources, a prompt, and the view of MCP Apps.
+
+The view (SEP-1865) is one document that draws the reply of a tool in a chat, of the page's own
+drawing code. It reaches no network, whatever the client allows: what it shows is given to it by the
+client, and what it asks further goes through the client.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +11,13 @@ import itertools
 import json
 import time
 from contextlib import suppress
+from importlib import resources
 from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
 
 import anyio
 import anyio.to_thread
-from mcp.server.apps import Apps
+from mcp.server.apps import APP_MIME_TYPE, Apps
 from mcp.server.caching import CacheableMethod, CacheHint
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
@@ -36,8 +42,8 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
+from ros2_memory.serving import page
 from ros2_memory.serving.auth import robots_of
-from ros2_memory.serving.chat_view import TOOLS_WITH_VIEW, VIEW_URI, view
 from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
@@ -47,6 +53,27 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
+
+
+VIEW_URI: Final = "ui://episodic/memory"
+TOOLS_WITH_VIEW: Final = frozenset(
+    {"recap", "visits", "find_things", "find_matches", "trajectory_summary", "compare"}
+)
+_STYLES: Final = ("page.css", "chat.css")
+_SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
+
+
+def view() -> ReadResourceContents:
+    """Returns the document."""
+    html = _joined(("chat.html",)).replace("<style></style>", f"<style>{_joined(_STYLES)}</style>")
+    html = html.replace("<script></script>", f"<script>{_joined(_SCRIPTS)}</script>")
+    return ReadResourceContents(html, APP_MIME_TYPE, {"ui": {"prefersBorder": True}})
+
+
+def _joined(names: Iterable[str]) -> str:
+    folder = resources.files(page)
+    return "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
+
 
 MESSAGES_PATH: Final = "/messages/"
 """Where the clients of event streams post, each with its session in the query string."""

@@ -32,10 +32,9 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
-from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
-from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
@@ -52,8 +51,7 @@ from ros2_memory.serving.page.span import (
     span_shown,
     thinned,
 )
-from ros2_memory.serving.page.topics import topics_shown
-from ros2_memory.serving.question_log import QuestionLog
+from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools

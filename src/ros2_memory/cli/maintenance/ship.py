@@ -8,8 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 from ros2_memory.bootstrap import SharedParts, shared_parts
-from ros2_memory.bootstrap_fleet import build_robots
-from ros2_memory.bootstrap_lake import lake_location
+from ros2_memory.bootstrap_fleet import build_robots, lake_location
 from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
 from ros2_memory.cli.output import print_json, print_line, print_notes
 from ros2_memory.config import Settings

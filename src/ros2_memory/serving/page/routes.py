@@ -27,12 +27,10 @@ from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
-from ros2_memory.serving.page.labels import labels_shown
 from ros2_memory.serving.page.moment import MomentRequest, moment_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
 from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
-from ros2_memory.serving.page.topics import topics_shown
+from ros2_memory.serving.page.topics import MOST_SIGNALS, Signal, labels_shown, topics_shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable

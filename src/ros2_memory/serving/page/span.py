@@ -42,7 +42,7 @@ from ros2_memory.places.local_map import local_track
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import data_time_range
-from ros2_memory.serving.page.signals import Signal, signal_in
+from ros2_memory.serving.page.topics import Signal, signal_in
 from ros2_memory.things.find import find_things
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing
-    from ros2_memory.serving.question_log import KeptQuestion, QuestionLog
+    from ros2_memory.serving.dispatch import KeptQuestion, QuestionLog
 
 MOST_POINTS: Final = 2_000
 MOST_EVENTS: Final = 300
