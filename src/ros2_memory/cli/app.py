@@ -5,8 +5,7 @@ wait for the libraries of all of them.
 """
 
 import signal
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
@@ -24,6 +23,7 @@ INTERRUPTED: Final = 130
 TOOL_HELP: Final = "--tool-help"
 """What `ask TOOL --help` is passed on as: help on the tool."""
 _HELP: Final = ("-h", "--help")
+_SIGNALS: Final = (signal.SIGTERM, signal.SIGHUP)
 
 
 class CommandEntry(NamedTuple):
@@ -176,17 +176,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: done, and the answer is yes; 1: an answer was wrong or missing, or something was left undone;
     2: it could not run, and stderr says why; 130: interrupted before it finished.
     """
+    # Signals end it as Ctrl-C does, so that files are closed.
+    before = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
     try:
-        with _as_keyboard_interrupt(signal.SIGTERM, signal.SIGHUP):
-            # An application with a callback is a group.
-            group = cast("TyperGroup", get_command(app))
-            for name in COMMANDS:
-                group.add_command(LazyCommand(name))
-            group(args=None if argv is None else [*argv], prog_name="ros2-memory")
+        # An application with a callback is a group.
+        group = cast("TyperGroup", get_command(app))
+        for name in COMMANDS:
+            group.add_command(LazyCommand(name))
+        group(args=None if argv is None else [*argv], prog_name="ros2-memory")
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0
 
 
@@ -206,7 +210,10 @@ class LazyCommand(TyperCommand):
     ) -> "Context":
         """Returns the context of the real command, which runs, completes and shows its help."""
         command = self._load()
-        if parent is not None and parent.params.get("verbose") and _takes(command, "verbose"):
+        # Of a group, the commands have the options.
+        commands = getattr(command, "commands", {self._name: command}).values()
+        is_verbose = parent is not None and parent.params.get("verbose")
+        if is_verbose and all("verbose" in [of.name for of in one.params] for one in commands):
             args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if word in _HELP else word for word in args]
@@ -229,28 +236,10 @@ class LazyCommand(TyperCommand):
         return get_group(parent).commands[self._name]
 
 
-def _takes(command: "Command", option: str) -> bool:
-    """Returns whether a command has an option; of a group, whether its commands have it."""
-    commands = getattr(command, "commands", None)
-    of_all = [*commands.values()] if commands else [command]
-    return all(option in [parameter.name for parameter in one.params] for one in of_all)
-
-
 def epilog(command: str) -> str:
     """Returns the last lines of a command's help: what its exit codes mean."""
     codes = {**COMMON_EXIT_CODES, **COMMANDS[command].exit_codes}
     return f"Exit code: {'; '.join(f'{code}: {codes[code]}' for code in sorted(codes))}."
-
-
-@contextmanager
-def _as_keyboard_interrupt(*signals: signal.Signals) -> Iterator[None]:
-    """Raises KeyboardInterrupt for these signals within the block, so that files are closed."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _print_version(requested: bool) -> None:

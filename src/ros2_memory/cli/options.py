@@ -174,12 +174,17 @@ def load_to_look(
     """
     named, given = settings_to_look(bag_dir, words, recording)
     loaded = load_for(named, given)
-    by_words = any(word.partition("=")[0] in GROUPS for word in given)
-    of_path = named if bag_dir is None else None
-    is_chosen = is_deployment_chosen(given)
-    if by_words or not _is_of_others(loaded[0], of_path, is_chosen=is_chosen):
+    if any(word.partition("=")[0] in GROUPS for word in given):
         return loaded
-    return load_for(named, [*LOOKING, *given])
+    found = loaded[0].recording.bag_dir
+    if named is not None and bag_dir is None:
+        own = load_for(None, None)[0].recording.bag_dir
+        is_of_others = named.absolute() != own.absolute() and not _is_recorded_now(found)
+    elif is_deployment_chosen(given) or has_recorded(found) or not found.is_dir():
+        is_of_others = False
+    else:
+        is_of_others = next(folders_with_bags(found), None) is not None
+    return load_for(named, [*LOOKING, *given]) if is_of_others else loaded
 
 
 def settings_to_look(
@@ -245,17 +250,6 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
         raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
     real = file.resolve()
     return real.parent, real.name
-
-
-def _is_of_others(settings: Settings, path: Path | None, *, is_chosen: bool) -> bool:
-    """Returns whether another deployment recorded the bags."""
-    bag_dir = settings.recording.bag_dir
-    if path is None:
-        if is_chosen or has_recorded(bag_dir) or not bag_dir.is_dir():
-            return False
-        return next(folders_with_bags(bag_dir), None) is not None
-    configured = load_for(None, None)[0].recording.bag_dir
-    return path.absolute() != configured.absolute() and not _is_recorded_now(bag_dir)
 
 
 def _is_recorded_now(bag_dir: Path) -> bool:

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing
-    from ros2_memory.serving.dispatch import KeptQuestion, QuestionLog
+    from ros2_memory.serving.dispatch import QuestionLog
 
 MOST_POINTS: Final = 2_000
 MOST_EVENTS: Final = 300
@@ -157,7 +157,7 @@ def span_shown(
         else {"closed": filling.closed, "waiting": filling.waiting},
     }
     if questions is not None and questions.is_on:
-        shown["questions"] = [_question(each) for each in questions.newest(MOST_QUESTIONS)]
+        shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
         ranged = data_time_range(memory, call)
         shown["range"] = {
@@ -250,17 +250,6 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
 def _keeps_up(filling: Progress) -> bool:
     """Whether the store lacks nothing but the newest of many bags, as while recording."""
     return filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
-
-
-def _question(kept: KeptQuestion) -> JsonObject:
-    return {
-        "asked": _s(kept.asked),
-        "tool": kept.tool,
-        "arguments": kept.arguments,
-        "outcome": kept.outcome,
-        "ms": round(kept.duration_s * 1000, 1),
-        "answer": kept.answer,
-    }
 
 
 def _s(at: Ns) -> float:
