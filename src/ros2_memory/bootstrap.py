@@ -216,7 +216,6 @@ def _memory_days_of(
     memory = settings.memory
     if not memory.keep and not (bag_dir / MEMORY_FOLDER).is_dir():
         return None
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
     from ros2_memory.storage.mcap.writer import McapWriter
 
@@ -234,10 +233,17 @@ def _memory_days_of(
         bags,
         writer,
         own,
-        SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length),
+        _extractor_of(settings),
         limits=limits if memory.keep else None,
         static_topics=static,
     )
+
+
+def _extractor_of(settings: Settings) -> SchemaExtractor:
+    """Returns what reads the fields of messages that the schema map names."""
+    from ros2_memory.extract import SchemaExtractor
+
+    return SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
 
 
 def _watch_of(
@@ -247,31 +253,27 @@ def _watch_of(
     own: OwnRecordings,
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
-    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.search import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
-    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    def is_recorded(topic: str) -> bool:
+        """Whether the list of topics, which may have changed, has one; True where it is refused."""
+        try:
+            return load_topics(settings.recording.topics_file).matches(topic)
+        except ConfigError:
+            return True
+
     return partial(
         Triggers,
         bag_dir,
         rules,
-        SplitSearch(reader, extractor, rules),
+        SplitSearch(reader, _extractor_of(settings), rules),
         own,
         clock=WallClock(),
         split_duration_s=settings.recording.split_duration_s,
-        is_recorded=lambda topic: _is_listed(settings.recording.topics_file, topic),
+        is_recorded=is_recorded,
     )
-
-
-def _is_listed(topics_file: Path, topic: str) -> bool:
-    """Whether the list of topics, which may have changed, has a topic; True where it is refused."""
-    from ros2_memory.recorder.process.topics import load_topics
-
-    try:
-        return load_topics(topics_file).matches(topic)
-    except ConfigError:
-        return True
 
 
 def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
@@ -318,7 +320,6 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
 
 
 def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Screening | None:
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.mcap.writer import McapWriter
     from ros2_memory.triggers.screening import Screening
 
@@ -329,7 +330,7 @@ def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Scree
         bag_dir,
         rules,
         reader,
-        SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length),
+        _extractor_of(settings),
         McapWriter(settings.reader.max_chunk_mb),
         split_duration_s=settings.recording.split_duration_s,
     )

@@ -139,22 +139,15 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
         if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
             if latching.is_latched(snapshot, topic):
                 for stored in view.stream.messages([topic], before):
-                    frames = _child_frames(view.memory, stored)
-                    valid.update(((topic, frame), stored) for frame in frames)
+                    with suppress(UndecodableError):
+                        message = view.memory.reader.decode(stored.record)
+                        edges = view.extractor.transforms(message, stored.time, static=True)
+                        valid.update(((topic, edge.child), stored) for edge in edges)
         elif (newest := view.stream.newest(topic, before)) and latching.holds(snapshot, newest):
             valid[topic, ""] = newest
     # A message is valid for several frames, and is exported once.
     once = {id(stored): stored for stored in valid.values()}
     return sorted(once.values(), key=lambda stored: stored.time)
-
-
-def _child_frames(memory: Memory, stored: StoredMessage) -> set[str]:
-    """Returns the child frames of a TFMessage; none if it cannot be decoded."""
-    with suppress(UndecodableError):
-        message = memory.reader.decode(stored.record)
-        edges = memory.extractor.transforms(message, stored.time, static=True)
-        return {edge.child for edge in edges}
-    return set()
 
 
 def profile_of(

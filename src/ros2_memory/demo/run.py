@@ -320,7 +320,7 @@ def run_demo(
             f"--duration {duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
             "the shortest is a lap of the robot and two bag files"
         )
-    if bag_dir is not None and bag_dir.exists() and not _is_empty(bag_dir):
+    if bag_dir and bag_dir.exists() and not (bag_dir.is_dir() and not any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
     port = free_port(port)
     tell: Callable[[str], object] = str if as_json else say
@@ -347,10 +347,6 @@ def run_demo(
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return 1 if wrong else 0
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _made(bag_dir: Path | None, stack: ExitStack) -> Path:

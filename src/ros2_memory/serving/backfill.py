@@ -36,7 +36,7 @@ from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
 
 T = TypeVar("T")
@@ -188,7 +188,12 @@ def make_fragments(
         TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
         for number in sorted(touched, reverse=True)
     ]
-    pieces = [piece for window in windows for piece in _pieces_of(window)]
+    # The newest `STRETCH_NS` of a window, and so on: few fragments wait to be written.
+    pieces = [
+        TimeWindow(max(window.start, stop - STRETCH_NS), stop)
+        for window in windows
+        for stop in range(window.stop, window.start, -STRETCH_NS)
+    ]
     unwritten: Ns = 0
     for nth, window in enumerate([*pieces, *stretches]):
         try:
@@ -214,12 +219,6 @@ def make_fragments(
             unwritten = 0
         memory.large.release()
     memory.columns.write_fragments()
-
-
-def _pieces_of(window: TimeWindow) -> Iterator[TimeWindow]:
-    """Yields the newest `STRETCH_NS` of a window, and so on: few fragments wait to be written."""
-    for stop in range(window.stop, window.start, -STRETCH_NS):
-        yield TimeWindow(max(window.start, stop - STRETCH_NS), stop)
 
 
 async def keep_backfilled(

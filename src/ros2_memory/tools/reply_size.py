@@ -170,7 +170,9 @@ def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
     shortener = _weakest_shortener(reply, max_chars)
     shorter = shortener.shorten(reply)
     named = [
-        f"{_as_field(path)} ({how}{f': {kept} of {total} kept' if total else ''})"
+        # As the `fields` argument takes it: relative to a sample's value.
+        f"{path.removeprefix('samples.').removeprefix('value.')} "
+        f"({how}{f': {kept} of {total} kept' if total else ''})"
         for (path, how), (kept, total) in shortener.shortened.items()
     ]
     if len(named) > _MAX_NAMES:
@@ -200,11 +202,6 @@ def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
     fewest, shortest = _ARRAY_STEPS[-1], _SHORTEST_TEXT // 4
     keys = next((step for step in _KEY_STEPS if fits(step, fewest, shortest)), _KEY_STEPS[-1])
     return _Shortener(keys, fewest, shortest)
-
-
-def _as_field(path: str) -> str:
-    """Returns the dot-path as the `fields` argument takes it: relative to a sample's value."""
-    return path.removeprefix("samples.").removeprefix("value.")
 
 
 class _Shortener:

@@ -145,7 +145,9 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
         return False
     request = SpanRequest(last_s=_WEEK_S, patient=True)
     try:
-        _gather_static_transforms(memory, call)
+        view = View(memory, call)
+        for bag in view.snapshot.bags[-1:]:
+            static_transforms(view, sessions_of(view).of(bag.recording))
         Recordings().shown(memory, memory, call)
         for _ in range(_MOST_TRIES):
             shown = span_shown(memory, call, request)
@@ -158,12 +160,6 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
     except Exception:
         log.exception("page_not_warmed_up")
     return True
-
-
-def _gather_static_transforms(memory: Memory, call: Call) -> None:
-    view = View(memory, call)
-    for bag in view.snapshot.bags[-1:]:
-        static_transforms(view, sessions_of(view).of(bag.recording))
 
 
 def span_request(given: QueryParams) -> SpanRequest:

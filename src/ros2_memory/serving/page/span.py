@@ -160,10 +160,13 @@ def span_shown(
         shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
         ranged = data_time_range(memory, call)
+        days: list[JsonValue] = [
+            [_s(start), _s(stop)] for start, stop in snapshot.timeline.thinned_times
+        ]
         shown["range"] = {
             **render(ranged, memory.index.bag_dir),
             "gaps": _gaps(ranged),
-            **_thinned_days(snapshot),
+            **({"thinned": days} if days else {}),
         }
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
@@ -266,12 +269,6 @@ def _end_s(window: TimeWindow) -> float:
     return -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
 
 
-def _thinned_days(snapshot: Snapshot) -> JsonObject:
-    """Returns the times of thinned days, where there are some."""
-    times = snapshot.timeline.thinned_times
-    return {"thinned": [[_s(start), _s(stop)] for start, stop in times]} if times else {}
-
-
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
     """Returns the longest gaps in order, as pairs of times."""
     longest = sorted(ranged.gaps, key=lambda each: each.start - each.end)[:MOST_GAPS]
@@ -292,7 +289,9 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     if window.stop <= latest or not len(track.times):
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
     path = _drawn(track, places.map_frame, is_whole=found.since is None)
-    named = _places(memory, places.map_frame)
+    named: list[JsonValue] = [
+        _place(at) for at in memory.limits.places if at.frame_id == places.map_frame
+    ]
     shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
     notes = [*view.notes.sentences()]
     if found.since is not None:
@@ -304,22 +303,16 @@ def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
     """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
     found = local_track(view, view.pose_topic, window)
     if found is None:
-        why = _without_poses(view)
+        try:
+            why = f"{resolve_pose_topic(view)} has no poses"
+        except NoDataError as error:  # names the setting or tool that gives a path
+            why = error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
     frame, track = found
     newest = local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1))
     robot = None if newest is None else _last(newest[1])
     shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
     return Shown(shown, view.notes.sentences())
-
-
-def _without_poses(view: View) -> str:
-    """Returns why there is no path, and which setting or tool gives one."""
-    try:
-        topic = resolve_pose_topic(view)
-    except NoDataError as error:
-        return error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
-    return f"{topic} has no poses"
 
 
 def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
@@ -425,12 +418,8 @@ def _last(track: RobotTrack) -> JsonObject | None:
     }
 
 
-def _places(memory: Memory, frame_id: str) -> list[JsonValue]:
-    """Returns the named places of a frame, each as a circle or as corners."""
-    return [_place(each) for each in memory.limits.places if each.frame_id == frame_id]
-
-
 def _place(place: Place) -> JsonObject:
+    """Returns a named place as a circle or as corners."""
     match place.region:
         case Circle(x, y, radius_m):
             return {"name": place.name, "circle": [x, y, radius_m]}

@@ -30,7 +30,7 @@ from ros2_memory.history.no_data import (
     topics_with,
 )
 from ros2_memory.history.scan import scan
-from ros2_memory.history.view import Census, View
+from ros2_memory.history.view import View
 from ros2_memory.insights.fields import fields_of
 from ros2_memory.insights.recap import found_events
 
@@ -232,18 +232,14 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
             "numbers": [*_numbers(view, topic)],
         }
         for topic in topics[:MOST_TOPICS]
-        for type_name, census in [_newest_type(view, topic)]
+        # The type under which it was recorded last.
+        for type_name, census in [max(view.census(topic).items(), key=lambda of: of[1].last)]
     ]
     return {
         "topics": rows,
         "topics_total": len(topics),
         "places_robot": _places_robot(view),
     }
-
-
-def _newest_type(view: View, topic: str) -> tuple[str, Census]:
-    """Returns the type under which a topic was recorded last, and what is recorded under it."""
-    return max(view.census(topic).items(), key=lambda each: each[1].last)
 
 
 def _rate(view: View, topic: str) -> float | None:
