@@ -35,11 +35,10 @@ from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
-from ros2_memory.serving.page.moment import moment_shown
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
     box_asked,
-    moment_request,
+    moment_asked,
     page_routes,
     span_request,
     warm_up,
@@ -111,7 +110,7 @@ def shown(memory: Memory, query: str = "", **more: Any) -> dict[str, Any]:
 
 
 def moment(memory: Memory, query: str) -> dict[str, Any]:
-    reply = moment_shown(memory, Call(), moment_request(QueryParams(query)))
+    reply = moment_asked(QueryParams(query), memory, Call())
     found: dict[str, Any] = json.loads(to_json_text(reply))
     return found
 
@@ -312,7 +311,7 @@ def test_a_moment_without_a_time_is_refused(memory: Memory) -> None:
     with pytest.raises(InvalidArgumentsError, match="give t, or start and end"):
         moment(memory, "label=cup")
     with pytest.raises(InvalidArgumentsError, match="longer than"):
-        moment_request(QueryParams({"label": "x" * 201}))
+        moment(memory, f"t=1&label={'x' * 201}")
 
 
 paths = st.lists(

@@ -8,7 +8,7 @@ the greatest of each. Labels count without a place, too.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, rounded
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
-from ros2_memory.counts.column_numbers import PieceNumbers
+from ros2_memory.counts.column_numbers import Part, PieceNumbers
 from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,
@@ -107,19 +107,6 @@ class Signal(NamedTuple):
         return cls(topic, field)
 
 
-class _Part(NamedTuple):
-    first: Ns
-    last: Ns
-    size: int
-    total: float
-    low: float
-    high: float
-
-
-_Found: TypeAlias = "tuple[Sequence[_Part], Ns | None, Sequence[UndecodableError]]"
-"""Numbers in order of time, since when they are known if not all were read, and failures."""
-
-
 def signal_in(
     memory: Memory, call: Call, signal: Signal, window: TimeWindow, span: TimeWindow
 ) -> JsonObject:
@@ -149,8 +136,13 @@ def signal_in(
     return shown
 
 
-def _signal_parts(view: View, topic: str, field: str, window: TimeWindow, width: Ns) -> _Found:
-    """Returns the numbers of a field, of times that no edge of a bin cuts, in order."""
+def _signal_parts(
+    view: View, topic: str, field: str, window: TimeWindow, width: Ns
+) -> tuple[list[Part], Ns | None, Sequence[UndecodableError]]:
+    """Returns the numbers of a field, of times that no edge of a bin cuts, in order.
+
+    And since when they are known, if not all were read, and failures.
+    """
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
         for first, last in view.timeline.recordings(topic).values()
@@ -162,30 +154,20 @@ def _signal_parts(view: View, topic: str, field: str, window: TimeWindow, width:
     edges = np.arange(begin - begin % width + width, end + 1, width)
     numbers = PieceNumbers(view, topic, (field,), edges)
     numbers.collect(window)
-    parts = [
-        _Part(
-            part.first,
-            part.last,
-            part.size,
-            part.total,
-            part.least.middle,
-            -part.greatest.middle,
-        )
-        for piece in range(len(edges) + 1)
-        for part in sorted(numbers.parts(0, piece))
-    ]
+    pieces = range(len(edges) + 1)
+    parts = [part for piece in pieces for part in sorted(numbers.parts(0, piece))]
     return parts, numbers.since, numbers.failures
 
 
-def _in_bins(parts: Sequence[_Part], width: Ns) -> list[tuple[float | None, ...]]:
+def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]:
     """Returns for each bin with numbers its middle, and the least, mean and greatest number."""
     middles = np.array([(each.first + each.last) // 2 for each in parts], np.int64)
     bins = middles // width
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
     sizes = np.array([each.size for each in parts], np.float64)
     totals = np.array([each.total for each in parts])
-    lows = np.minimum.reduceat(np.array([each.low for each in parts]), starts)
-    highs = np.maximum.reduceat(np.array([each.high for each in parts]), starts)
+    lows = np.minimum.reduceat(np.array([each.least.middle for each in parts]), starts)
+    highs = np.maximum.reduceat(np.array([-each.greatest.middle for each in parts]), starts)
     # One of them may be exact, and the other rounded to beyond it.
     lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
     means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
