@@ -489,21 +489,28 @@ def build_memory(
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 
 
-def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
+def build_columns(
+    settings: Settings, reader: BagReader, of_lake: str | None = None
+) -> ColumnStore | None:
     """Returns the store of columns; None where the configuration wants none.
 
-    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes.
+    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes. That of
+    a lake's robot, named by `of_lake`, is in the cache folder, and made again from the lake.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
 
     if not settings.store.enabled:
         return None
+    definitions = _hash_of(_definitions_of(settings))
+    if of_lake is not None:
+        cached = _cached(f"{settings.lake.warehouse} {of_lake}".encode())
+        return ColumnStore(cached, reader.definition, definitions=definitions)
     bag_dir = settings.recording.bag_dir
     return ColumnStore(
         partial(column_paths, settings),
         reader.definition,
-        definitions=_hash_of(_definitions_of(settings)),
+        definitions=definitions,
         # What a recorder's server stored serves who only looks, too.
         sources=(bag_dir / OWN_FOLDER / FILE,),
         waits_for=bag_dir,
@@ -537,22 +544,6 @@ def _cached(name: bytes) -> tuple[Path, ...]:
         return ()
     folder = cache / PACKAGE / hashlib.sha256(name).hexdigest()[:16]
     return (folder / FILE,) if cache.is_absolute() else ()
-
-
-def build_columns_of_lake(settings: Settings, robot: str, decoder: BagReader) -> ColumnStore | None:
-    """Returns the store of columns of a lake's robot, which is in the cache folder; None for none.
-
-    It is made again from the lake.
-    """
-    from ros2_memory.columns.store import ColumnStore
-
-    if not settings.store.enabled:
-        return None
-    return ColumnStore(
-        _cached(f"{settings.lake.warehouse} {robot}".encode()),
-        decoder.definition,
-        definitions=_hash_of(_definitions_of(settings)),
-    )
 
 
 def delete_catalogues(settings: Settings) -> None:
@@ -606,29 +597,20 @@ def _hash_of(value: object) -> str:
     return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
 
 
-def build_backfill(settings: Settings, memory: Memory) -> Backfill:
+def build_backfill(settings: Settings, memory: Memory, *, are_files: bool = True) -> Backfill:
     """Returns what fills the store of columns of a memory, if it has one.
 
-    Deletes the catalogues of earlier versions, whose place the store takes.
+    Deletes the catalogues of earlier versions, whose place the store takes. `are_files`: whether
+    the bags are files, and not those of a lake.
     """
-    try:
-        delete_catalogues(settings)
-    except BagError as error:
-        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
-    return _backfill(settings, memory, settings.recording.bag_dir)
-
-
-def build_backfill_of_lake(settings: Settings, memory: Memory) -> Backfill:
-    """Returns what fills the store of columns of a lake's robot, if it has one."""
-    return _backfill(settings, memory, memory.index.bag_dir, are_files=False)
-
-
-def _backfill(
-    settings: Settings, memory: Memory, bag_dir: Path, *, are_files: bool = True
-) -> Backfill:
     from ros2_memory.columns.fill import Filling, StoreLimits
     from ros2_memory.serving.backfill import Backfill
 
+    try:
+        if are_files:
+            delete_catalogues(settings)
+    except BagError as error:
+        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
     scanner, store = memory.columns, settings.store
     if scanner.store is None:
         return Backfill(memory, None)
@@ -637,7 +619,7 @@ def _backfill(
         Filling(
             scanner,
             memory.reader,
-            bag_dir,
+            memory.index.bag_dir,
             memory.clock,
             StoreLimits(store.max_share, round(store.max_gb * GB)),
             are_files=are_files,

@@ -15,7 +15,7 @@ import yaml
 
 from ros2_memory.bootstrap import (
     SharedParts,
-    build_columns_of_lake,
+    build_columns,
     build_memory,
     instantiated,
     query_settings_of,
@@ -222,7 +222,7 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         extractor=shared.extractor,
         decoder=shared.reader,
         large=shared.large,
-        store=build_columns_of_lake(own, name, shared.reader),
+        store=build_columns(own, shared.reader, of_lake=name),
         settings=reading_of(own, shared.schemas),
         refresh_s=LAKE_REFRESH_S,
     )

@@ -217,7 +217,7 @@ def _parts_of_fleet(
     """Returns the parts of a fleet's server, which has no page: that shows one robot."""
     import anyio
 
-    from ros2_memory.bootstrap import build_backfill, build_backfill_of_lake, build_server
+    from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.bootstrap_fleet import robot_settings
     from ros2_memory.serving.backfill import Filler, keep_all_backfilled
     from ros2_memory.serving.health import FleetHealth, Health
@@ -236,7 +236,8 @@ def _parts_of_fleet(
     def all_fillers() -> list[tuple[Memory, Filler]]:
         for each in [*fleet.robots.values()]:  # more robots may have joined
             if each.lake is not None and each.name not in shipped:
-                shipped[each.name] = each.lake, Filler(build_backfill_of_lake(settings, each.lake))
+                backfill = build_backfill(settings, each.lake, are_files=False)
+                shipped[each.name] = each.lake, Filler(backfill)
         return [*fillers.values(), *shipped.values()]
 
     async def background() -> None:

@@ -140,15 +140,13 @@ MOMENT: Final = ResourceTemplate(
     mime_type=_JSON,
 )
 _TEMPLATES: Final = {
-    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type"),
-    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment"),
+    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type", "list_recorded_topics"),
+    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment", "list_moments"),
 }
-"""By prefix: the template, the tool whose reply is the text, and its argument."""
-_VALUES: Final = {
-    SCHEMA.uri_template: ("list_recorded_topics", "type"),
-    MOMENT.uri_template: ("list_moments", "moment"),
-}
-"""The values that a template's parameter can have: the tool whose rows have them, and their key."""
+"""By prefix: the template, the tool whose reply is the text, and its argument.
+
+And the tool whose rows have, under the same name, the values that it can have.
+"""
 
 
 class EpisodicServer(MCPServer[object]):
@@ -186,7 +184,9 @@ class EpisodicServer(MCPServer[object]):
         readable = dispatcher.readable
         self._resources = [each for each in offered if TOOLS_OF_RESOURCES[each.uri] in readable]
         self._templates = [
-            template for template, tool, _ in _TEMPLATES.values() if has_status and tool in readable
+            template
+            for template, tool, *_ in _TEMPLATES.values()
+            if has_status and tool in readable
         ]
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
 
@@ -254,7 +254,7 @@ class EpisodicServer(MCPServer[object]):
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
         """Returns the tool of a resource, and its arguments."""
-        for prefix, (template, tool, argument) in _TEMPLATES.items():
+        for prefix, (template, tool, argument, _) in _TEMPLATES.items():
             if template in self._templates and uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
         offered = [each.uri for each in self._resources]
@@ -272,9 +272,11 @@ class EpisodicServer(MCPServer[object]):
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
         of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        if of not in {each.uri_template for each in self._templates}:
+        known = (row for row in _TEMPLATES.values() if row[0] in self._templates)
+        asked = next((row for row in known if row[0].uri_template == of), None)
+        if asked is None:
             return None
-        tool, key = _VALUES[of]
+        _, _, key, tool = asked
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
         rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
         typed = argument.value.casefold()
