@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -99,13 +100,13 @@ class Metrics(Observer):
         return Exposition(CONTENT_TYPE_PLAIN_0_0_4, text)
 
 
+@dataclass
 class _Collector:
     """What `generate_latest` renders: the counters, and the gauges of one moment."""
 
-    def __init__(self, registry: CollectorRegistry, gauges: Sequence[Metric], version: str) -> None:
-        self._registry = registry
-        self._gauges = gauges
-        self._version = version
+    _registry: CollectorRegistry
+    _gauges: Sequence[Metric]
+    _version: str
 
     def collect(self) -> Iterator[Metric]:
         """Yields all metric families."""
@@ -116,13 +117,13 @@ class _Collector:
         yield from self._gauges
 
 
+@dataclass
 class MemoryGauges:
     """Measures a memory, and what its recorder writes about itself; for one thread at a time."""
 
-    def __init__(self, memory: Memory) -> None:
-        self._memory = memory
-        self._pid: int | None = None
-        self._restarts = 0
+    _memory: Memory
+    _pid: int | None = None
+    _restarts: int = 0
 
     def __call__(self) -> list[Metric]:
         """Returns the metric families of this moment.

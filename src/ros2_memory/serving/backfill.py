@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from heapq import merge
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -58,6 +59,7 @@ _LATELY: Final = 4
 """Intervals between scans after which bags count as out of reach."""
 
 
+@dataclass
 class Backfill:
     """Stores the bags of one memory. Only `progress` may be called from several threads.
 
@@ -70,11 +72,10 @@ class Backfill:
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
     """
 
-    def __init__(self, memory: Memory, filling: Filling | None) -> None:
-        self._memory = memory
-        self.filling = filling
-        self.undecodable: dict[str, str] = {}
-        self._of_others: list[Ns] | None = None
+    _memory: Memory
+    filling: Filling | None
+    undecodable: dict[str, str] = field(default_factory=dict)
+    _of_others: list[Ns] | None = None
 
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
@@ -257,23 +258,18 @@ async def keep_all_backfilled(
         await anyio.sleep(every_s)
 
 
+@dataclass
 class Filler:
     """Fills one store, a round at a time; see `keep_backfilled`.
 
     Without a `helper` it stores a backlog itself.
     """
 
-    def __init__(
-        self,
-        backfill: Backfill,
-        helper: Sequence[str] = (),
-        warm_up: Callable[[], bool] | None = None,
-    ) -> None:
-        self._backfill = backfill
-        self._helper = helper
-        self._warm_up = warm_up
-        self._pruned_s = -math.inf
-        self._is_precomputed = False
+    _backfill: Backfill
+    _helper: Sequence[str] = ()
+    _warm_up: Callable[[], bool] | None = None
+    _pruned_s: float = -math.inf
+    _is_precomputed: bool = False
 
     async def fill(self) -> None:
         """Stores the closed bags that there are. Raises nothing but cancellation."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -116,12 +117,12 @@ class Health:
         return _status(self._version, ["the bag directory is being scanned"], {})
 
 
+@dataclass
 class FleetHealth:
     """Reports the state of a fleet's server: the robots' states, each by its own `Health`."""
 
-    def __init__(self, robots: Mapping[str, Health], version: str) -> None:
-        self._robots = robots
-        self._version = version
+    _robots: Mapping[str, Health]
+    _version: str
 
     def stop(self) -> None:
         """Ends the threads when they are done."""

@@ -11,6 +11,7 @@ import itertools
 import json
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
@@ -311,17 +312,13 @@ class EpisodicServer(MCPServer[object]):
         )
 
 
+@dataclass
 class Storing:
     """How far the store of columns is filled, and at what rate it was during one call."""
 
-    def __init__(
-        self,
-        progress: Callable[[], Progress] | None,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._progress = progress
-        self._monotonic = monotonic
-        self._first: tuple[float, int] | None = None
+    _progress: Callable[[], Progress] | None
+    _monotonic: Callable[[], float] = time.monotonic
+    _first: tuple[float, int] | None = None
 
     def sentence(self) -> str | None:
         """Returns e.g. `40 % of the bags stored, about 20 s left`; None where none waits."""

@@ -48,6 +48,7 @@ _KINDS: Final = {
 _TIME: Final = "Unix seconds or ISO 8601 text"
 
 
+@dataclass(frozen=True)
 class Signature:
     """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
 
@@ -56,16 +57,9 @@ class Signature:
     which one must be given there is the first alone, as the specification has it.
     """
 
-    def __init__(
-        self,
-        arguments: type[Arguments],
-        when: type[TimeArgument] | None = None,
-        *,
-        plain_times: bool = False,
-    ) -> None:
-        self._arguments = arguments
-        self._when = when
-        self._plain_times = plain_times
+    _arguments: type[Arguments]
+    _when: type[TimeArgument] | None = None
+    plain_times: bool = False
 
     @cached_property
     def _properties(self) -> dict[str, JsonObject]:
@@ -76,7 +70,7 @@ class Signature:
                 properties.update(_properties(self._when))
             else:
                 properties[name] = schema
-        if self._plain_times and self._when is not None:
+        if self.plain_times and self._when is not None:
             for name in self._when.either[1:]:
                 del properties[name]
         return properties
@@ -89,7 +83,7 @@ class Signature:
     def _either(self) -> tuple[str, ...]:
         """Returns the arguments of which exactly one must be given."""
         either = () if self._when is None else self._when.either
-        return either[:1] if self._plain_times else either
+        return either[:1] if self.plain_times else either
 
     @property
     def example(self) -> JsonObject:
@@ -110,8 +104,8 @@ class Signature:
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
             shown = _with_list_of_types(shown)
-            properties[name] = _with_plain_times(shown) if self._plain_times else shown
-        required = [*self._required, *(self._either if self._plain_times else ())]
+            properties[name] = _with_plain_times(shown) if self.plain_times else shown
+        required = [*self._required, *(self._either if self.plain_times else ())]
         whole: JsonObject = {"type": "object", "properties": properties}
         return {**whole, "required": [*required]} if required else whole
 

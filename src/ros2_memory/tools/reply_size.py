@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_left
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -204,6 +205,7 @@ def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
     return _Shortener(keys, fewest, shortest)
 
 
+@dataclass
 class _Shortener:
     """Limits on the keys of an object, the elements of an array, and the characters of a text.
 
@@ -212,11 +214,10 @@ class _Shortener:
             was kept of how much, of the longest list or widest object there; (0, 0) for texts.
     """
 
-    def __init__(self, keys: int, arrays: int, text: int) -> None:
-        self._keys = keys
-        self._arrays = arrays
-        self._text = text
-        self.shortened: dict[tuple[str, str], tuple[int, int]] = {}
+    _keys: int
+    _arrays: int
+    _text: int
+    shortened: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
 
     def shorten(self, reply: JsonObject) -> JsonObject:
         """Returns the reply with everything within the limits, except notes and its rows."""
