@@ -7,7 +7,7 @@ Two programs share a directory of bags and nothing else. The **recorder**
 Modules at the top::
 
     server          entry point of the query server
-    bootstrap       composition root; bootstrap_fleet: of many robots; bootstrap_lake: of a lake
+    bootstrap       composition root; bootstrap_fleet: of many robots and of a lake
     config          the configuration: models, loading, errors, sources
     queries         one function for each tool of the specification
     extract         the fields, poses and transforms that the schema map names

@@ -22,7 +22,12 @@ from hydra.utils import instantiate
 
 from ros2_memory import PACKAGE, package_version
 from ros2_memory.config import (
+    AdapterNode,
+    ExcludeRule,
+    KeepRule,
     NullRecorderNode,
+    PlaceShape,
+    Settings,
     load_exclusions,
     load_labels,
     load_message_schemas,
@@ -33,9 +38,9 @@ from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, ConfigError, InvalidArgumentsError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.telemetry import SILENT, Telemetry
+from ros2_memory.core.telemetry import SILENT, Observer, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
-from ros2_memory.recorder.base import Recorder
+from ros2_memory.recorder.base import Housekeeper, Recorder
 from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
@@ -46,14 +51,11 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.columns.fill import Progress
     from ros2_memory.columns.store import ColumnStore
-    from ros2_memory.config import AdapterNode, ExcludeRule, KeepRule, PlaceShape, Settings
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.regions import Place, Region
-    from ros2_memory.core.telemetry import Observer
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.recorder.base import Housekeeper
     from ros2_memory.recorder.memory.days import MemoryDays
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
@@ -104,8 +106,7 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
     Raises:
         ConfigError: it cannot be built.
     """
-    node = settings.recorder
-    return instantiated("recorder", node, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
+    return instantiated("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
 
 
 def instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
@@ -196,12 +197,11 @@ def _topic_cutter_of(settings: Settings, bag_dir: Path, reader: BagReader) -> To
     ]
     if not topic_ages:
         return None
-    writer = McapWriter(settings.reader.max_chunk_mb)
     return TopicCutter(
         bag_dir,
         topic_ages,
         reader,
-        writer,
+        McapWriter(settings.reader.max_chunk_mb),
         static_topics=settings.data.tf_static_topics,
         is_quiet=is_quiet,
     )
@@ -216,7 +216,6 @@ def _memory_days_of(
     memory = settings.memory
     if not memory.keep and not (bag_dir / MEMORY_FOLDER).is_dir():
         return None
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
     from ros2_memory.storage.mcap.writer import McapWriter
 
@@ -229,16 +228,22 @@ def _memory_days_of(
     )
     writer = McapWriter(settings.reader.max_chunk_mb)
     static = settings.data.tf_static_topics
-    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
     return MemoryDays(
         bag_dir,
         bags,
         writer,
         own,
-        extractor,
+        _extractor_of(settings),
         limits=limits if memory.keep else None,
         static_topics=static,
     )
+
+
+def _extractor_of(settings: Settings) -> SchemaExtractor:
+    """Returns what reads the fields of messages that the schema map names."""
+    from ros2_memory.extract import SchemaExtractor
+
+    return SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
 
 
 def _watch_of(
@@ -248,31 +253,27 @@ def _watch_of(
     own: OwnRecordings,
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
-    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.recorder.process.topics import load_topics
     from ros2_memory.triggers.search import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
-    extractor = SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length)
+    def is_recorded(topic: str) -> bool:
+        """Whether the list of topics, which may have changed, has one; True where it is refused."""
+        try:
+            return load_topics(settings.recording.topics_file).matches(topic)
+        except ConfigError:
+            return True
+
     return partial(
         Triggers,
         bag_dir,
         rules,
-        SplitSearch(reader, extractor, rules),
+        SplitSearch(reader, _extractor_of(settings), rules),
         own,
         clock=WallClock(),
         split_duration_s=settings.recording.split_duration_s,
-        is_recorded=lambda topic: _is_listed(settings.recording.topics_file, topic),
+        is_recorded=is_recorded,
     )
-
-
-def _is_listed(topics_file: Path, topic: str) -> bool:
-    """Whether the list of topics, which may have changed, has a topic; True where it is refused."""
-    from ros2_memory.recorder.process.topics import load_topics
-
-    try:
-        return load_topics(topics_file).matches(topic)
-    except ConfigError:
-        return True
 
 
 def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
@@ -319,7 +320,6 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
 
 
 def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Screening | None:
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.mcap.writer import McapWriter
     from ros2_memory.triggers.screening import Screening
 
@@ -330,7 +330,7 @@ def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Scree
         bag_dir,
         rules,
         reader,
-        SchemaExtractor(load_message_schemas(settings), settings.data.max_array_length),
+        _extractor_of(settings),
         McapWriter(settings.reader.max_chunk_mb),
         split_duration_s=settings.recording.split_duration_s,
     )
@@ -360,12 +360,11 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
                 f"{path}: the rule {name!r}: {each.topic} is not recorded, so its value would be "
                 f"unknown at all times: list it in {recording.topics_file}"
             )
-        condition = _condition_of(settings, each, f"{path}: the rule {name!r}")
         rules.append(
             ExclusionRule(
                 name=name,
                 topic=each.topic,
-                condition=condition,
+                condition=_condition_of(settings, each, f"{path}: the rule {name!r}"),
                 margin=ns_from_unix(each.margin_s),
                 stale=ns_from_unix(each.stale_s),
                 excludes_unknown=each.on_unknown == "exclude",
@@ -490,21 +489,28 @@ def build_memory(
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 
 
-def build_columns(settings: Settings, reader: BagReader) -> ColumnStore | None:
+def build_columns(
+    settings: Settings, reader: BagReader, of_lake: str | None = None
+) -> ColumnStore | None:
     """Returns the store of columns; None where the configuration wants none.
 
-    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes.
+    `reader` leaves out what the bag directory hides: overlaps, and what `forget` deletes. That of
+    a lake's robot, named by `of_lake`, is in the cache folder, and made again from the lake.
     """
     from ros2_memory.bag_dir.layout import OWN_FOLDER
     from ros2_memory.columns.store import FILE, ColumnStore
 
     if not settings.store.enabled:
         return None
+    definitions = _hash_of(_definitions_of(settings))
+    if of_lake is not None:
+        cached = _cached(f"{settings.lake.warehouse} {of_lake}".encode())
+        return ColumnStore(cached, reader.definition, definitions=definitions)
     bag_dir = settings.recording.bag_dir
     return ColumnStore(
         partial(column_paths, settings),
         reader.definition,
-        definitions=_hash_of(_definitions_of(settings)),
+        definitions=definitions,
         # What a recorder's server stored serves who only looks, too.
         sources=(bag_dir / OWN_FOLDER / FILE,),
         waits_for=bag_dir,
@@ -538,22 +544,6 @@ def _cached(name: bytes) -> tuple[Path, ...]:
         return ()
     folder = cache / PACKAGE / hashlib.sha256(name).hexdigest()[:16]
     return (folder / FILE,) if cache.is_absolute() else ()
-
-
-def build_columns_of_lake(settings: Settings, robot: str, decoder: BagReader) -> ColumnStore | None:
-    """Returns the store of columns of a lake's robot, which is in the cache folder; None for none.
-
-    It is made again from the lake.
-    """
-    from ros2_memory.columns.store import ColumnStore
-
-    if not settings.store.enabled:
-        return None
-    return ColumnStore(
-        _cached(f"{settings.lake.warehouse} {robot}".encode()),
-        decoder.definition,
-        definitions=_hash_of(_definitions_of(settings)),
-    )
 
 
 def delete_catalogues(settings: Settings) -> None:
@@ -607,41 +597,31 @@ def _hash_of(value: object) -> str:
     return hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16]
 
 
-def build_backfill(settings: Settings, memory: Memory) -> Backfill:
+def build_backfill(settings: Settings, memory: Memory, *, are_files: bool = True) -> Backfill:
     """Returns what fills the store of columns of a memory, if it has one.
 
-    Deletes the catalogues of earlier versions, whose place the store takes.
+    Deletes the catalogues of earlier versions, whose place the store takes. `are_files`: whether
+    the bags are files, and not those of a lake.
     """
-    try:
-        delete_catalogues(settings)
-    except BagError as error:
-        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
-    return _backfill(settings, memory, settings.recording.bag_dir)
-
-
-def build_backfill_of_lake(settings: Settings, memory: Memory) -> Backfill:
-    """Returns what fills the store of columns of a lake's robot, if it has one."""
-    return _backfill(settings, memory, memory.index.bag_dir, are_files=False)
-
-
-def _backfill(
-    settings: Settings, memory: Memory, bag_dir: Path, *, are_files: bool = True
-) -> Backfill:
     from ros2_memory.columns.fill import Filling, StoreLimits
     from ros2_memory.serving.backfill import Backfill
 
+    try:
+        if are_files:
+            delete_catalogues(settings)
+    except BagError as error:
+        log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
     scanner, store = memory.columns, settings.store
     if scanner.store is None:
         return Backfill(memory, None)
-    limits = StoreLimits(store.max_share, round(store.max_gb * GB))
     return Backfill(
         memory,
         Filling(
             scanner,
             memory.reader,
-            bag_dir,
+            memory.index.bag_dir,
             memory.clock,
-            limits,
+            StoreLimits(store.max_share, round(store.max_gb * GB)),
             are_files=are_files,
             large=memory.large,
         ),

@@ -27,12 +27,14 @@ from typing import (
     Literal,
     TypeAlias,
     TypeVar,
+    cast,
+    dataclass_transform,
     get_args,
     get_type_hints,
 )
 
 from hydra import compose, initialize_config_dir
-from omegaconf import ListConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationInfo
 from pydantic.dataclasses import dataclass
 from pydantic.types import PathType
@@ -57,8 +59,6 @@ from ros2_memory.things.labels import plain, singular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
-
-    from omegaconf import DictConfig
 
     from ros2_memory.core.model import JsonValue
 
@@ -205,10 +205,15 @@ BelowBagDir: TypeAlias = Annotated[Text, AfterValidator(_below)]
 DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
 RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
 
-_REFUSE_UNKNOWN: Final = ConfigDict(extra="forbid")
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
+def section(model: type[_T]) -> type[_T]:
+    """Makes a class plain frozen data, whose values are checked; unknown keys are refused."""
+    checked = dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(extra="forbid"))
+    return cast("type[_T]", checked(model))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class RequiredTopic:
     """A name or a glob of topics without which recording counts as failed, and the least rate."""
 
@@ -224,7 +229,7 @@ def _topic_alone(value: object) -> object:
 RequiredTopics: TypeAlias = tuple[Annotated[RequiredTopic, BeforeValidator(_topic_alone)], ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class RecordingSettings:
     """What is recorded, and where to.
 
@@ -245,7 +250,7 @@ class RecordingSettings:
     required: RequiredTopics
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class LatchedTopics:
     """Names or globs of topics that count as latched whatever QoS is offered, or never do."""
 
@@ -253,7 +258,7 @@ class LatchedTopics:
     exclude: tuple[Text, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class DataSettings:
     """How recorded data is interpreted.
 
@@ -280,7 +285,7 @@ class DataSettings:
     places_file: ConfigFile
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class ReaderSettings:
     """How bags are found and decoded.
 
@@ -295,7 +300,7 @@ class ReaderSettings:
     schemas_file: ConfigFile
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class StoreSettings:
     """How much of the bags is also stored as columns, which changes how long answers take alone.
 
@@ -308,14 +313,14 @@ class StoreSettings:
     max_gb: Positive
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class TopicLife:
     """How old the messages of some topics may become."""
 
     max_age_h: Positive
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class RetentionSettings:
     """How much history is kept.
 
@@ -335,7 +340,7 @@ class RetentionSettings:
     topics: dict[Text, TopicLife]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class MemorySettings:
     """What stays of bags that retention deletes: nothing, unless `keep` is true.
 
@@ -351,7 +356,7 @@ class MemorySettings:
     max_age_d: Positive
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class ServerSettings:
     """How the query server is reached, and what it offers. Port 0 is any free port.
 
@@ -374,7 +379,7 @@ class ServerSettings:
     traces: Flag
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class FleetSettings:
     """The robots that one server answers for; none where it answers for `recording.bag_dir`.
 
@@ -397,7 +402,7 @@ class FleetSettings:
                 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class LoggingSettings:
     """What is logged, and in which format."""
 
@@ -406,7 +411,7 @@ class LoggingSettings:
     arguments: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class AdapterNode:
     """An adapter's class, and the plain values for its constructor.
 
@@ -423,7 +428,7 @@ class AdapterNode:
         return {name: getattr(self, name) for name in names}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class McapNode(AdapterNode):
     """`storage=mcap`: single MCAP files."""
 
@@ -433,7 +438,7 @@ class McapNode(AdapterNode):
     max_chunk_mb: Mebibytes
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class Rosbag2Node(AdapterNode):
     """`storage=rosbag2`: recordings of either plugin; `unpack_max_mb` bounds temporary files."""
 
@@ -444,7 +449,7 @@ class Rosbag2Node(AdapterNode):
     unpack_max_mb: Count
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class Ros2BagNode(AdapterNode):
     """`recorder=ros2bag`: a supervised `ros2 bag record`."""
 
@@ -463,14 +468,14 @@ class Ros2BagNode(AdapterNode):
     chunk_bytes: Annotated[int, Field(strict=True, ge=1024)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class NullRecorderNode(AdapterNode):
     """`recorder=none`: nothing is recorded."""
 
     target: Literal["ros2_memory.recorder.null.NullRecorder"] = Field(alias="_target_")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class DuckdbNode(AdapterNode):
     """`lake=duckdb`: DuckDB inside of this process."""
 
@@ -479,7 +484,7 @@ class DuckdbNode(AdapterNode):
     threads: Count | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class LakeSettings:
     """Where `ros2-memory ship` writes the bags of the fleet's robots; needs the extra `lake`.
 
@@ -504,21 +509,21 @@ class LakeSettings:
             raise ValueError("must have in uri the address of the catalogue, with catalog=rest")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class MessageSchemas:
     """The schema map: for each message type, field name to dot-path in the message."""
 
     schemas: dict[MessageType, dict[Text, DotPath]]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class LabelsFile:
     """Other spellings of labels: for each name that is to be shown, what detectors write for it."""
 
     labels: Annotated[dict[Text, tuple[Text, ...]], AfterValidator(_each_spelling_once)]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class PlaceShape:
     """A circle (x, y, radius_m), a rectangle (x and y as [from, to]) or a polygon, in metres.
 
@@ -548,14 +553,14 @@ class PlaceShape:
             )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class PlacesFile:
     """The named places."""
 
     places: dict[Text, PlaceShape]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class KeepRule:
     """When what was recorded is kept as a moment, and how much of it.
 
@@ -593,14 +598,14 @@ class KeepRule:
             raise ValueError(f"must have neither topic nor for_s: its kind is {self.kind}")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class TriggersFile:
     """The rules, by name."""
 
     rules: dict[Text, KeepRule]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class ExcludeRule:
     """When nothing recorded stays, nor what was within `margin_s` of it.
 
@@ -619,14 +624,14 @@ class ExcludeRule:
     on_unknown: Literal["exclude", "keep"] = "exclude"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class ExclusionsFile:
     """The rules, by name."""
 
     rules: dict[Text, ExcludeRule]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, config=_REFUSE_UNKNOWN)
+@section
 class Settings:
     """The whole configuration, validated."""
 

@@ -124,8 +124,7 @@ def reason_of(error: Exception) -> str:
     text = (error.strerror if isinstance(error, OSError) else None) or str(error)
     if text in {"", "None"} and error.__cause__ is not None:
         text = str(error.__cause__)
-    reason = re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)[0]
-    return " ".join(reason.split())
+    return " ".join(re.split(r"\n *(?:full_key:|Config search path:|See https:)", text)[0].split())
 
 
 def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:

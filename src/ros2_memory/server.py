@@ -27,7 +27,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.serving.listen import CannotListenError, resolved
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Sequence
 
     from starlette.routing import Route
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
-    from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.health import FleetHealth, Health
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.serving.web_app import Background
@@ -182,30 +181,30 @@ class _Parts(NamedTuple):
 def _parts_of_one(
     settings: Settings, memory: Memory, telemetry: Telemetry, overrides: Sequence[str]
 ) -> _Parts:
+    import anyio
+
     from ros2_memory.bootstrap import build_backfill, build_server
-    from ros2_memory.serving.health import Health
+    from ros2_memory.serving.backfill import keep_backfilled
+    from ros2_memory.serving.health import Health, keep_fresh, read_listings
 
     backfill = build_backfill(settings, memory)
     server = build_server(settings, memory, telemetry, backfill.progress)
-    page, warm_page = None, None
+    every_s, page, warm_page = settings.reader.index_refresh_s, None, None
     if settings.server.transport != "stdio" and settings.server.page:
         from ros2_memory.serving.page.routes import page_routes, warm_up
 
         page = page_routes(server.dispatcher, backfill.progress)
         warm_page = partial(warm_up, memory, server.dispatcher)
-    return _Parts(
-        server,
-        Health(memory, package_version(), backfill),
-        partial(
-            _in_background,
-            memory,
-            backfill,
-            settings.reader.index_refresh_s,
-            overrides,
-            warm_page,
-        ),
-        page,
-    )
+
+    async def background() -> None:
+        """Keeps the index fresh and the store of columns full, until it is cancelled."""
+        async with anyio.create_task_group() as tasks:
+            if warm_page is not None:
+                tasks.start_soon(read_listings, memory)
+            tasks.start_soon(keep_fresh, memory, every_s)
+            tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s, warm_page)
+
+    return _Parts(server, Health(memory, package_version(), backfill), background, page)
 
 
 def _parts_of_fleet(
@@ -216,32 +215,40 @@ def _parts_of_fleet(
     overrides: Sequence[str],
 ) -> _Parts:
     """Returns the parts of a fleet's server, which has no page: that shows one robot."""
-    from ros2_memory.bootstrap import build_backfill, build_backfill_of_lake, build_server
+    import anyio
+
+    from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.bootstrap_fleet import robot_settings
+    from ros2_memory.serving.backfill import Filler, keep_all_backfilled
     from ros2_memory.serving.health import FleetHealth, Health
 
-    robots = {
-        each: build_backfill(robot_settings(settings, name), each.memory())
-        for name, each in fleet.robots.items()
-        if name in settings.fleet.robots  # of others there is no bag here
-    }
-    reports = {
-        each.name: Health(each.memory(), package_version(), backfill)
-        for each, backfill in robots.items()
-    }
-    return _Parts(
-        build_server(settings, memory, telemetry, fleet=fleet),
-        FleetHealth(reports, package_version()),
-        partial(
-            _fleet_in_background,
-            fleet,
-            robots,
-            partial(build_backfill_of_lake, settings),
-            settings.reader.index_refresh_s,
-            overrides,
-        ),
-        None,
-    )
+    reports: dict[str, Health] = {}
+    fillers: dict[str, tuple[Memory, Filler]] = {}
+    for name in settings.fleet.robots:  # of others there is no bag here
+        robot = fleet.robots[name]
+        own = robot.memory()
+        backfill = build_backfill(robot_settings(settings, name), own)
+        reports[name] = Health(own, package_version(), backfill)
+        helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
+        fillers[name] = own, Filler(backfill, helper)
+    shipped: dict[str, tuple[Memory, Filler]] = {}
+
+    def all_fillers() -> list[tuple[Memory, Filler]]:
+        for each in [*fleet.robots.values()]:  # more robots may have joined
+            if each.lake is not None and each.name not in shipped:
+                backfill = build_backfill(settings, each.lake, are_files=False)
+                shipped[each.name] = each.lake, Filler(backfill)
+        return [*fillers.values(), *shipped.values()]
+
+    async def background() -> None:
+        """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
+        every_s = settings.reader.index_refresh_s
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(keep_fleet_fresh, fleet, every_s)
+            tasks.start_soon(keep_all_backfilled, all_fillers, every_s)
+
+    server = build_server(settings, memory, telemetry, fleet=fleet)
+    return _Parts(server, FleetHealth(reports, package_version()), background, None)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -287,59 +294,6 @@ def _helper(overrides: Sequence[str], *options: str) -> list[str]:
     """Returns the command line of the program that stores a backlog."""
     program = [sys.executable, "-m", "ros2_memory.cli", "index"]
     return [*program, "--for-server", str(os.getpid()), *options, "--", *overrides]
-
-
-async def _in_background(
-    memory: Memory,
-    backfill: Backfill,
-    every_s: float,
-    overrides: Sequence[str],
-    warm_page: Callable[[], bool] | None,
-) -> None:
-    """Keeps the index fresh and the store of columns full, until it is cancelled."""
-    import anyio
-
-    from ros2_memory.serving.backfill import keep_backfilled
-    from ros2_memory.serving.health import keep_fresh, read_listings
-
-    async with anyio.create_task_group() as tasks:
-        if warm_page is not None:
-            tasks.start_soon(read_listings, memory)
-        tasks.start_soon(keep_fresh, memory, every_s)
-        tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s, warm_page)
-
-
-async def _fleet_in_background(
-    fleet: Fleet,
-    robots: Mapping[Robot, Backfill],
-    of_lake: Callable[[Memory], Backfill],
-    every_s: float,
-    overrides: Sequence[str],
-) -> None:
-    """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
-    import anyio
-
-    from ros2_memory.serving.backfill import Filler, keep_all_backfilled
-
-    fillers = [
-        (
-            each.memory(),
-            Filler(backfill, _helper(overrides, "--bag-dir", str(each.bag_dir.absolute()))),
-        )
-        for each, backfill in robots.items()
-    ]
-    shipped: dict[str, tuple[Memory, Filler]] = {}
-
-    def all_fillers() -> list[tuple[Memory, Filler]]:
-        for each in [*fleet.robots.values()]:  # more robots may have joined
-            memory = each.lake
-            if memory is not None and each.name not in shipped:
-                shipped[each.name] = memory, Filler(of_lake(memory))
-        return [*fillers, *shipped.values()]
-
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_fleet_fresh, fleet, every_s)
-        tasks.start_soon(keep_all_backfilled, all_fillers, every_s)
 
 
 async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_LOOKED_AT_S) -> None:

@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import (
     unix_rounded_up,
 )
 from ros2_memory.demo import judges, published_topics, robot
-from ros2_memory.demo.answer_checks import (
+from ros2_memory.demo.judges import (
     at,
     items,
     near,
@@ -28,16 +28,15 @@ from ros2_memory.demo.answer_checks import (
     same,
     text,
 )
-from ros2_memory.demo.floor_plan import THINGS
 from ros2_memory.demo.messages import description
 from ros2_memory.demo.published_topics import STREAMS
-from ros2_memory.demo.robot import Planar
+from ros2_memory.demo.robot import THINGS, Planar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.answer_checks import CallContext
+    from ros2_memory.demo.judges import CallContext
     from ros2_memory.demo.published_topics import Message, Stream
 
 Replies: TypeAlias = "Sequence[JsonValue]"

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.demo.answer_checks import CallContext
+from ros2_memory.demo.judges import CallContext
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock

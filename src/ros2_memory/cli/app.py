@@ -5,26 +5,25 @@ wait for the libraries of all of them.
 """
 
 import signal
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command, get_group
 
 from ros2_memory import package_version
 
 if TYPE_CHECKING:
     from typer._click import Command, Context  # Typer has no public names for these
-    from typer.core import TyperGroup
 
 INTERRUPTED: Final = 130
 TOOL_HELP: Final = "--tool-help"
 """What `ask TOOL --help` is passed on as: help on the tool."""
 _HELP: Final = ("-h", "--help")
+_SIGNALS: Final = (signal.SIGTERM, signal.SIGHUP)
 
 
 class CommandEntry(NamedTuple):
@@ -177,17 +176,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: done, and the answer is yes; 1: an answer was wrong or missing, or something was left undone;
     2: it could not run, and stderr says why; 130: interrupted before it finished.
     """
+    # Signals end it as Ctrl-C does, so that files are closed.
+    before = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
     try:
-        with _as_keyboard_interrupt(signal.SIGTERM, signal.SIGHUP):
-            # An application with a callback is a group.
-            group = cast("TyperGroup", get_command(app))
-            for name in COMMANDS:
-                group.add_command(LazyCommand(name))
-            group(args=None if argv is None else [*argv], prog_name="ros2-memory")
+        # An application with a callback is a group.
+        group = cast("TyperGroup", get_command(app))
+        for name in COMMANDS:
+            group.add_command(LazyCommand(name))
+        group(args=None if argv is None else [*argv], prog_name="ros2-memory")
     except KeyboardInterrupt:
         return INTERRUPTED
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     return 0
 
 
@@ -207,7 +210,10 @@ class LazyCommand(TyperCommand):
     ) -> "Context":
         """Returns the context of the real command, which runs, completes and shows its help."""
         command = self._load()
-        if parent is not None and parent.params.get("verbose") and _takes(command, "verbose"):
+        # Of a group, the commands have the options.
+        commands = getattr(command, "commands", {self._name: command}).values()
+        is_verbose = parent is not None and parent.params.get("verbose")
+        if is_verbose and all("verbose" in [of.name for of in one.params] for one in commands):
             args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if word in _HELP else word for word in args]
@@ -226,33 +232,14 @@ class LazyCommand(TyperCommand):
             # Imported here, as the command is, since it imports much itself.
             from ros2_memory.cli.options import as_command  # noqa: PLC0415
 
-            command = as_command(self._name)(loaded)
-            parent.command(self._name, epilog=epilog(self._name))(command)
+            parent.command(self._name, epilog=epilog(self._name))(as_command(self._name)(loaded))
         return get_group(parent).commands[self._name]
-
-
-def _takes(command: "Command", option: str) -> bool:
-    """Returns whether a command has an option; of a group, whether its commands have it."""
-    commands = getattr(command, "commands", None)
-    of_all = [*commands.values()] if commands else [command]
-    return all(option in [parameter.name for parameter in one.params] for one in of_all)
 
 
 def epilog(command: str) -> str:
     """Returns the last lines of a command's help: what its exit codes mean."""
     codes = {**COMMON_EXIT_CODES, **COMMANDS[command].exit_codes}
     return f"Exit code: {'; '.join(f'{code}: {codes[code]}' for code in sorted(codes))}."
-
-
-@contextmanager
-def _as_keyboard_interrupt(*signals: signal.Signals) -> Iterator[None]:
-    """Raises KeyboardInterrupt for these signals within the block, so that files are closed."""
-    before = {number: signal.signal(number, signal.default_int_handler) for number in signals}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _print_version(requested: bool) -> None:
@@ -277,25 +264,21 @@ def _options_of_all(
 
 
 def demo(
-    once: Annotated[
-        bool, typer.Option("--once", help="Exit after the answers; code 1 if one was wrong.")
-    ] = False,
+    once: Annotated[bool, "Exit after the answers; code 1 if one was wrong."] = False,
     *,
-    port: Annotated[int, typer.Option(help="Port on 127.0.0.1; 0 picks a free one.")] = 9203,
+    port: Annotated[int, "Port on 127.0.0.1; 0 picks a free one."] = 9203,
     bag_dir: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Keep the bags in this new or empty folder."),
+        "DIR",
+        "Keep the bags in this new or empty folder.",
     ] = None,
     duration: Annotated[
         float,
-        typer.Option(metavar="S", help="Seconds to record before the questions."),
+        "S",
+        "Seconds to record before the questions.",
     ] = 120.0,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", help="Show the server's log on stderr.")
-    ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print a line of JSON for each question.")
-    ] = False,
+    verbose: Annotated[bool, "Show the server's log on stderr."] = False,
+    as_json: Annotated[bool, "--json", "Print a line of JSON for each question."] = False,
 ) -> int:
     """Simulate a robot, record it, and ask the server questions about it.
 

@@ -105,7 +105,12 @@ def ask(
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
     tools = {known.name: known for known in dispatcher.tools}
     if not asked:
-        rows = [_tool_row(known) for known in dispatcher.tools]
+        rows: list[JsonValue] = []
+        for known in dispatcher.tools:
+            purpose, _, _ = known.description.removeprefix("Blocking. ").partition(". ")
+            taken = ", ".join(argument for argument, _ in _arguments(known))
+            purpose = purpose.partition(";")[0].rstrip(".")
+            rows.append({"tool": known.name, "purpose": purpose, "arguments": taken})
         if as_json:
             print_line(json.dumps(rows))
         else:
@@ -252,15 +257,6 @@ def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:
     needed = required if isinstance(required, list) else []
     for name, schema in tool.arguments.items():
         yield name if name in needed else f"{name}?", schema
-
-
-def _tool_row(tool: Tool) -> JsonValue:
-    purpose, _, _ = tool.description.removeprefix("Blocking. ").partition(". ")
-    return {
-        "tool": tool.name,
-        "purpose": purpose.partition(";")[0].rstrip("."),
-        "arguments": ", ".join(name for name, _ in _arguments(tool)),
-    }
 
 
 def _print_help(name: str) -> None:

@@ -35,25 +35,24 @@ def cat(
     *,
     field: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PATH", help="Print only this field, such as pose.covariance; repeatable."
-        ),
+        "PATH",
+        "Print only this field, such as pose.covariance; repeatable.",
     ] = None,
     times: Times,
     limit: Annotated[
         int | None,
-        typer.Option("--limit", "-n", metavar="N", help="Print only the first N messages."),
+        "--limit",
+        "-n",
+        "N",
+        "Print only the first N messages.",
     ] = None,
-    tail: Annotated[
-        int | None, typer.Option(metavar="N", help="Print only the newest N messages.")
-    ] = None,
+    tail: Annotated[int | None, "N", "Print only the newest N messages."] = None,
     as_csv: Annotated[
         bool,
-        typer.Option("--csv", help="Print CSV: time in Unix seconds, a column for each field."),
+        "--csv",
+        "Print CSV: time in Unix seconds, a column for each field.",
     ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print JSON lines: time (Unix s), time_ns, value.")
-    ] = False,
+    as_json: Annotated[bool, "--json", "Print JSON lines: time (Unix s), time_ns, value."] = False,
     bags: Bags,
 ) -> bool:
     """Print the messages of a topic in a time window, each once, by log time.

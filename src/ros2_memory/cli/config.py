@@ -5,7 +5,6 @@ import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
-from pathlib import Path
 from typing import Annotated, Final
 
 import typer
@@ -31,7 +30,7 @@ config = typer.Typer(
 def config_show(
     words: Words = None,
     bag_dir: BagDir = None,
-    sources: Annotated[bool, typer.Option("--sources", help="Show what set each key.")] = False,
+    sources: Annotated[bool, "Show what set each key."] = False,
     as_json: AsJson = False,
 ) -> None:
     """Show the configuration as YAML, composed of files, environment and arguments; no secrets.
@@ -88,12 +87,11 @@ def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Ite
     rows = [(group, who, option or "null") for group, option, who in found]
     for key, value in values.items():
         rows.append((key, source(key), value if isinstance(value, str) else json.dumps(value)))
-    shown = [(key, _shortened_source(who, source.folder), text) for key, who, text in rows]
+    shown: list[tuple[str, str, str]] = []
+    for key, who, text in rows:
+        file, link, other = who.partition(", as ")
+        told = f"as {other}" if link else file.replace(f"in {source.folder}/", "")
+        shown.append((key, told, text))
     key_width, source_width = (max(len(row[column]) for row in shown) for column in (0, 1))
     for key, who, text in shown:
         print_line(f"{key:<{key_width}}  {who:<{source_width}}  {text}")
-
-
-def _shortened_source(who: str, folder: Path) -> str:
-    file, link, other = who.partition(", as ")
-    return f"as {other}" if link else file.replace(f"in {folder}/", "")

@@ -624,8 +624,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     start = time.monotonic()
     try:
         token = api_token(os.environ)
-        shown = token.get_secret_value() if token else ""
-        status, reply = _health(server.host, server.port, shown)
+        status, reply = _health(server.host, server.port, token.get_secret_value() if token else "")
     except (OSError, http.client.HTTPException) as problem:
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
         yield error(f"nothing answers on {address}: {problem}", do)

@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.layout import (
     is_carried,
 )
 from ros2_memory.bag_dir.state_files import is_shipped, read_receipts
-from ros2_memory.bootstrap_lake import lake_location
+from ros2_memory.bootstrap_fleet import lake_location
 from ros2_memory.cli.findings import Examined, Finding, error, ok, warning
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import ConfigError, LakeError
@@ -84,8 +84,7 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         do = "ros2-memory ship makes it; was it there before, is its disk mounted?"
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
-        seen = f"{location.warehouse}; its newest commit is from {iso_local(committed)}"
-        yield ok(seen)
+        yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
     # A server that asks the lake ships nothing.
     if settings.lake.engine is None:
         yield from _check_writer(location, has_bags=committed is not None)

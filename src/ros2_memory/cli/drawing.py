@@ -43,7 +43,7 @@ from matplotlib.figure import Figure  # noqa: E402
 from matplotlib.patches import Circle as RoundPatch  # noqa: E402
 from matplotlib.patches import Polygon as PolygonPatch  # noqa: E402
 
-from ros2_memory.core.regions import Circle, Polygon  # noqa: E402
+from ros2_memory.core.regions import Circle, Place, Polygon  # noqa: E402
 from ros2_memory.core.text import shortened  # noqa: E402
 
 if TYPE_CHECKING:
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.cli.plot import DrawnPath, Signal, TimelineRow
-    from ros2_memory.core.regions import Place
 
 _STYLE: Final = {
     "axes.spines.right": False,
@@ -208,8 +207,7 @@ def draw_recap(
 def write_instead(axes: Axes, reason: str) -> None:
     """Writes why a part of a picture has nothing to show."""
     axes.set_axis_off()
-    wrapped = textwrap.fill(reason, 50)
-    axes.text(0.5, 0.5, wrapped, ha="center", va="center", color="#6b7280")
+    axes.text(0.5, 0.5, textwrap.fill(reason, 50), ha="center", va="center", color="#6b7280")
 
 
 def _format_times(axes: Axes, start: float, end: float, *, of_colors: str = "") -> None:

@@ -8,8 +8,6 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Final
 
-import typer
-
 from ros2_memory.cli.options import AsJson, Bags, Times
 from ros2_memory.cli.output import print_json, print_line, print_notes, progress_bar
 from ros2_memory.core.errors import (
@@ -37,35 +35,30 @@ def export(
     *,
     mcap: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE", help="Write this MCAP file, for Foxglove, ros2 bag and rosbags."
-        ),
+        "FILE",
+        "Write this MCAP file, for Foxglove, ros2 bag and rosbags.",
     ] = None,
     parquet: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
-        ),
+        "DIR",
+        "Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
     ] = None,
     topic: Annotated[
         list[str] | None,
-        typer.Option(metavar="GLOB", help="Copy only these topics, such as /vision/*; repeatable."),
+        "GLOB",
+        "Copy only these topics, such as /vision/*; repeatable.",
     ] = None,
     times: Times,
     latched: Annotated[
         bool | None,
-        typer.Option(
-            "--latched/--no-latched",
-            help="Also copy the latched messages valid at the start: maps, static transforms "
-            "(default: for --mcap).",
-        ),
+        "--latched/--no-latched",
+        "Also copy the latched messages valid at the start: maps, static transforms "
+        "(default: for --mcap).",
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME", help="Partition Parquet by robot, too: one dataset for a fleet."
-        ),
+        "NAME",
+        "Partition Parquet by robot, too: one dataset for a fleet.",
     ] = None,
     as_json: AsJson = False,
     bags: Bags,
@@ -146,22 +139,15 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
         if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
             if latching.is_latched(snapshot, topic):
                 for stored in view.stream.messages([topic], before):
-                    frames = _child_frames(view.memory, stored)
-                    valid.update(((topic, frame), stored) for frame in frames)
+                    with suppress(UndecodableError):
+                        message = view.memory.reader.decode(stored.record)
+                        edges = view.extractor.transforms(message, stored.time, static=True)
+                        valid.update(((topic, edge.child), stored) for edge in edges)
         elif (newest := view.stream.newest(topic, before)) and latching.holds(snapshot, newest):
             valid[topic, ""] = newest
     # A message is valid for several frames, and is exported once.
     once = {id(stored): stored for stored in valid.values()}
     return sorted(once.values(), key=lambda stored: stored.time)
-
-
-def _child_frames(memory: Memory, stored: StoredMessage) -> set[str]:
-    """Returns the child frames of a TFMessage; none if it cannot be decoded."""
-    with suppress(UndecodableError):
-        message = memory.reader.decode(stored.record)
-        edges = memory.extractor.transforms(message, stored.time, static=True)
-        return {edge.child for edge in edges}
-    return set()
 
 
 def profile_of(

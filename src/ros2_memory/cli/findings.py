@@ -6,12 +6,10 @@ from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.config import NullRecorderNode
+from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
+from ros2_memory.config import NullRecorderNode, Settings
 
 if TYPE_CHECKING:
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.config import Settings
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.index.snapshot import Snapshot

@@ -134,8 +134,7 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     are_bags = False
     for name in robots or ("",):
         own = robot_settings(settings, name) if robots else settings
-        setting = ROBOTS_SETTING if robots else None
-        memory = open_memory(own, verbose=bags.verbose, setting=setting)
+        memory = open_memory(own, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None)
         reports[name] = report = _report(own, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:
@@ -365,13 +364,23 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
     for path, bags in sorted(recordings_of(snapshot).items(), key=lambda found: found[1][0].start):
         inside = [file for file in left if file.startswith(f"{path}/")]
-        row = _row(name_of(path, bags, str(root)), bags)
-        row["whose"] = _maker(Path(path), bags, root, own)
-        if inside:
-            row["not_read"] = len(inside)
         for file in inside:
             del left[file]
-        yield row
+        start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+        is_open = any(bag.state is BagState.ACTIVE for bag in bags)
+        yield {
+            "recording": name_of(path, bags, str(root)),
+            "start": unix_from_ns(start),
+            "end": None if is_open else unix_from_ns(end),
+            "length_s": round(unix_from_ns(end - start), 3),
+            "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
+            "bags": len(bags),
+            "messages": sum(bag.summary.count for bag in bags),
+            "topics": len({topic for bag in bags for topic in bag.summary.schema.positions}),
+            "storage": storage_of(bags),
+            "whose": _maker(Path(path), bags, root, own),
+            **({"not_read": len(inside)} if inside else {}),
+        }
     for file, reason in sorted(left.items()):
         yield {"recording": file.removeprefix(f"{root}/"), "reason": reason}
 
@@ -387,23 +396,6 @@ def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]
             "messages": 0,
             "reason": "no message was recorded",
         }
-
-
-def _row(name: str, bags: Sequence[BagFile]) -> dict[str, JsonValue]:
-    start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
-    topics = {topic for bag in bags for topic in bag.summary.schema.positions}
-    is_open = any(bag.state is BagState.ACTIVE for bag in bags)
-    return {
-        "recording": name,
-        "start": unix_from_ns(start),
-        "end": None if is_open else unix_from_ns(end),
-        "length_s": round(unix_from_ns(end - start), 3),
-        "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
-        "bags": len(bags),
-        "messages": sum(bag.summary.count for bag in bags),
-        "topics": len(topics),
-        "storage": storage_of(bags),
-    }
 
 
 def _maker(path: Path, bags: Sequence[BagFile], root: Path, own: OwnRecordings | None) -> JsonValue:

@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 from datetime import datetime, time, timedelta
 from difflib import get_close_matches
 from functools import wraps
-from inspect import Signature, signature
+from inspect import Parameter, Signature, signature
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias, get_args
 
 import typer
 
@@ -73,9 +73,8 @@ _TIME_OF_DAY: Final = re.compile(
 
 BagDir = Annotated[
     Path | None,
-    typer.Option(
-        "--bag-dir", metavar="DIR", help="Use the bags in this folder instead of recording.bag_dir."
-    ),
+    "DIR",
+    "Use the bags in this folder instead of recording.bag_dir.",
 ]
 Overrides = Annotated[
     list[str] | None,
@@ -91,34 +90,32 @@ Words = Annotated[
 ]
 Recording = Annotated[
     str | None,
-    typer.Option(
-        "--recording",
-        metavar="NAME",
-        help="Use this recording only, by a name that `ros2-memory recordings` lists.",
-    ),
+    "NAME",
+    "Use this recording only, by a name that `ros2-memory recordings` lists.",
 ]
 Sets = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="key=value", help="A setting, the same as for ros2-memory-server."
-    ),
+    "--set",
+    "key=value",
+    "A setting, the same as for ros2-memory-server.",
 ]
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", "-v", help="Show the log on stderr, at logging.level."),
+    "--verbose",
+    "-v",
+    "Show the log on stderr, at logging.level.",
 ]
 Command: TypeAlias = Callable[..., int | None]  # type: ignore[explicit-any]  # each its own options
 LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+AsJson = Annotated[bool, "--json", "Print JSON."]
 Start = Annotated[
     str | None,
-    typer.Option(metavar="TIME", help=f"Start time: {TIMES}; local time."),
+    "TIME",
+    f"Start time: {TIMES}; local time.",
 ]
-End = Annotated[
-    str | None, typer.Option(metavar="TIME", help="End time, inclusive, in the same formats.")
-]
+End = Annotated[str | None, "TIME", "End time, inclusive, in the same formats."]
 
 
 def _seconds(text: str) -> float:
@@ -177,12 +174,17 @@ def load_to_look(
     """
     named, given = settings_to_look(bag_dir, words, recording)
     loaded = load_for(named, given)
-    by_words = any(word.partition("=")[0] in GROUPS for word in given)
-    of_path = named if bag_dir is None else None
-    is_chosen = is_deployment_chosen(given)
-    if by_words or not _is_of_others(loaded[0], of_path, is_chosen=is_chosen):
+    if any(word.partition("=")[0] in GROUPS for word in given):
         return loaded
-    return load_for(named, [*LOOKING, *given])
+    found = loaded[0].recording.bag_dir
+    if named is not None and bag_dir is None:
+        own = load_for(None, None)[0].recording.bag_dir
+        is_of_others = named.absolute() != own.absolute() and not _is_recorded_now(found)
+    elif is_deployment_chosen(given) or has_recorded(found) or not found.is_dir():
+        is_of_others = False
+    else:
+        is_of_others = next(folders_with_bags(found), None) is not None
+    return load_for(named, [*LOOKING, *given]) if is_of_others else loaded
 
 
 def settings_to_look(
@@ -248,17 +250,6 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
         raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
     real = file.resolve()
     return real.parent, real.name
-
-
-def _is_of_others(settings: Settings, path: Path | None, *, is_chosen: bool) -> bool:
-    """Returns whether another deployment recorded the bags."""
-    bag_dir = settings.recording.bag_dir
-    if path is None:
-        if is_chosen or has_recorded(bag_dir) or not bag_dir.is_dir():
-            return False
-        return next(folders_with_bags(bag_dir), None) is not None
-    configured = load_for(None, None)[0].recording.bag_dir
-    return path.absolute() != configured.absolute() and not _is_recorded_now(bag_dir)
 
 
 def _is_recorded_now(bag_dir: Path) -> bool:
@@ -467,6 +458,9 @@ def as_command(name: str) -> Callable[[Command], Command]:
 
     Its parameters of the types `Bags` and `Times` become the options of these, in their place. It
     returns its exit code, or whether something was left undone (`EXIT_NEGATIVE`).
+
+    An annotation such as `Annotated[float, "S", "Seconds between updates."]` declares an option, by
+    the names that it has besides that of the parameter, what its value is, and the line of help.
     """
 
     def made(command: Command) -> Command:
@@ -486,7 +480,7 @@ def as_command(name: str) -> Callable[[Command], Command]:
                 raise typer.Exit(int(command(**given) or 0))
 
         options = [
-            option.replace(kind=option.KEYWORD_ONLY)
+            option.replace(kind=option.KEYWORD_ONLY, annotation=_declared(option))
             for name, parameter in parameters.items()
             for option in (
                 signature(groups[name]).parameters.values() if name in groups else [parameter]
@@ -496,6 +490,18 @@ def as_command(name: str) -> Callable[[Command], Command]:
         return run
 
     return made
+
+
+def _declared(option: Parameter) -> object:
+    """Returns the annotation of an option as Typer takes it; others as they are."""
+    kind, *more, line = get_args(option.annotation) or (None, None)
+    if not isinstance(line, str):
+        return option.annotation
+    names = [text for text in more if text.startswith("-")]
+    if kind is bool and not names:
+        names = [f"--{option.name.replace('_', '-')}"]
+    metavar = next((text for text in more if text not in names), None)
+    return Annotated[kind, typer.Option(*names, metavar=metavar, help=line)]
 
 
 @contextmanager

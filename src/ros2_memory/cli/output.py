@@ -10,7 +10,7 @@ import math
 import os
 import re
 import sys
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -25,7 +25,6 @@ from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
 
     from rich.progress import Progress
 

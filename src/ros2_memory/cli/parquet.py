@@ -24,12 +24,11 @@ import pyarrow.parquet as pq
 
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.text import encodable
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.storage.base import BagReader, Record

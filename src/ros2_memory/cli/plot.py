@@ -82,12 +82,10 @@ plot = typer.Typer(
 
 Out = Annotated[
     Path,
-    typer.Option(
-        "--out",
-        "-o",
-        metavar="FILE",
-        help="Write the picture here: .svg, .png or .pdf; overwrites the file.",
-    ),
+    "--out",
+    "-o",
+    "FILE",
+    "Write the picture here: .svg, .png or .pdf; overwrites the file.",
 ]
 
 
@@ -166,14 +164,13 @@ def plot_path(
     times: Times,
     topic: Annotated[
         str | None,
-        typer.Option(metavar="TOPIC", help="The topic of the poses (default: data.pose_topic)."),
+        "TOPIC",
+        "The topic of the poses (default: data.pose_topic).",
     ] = None,
     frame: Annotated[
         str | None,
-        typer.Option(
-            metavar="FRAME",
-            help="The frame to draw in (default: data.map_frame, or the frame of the poses).",
-        ),
+        "FRAME",
+        "The frame to draw in (default: data.map_frame, or the frame of the poses).",
     ] = None,
     as_json: AsJson = False,
     bags: Bags,
@@ -200,9 +197,8 @@ def plot_signal(
     out: Out,
     field: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="PATH", help="A numeric field; repeatable (default: all that change)."
-        ),
+        "PATH",
+        "A numeric field; repeatable (default: all that change).",
     ] = None,
     times: Times,
     as_json: AsJson = False,
@@ -247,9 +243,8 @@ def plot_recap(
     out: Out,
     day: Annotated[
         str | None,
-        typer.Option(
-            metavar="TIME", help="today, yesterday or a date, 2026-11-20 (default: the newest day)."
-        ),
+        "TIME",
+        "today, yesterday or a date, 2026-11-20 (default: the newest day).",
     ] = None,
     times: Times,
     as_json: AsJson = False,

@@ -50,12 +50,10 @@ def prove(
     *,
     output: Annotated[
         Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="FILE.mcap|DIR",
-            help="Write this MCAP file, or a folder in which recordings stay apart.",
-        ),
+        "--output",
+        "-o",
+        "FILE.mcap|DIR",
+        "Write this MCAP file, or a folder in which recordings stay apart.",
     ],
     as_json: AsJson = False,
     bags: Bags,
@@ -278,8 +276,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     tools = {each.name: each for each in dispatcher.tools}
     if tool not in tools:
         raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
-    arguments = question_for(memory, tool, tools[tool], given)
-    (reply,) = call_tools(dispatcher, {tool: arguments})
+    (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools[tool], given)})
     answer: JsonValue = json.loads(reply.text)
     return answer
 

@@ -4,8 +4,6 @@ import os
 import sys
 from typing import Annotated
 
-import typer
-
 from ros2_memory.cli.options import BagDir, Words, settings_to_look
 from ros2_memory.config_sources import quoted
 
@@ -14,9 +12,7 @@ def serve(
     words: Words = None,
     *,
     bag_dir: BagDir = None,
-    no_open: Annotated[
-        bool, typer.Option("--no-open", help="Open no browser; print the page's address only.")
-    ] = False,
+    no_open: Annotated[bool, "Open no browser; print the page's address only."] = False,
 ) -> None:
     """Answer questions over MCP, like ros2-memory-server.
 

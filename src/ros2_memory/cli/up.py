@@ -85,10 +85,8 @@ def up(
     words: Overrides = None,
     *,
     bag_dir: BagDir = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Record what is proposed, unasked.")] = False,
-    install: Annotated[
-        bool, typer.Option("--install", help="Install as services, instead of starting here.")
-    ] = False,
+    yes: Annotated[bool, "Record what is proposed, unasked."] = False,
+    install: Annotated[bool, "Install as services, instead of starting here."] = False,
 ) -> bool:
     """Record this robot and answer questions about it, in one line, until Ctrl-C.
 

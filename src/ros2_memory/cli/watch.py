@@ -7,7 +7,6 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
-import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.live import Live
@@ -125,8 +124,8 @@ class Observation:
 
 def watch(
     *,
-    every: Annotated[float, typer.Option(metavar="S", help="Seconds between updates.")] = 2.0,
-    count: Annotated[int | None, typer.Option(metavar="N", help="Exit after N updates.")] = None,
+    every: Annotated[float, "S", "Seconds between updates."] = 2.0,
+    count: Annotated[int | None, "N", "Exit after N updates."] = None,
     as_json: AsJson = False,
     bags: Bags,
 ) -> None:
@@ -138,8 +137,7 @@ def watch(
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")
-    words = ["reader.include_active=true", *(bags.words or ())]
-    memory = replace(bags, words=words).memory()
+    memory = replace(bags, words=["reader.include_active=true", *(bags.words or ())]).memory()
     console = stdout_console()
     is_screen = console.is_terminal and not as_json
     screen = Live(console=console, auto_refresh=False) if is_screen else nullcontext()

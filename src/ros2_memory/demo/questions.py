@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.demo import judges, published_topics, robot
-from ros2_memory.demo.answer_checks import WrongAnswerError, parsed
+from ros2_memory.demo.judges import CallContext, Judge, WrongAnswerError, parsed
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.answer_checks import CallContext
-    from ros2_memory.demo.judges import Judge
     from ros2_memory.demo.robot import Planar
 
 LOOK_BACK_S: Final = 60

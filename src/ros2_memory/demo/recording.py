@@ -18,16 +18,14 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.bootstrap import build_repairer
-from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import Clock, Ns, WallClock, ns_from_unix, unix_from_ns
 from ros2_memory.demo.messages import definition, payload
-from ros2_memory.demo.published_topics import STREAMS
+from ros2_memory.demo.published_topics import STREAMS, Message, MessageSchedule, Stream
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.timebase import Clock
-    from ros2_memory.demo.published_topics import Message, MessageSchedule, Stream
 
 _CHUNK_BYTES: Final = 16 * 1024
 _FOR_EVER: Final[dict[str, JsonValue]] = {"sec": 9223372036, "nsec": 854775807}
@@ -151,10 +149,9 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
         self.splits += 1
         writer = Writer(file, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         writer.start(profile="ros2", library="ros2-memory demo")
-        types = dict.fromkeys(stream.type for stream in STREAMS)
         schemas = {
             name: writer.register_schema(name, "ros2msg", definition(name).encode())
-            for name in types
+            for name in dict.fromkeys(stream.type for stream in STREAMS)
         }
         channels: dict[str, int] = {}
         for stream in STREAMS:

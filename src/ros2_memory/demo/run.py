@@ -2,34 +2,274 @@
 
 from __future__ import annotations
 
+import errno
+import http.client
+import json
+import os
+import re
+import shlex
+import socket
 import subprocess
+import sys
+import textwrap
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
+import yaml
 from mcp import Client, MCPError
 from mcp.client.sse import sse_client
 from mcp.types import TextContent
 
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
-from ros2_memory.demo.answer_checks import CallContext
-from ros2_memory.demo.output import connection_hints, exchange_as_json, format_exchange
+from ros2_memory.demo.judges import CallContext
 from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.questions import QUESTIONS, Exchange, judge_reply
+from ros2_memory.demo.questions import QUESTIONS, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.demo.robot import LAP_S
-from ros2_memory.demo.server_process import HOST, free_port, running_server
+from ros2_memory.demo.robot import LAP_S, ROOMS
+from ros2_memory.recorder.process.child import LAUNCHER
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
-    from ros2_memory.demo.questions import Question
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     _Show: TypeAlias = Callable[[int, Exchange], object]
+
+
+WIDTH: Final = 96
+_INDENT: Final = "    "
+_JSON_LINES: Final = 4
+
+
+def format_exchange(number: int, exchange: Exchange) -> str:
+    """Returns the question, the tool call, the answer in words, and the reply as received.
+
+    An empty line follows.
+    """
+    question, mark = exchange.question, "" if exchange.right else "WRONG: "
+    arguments = ", ".join(
+        f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
+    )
+    call = textwrap.wrap(
+        f"{question.tool}({arguments})",
+        WIDTH,
+        initial_indent=_INDENT,
+        subsequent_indent=_INDENT * 2,
+        break_on_hyphens=False,
+    )
+    answer = textwrap.fill(
+        f"{mark}{exchange.sentence}",
+        WIDTH,
+        initial_indent=f"{_INDENT}=> ",
+        subsequent_indent=f"{_INDENT}   ",
+        break_on_hyphens=False,
+    )
+    return "\n".join([f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""])
+
+
+def exchange_as_json(number: int, exchange: Exchange) -> str:
+    """Returns the same in one line, for programs."""
+    question = exchange.question
+    return json.dumps(
+        {
+            "number": number,
+            "question": question.words,
+            "tool": question.tool,
+            "arguments": dict(question.arguments),
+            "right": exchange.right,
+            "answer": exchange.sentence,
+            "reply": exchange.reply,
+        }
+    )
+
+
+def connection_hints(url: str) -> str:
+    """Returns where the page is and how a client connects, while the robot drives on."""
+    return "\n".join(
+        [
+            "The robot drives on, and the server stays up until Ctrl-C. Look at it, or ask it:",
+            "",
+            f"  in a browser           {url}/",
+            f"  from an MCP client     {url}/mcp (streamable HTTP)",
+            "  from a brain           with this in its tools/mcp.yaml:",
+            "",
+            "    - name: episodic",
+            "      transport: sse",
+            f'      url: "{url}/sse"',
+        ]
+    )
+
+
+def _reply(text: str) -> Iterator[str]:
+    """Yields the JSON as received, broken after commas; of a long one the start and its length."""
+    lines = [""]
+    for piece in re.findall(r"[^,]*,|[^,]+$", text):
+        if lines[-1] and len(_INDENT) + len(lines[-1]) + len(piece) > WIDTH:
+            lines.append("")
+        lines[-1] += piece
+    for line in lines[:_JSON_LINES]:
+        yield _INDENT + line
+    if len(lines) > _JSON_LINES:
+        yield f"{_INDENT}... ({len(text):,} characters in all)"
+
+
+HOST: Final = "127.0.0.1"
+LOG_NAME: Final = "server.log"
+PLACES_NAME: Final = "places.yaml"
+_OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
+_UP_WITHIN_S: Final = 300.0
+"""As long as it may take on a machine with much else to do; one that fails ends at once."""
+_SAID_AFTER_S: Final = 5.0
+_DOWN_WITHIN_S: Final = 5.0
+_LOG_LINES_SHOWN: Final = 8
+_LONGEST_REPORT: Final = 1_000_000
+_ANOTHER_PORT: Final = "choose another with --port, or --port 0 for any"
+
+
+def free_port(wanted: int) -> int:
+    """Returns the port to serve on: `wanted`, or any free one if that is 0.
+
+    Raises:
+        ConfigError: the port cannot be had; says why and what to do.
+    """
+    if not 0 <= wanted <= 65535:
+        raise ConfigError(f"port {wanted} does not exist; give --port a number from 0 to 65535")
+    try:
+        with socket.create_server((HOST, wanted)) as probe:
+            port: int = probe.getsockname()[1]
+            return port
+    except OSError as error:
+        in_use = error.errno == errno.EADDRINUSE
+        why = "is in use by another program" if in_use else f"cannot be opened ({error})"
+        raise ConfigError(f"port {wanted} on {HOST} {why}; {_ANOTHER_PORT}") from error
+
+
+def server_environment(
+    environment: Mapping[str, str],
+    bag_dir: Path,
+    port: int,
+    split_duration_s: float,
+    cache: str,
+) -> dict[str, str]:
+    """Returns the environment of a server of `bag_dir`, without the caller's settings."""
+    kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
+    return kept | {
+        "MCP_TRANSPORT": "sse",
+        "MCP_HOST": HOST,
+        "MCP_PORT": str(port),
+        "MEMORY_BAG_DIR": str(bag_dir),
+        "XDG_CACHE_HOME": cache,
+        "MEMORY_CONFIG_OVERRIDES": (
+            f"recorder=none storage=mcap reader.index_refresh_s=1 "
+            f"recording.split_duration_s={split_duration_s:g} "
+            f"{shlex.quote(f'data.places_file={bag_dir / PLACES_NAME}')}"
+        ),
+    }
+
+
+@contextmanager
+def running_server(
+    bag_dir: Path,
+    port: int,
+    say: Callable[[str], object],
+    *,
+    split_duration_s: float,
+    verbose: bool = False,
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Yields a server that answers, and ends it after the block; says what it waits for.
+
+    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its columns
+    into a folder that is removed at the end: no one else uses it. The rooms of the flat are written
+    to `places.yaml` in the bag directory.
+
+    Raises:
+        ConfigError: another server answers on the port.
+        EpisodicError: it did not come up; the sentence ends with the last lines of its log.
+    """
+    log_path = bag_dir / LOG_NAME
+    places = {
+        name: {"x": [from_x, to_x], "y": [from_y, to_y]}
+        for name, (from_x, to_x, from_y, to_y) in ROOMS.items()
+    }
+    (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
+    with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
+        environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
+        with log_path.open("wb") as log:
+            process = subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
+                [
+                    # It ends with this program, also where that is killed.
+                    *(sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())),
+                    *(sys.executable, "-m", "ros2_memory.server"),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=None if verbose else log,
+                stderr=None if verbose else log,
+                cwd=bag_dir,
+                env=environment,
+                # A Ctrl-C reaches the whole process group of a terminal; the order in which things
+                # end is ours to choose.
+                process_group=0,
+            )
+        try:
+            _wait_until_up(process, port, log_path, say)
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(_DOWN_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def _wait_until_up(
+    process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], object]
+) -> None:
+    begun = time.monotonic()
+    has_said = False
+    while (answering := _answering(port)) != process.pid:
+        if answering is not None:
+            raise ConfigError(f"port {port} on {HOST} is in use by another server; {_ANOTHER_PORT}")
+        code = process.poll()
+        if code is not None:
+            raise EpisodicError(f"the server ended with exit code {code}{_last_words(log_path)}")
+        waited_s = time.monotonic() - begun
+        if waited_s > _SAID_AFTER_S and not has_said:
+            has_said = True
+            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer on port {port}")
+        if waited_s > _UP_WITHIN_S:
+            raise EpisodicError(
+                f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
+                f"{_last_words(log_path)}"
+            )
+        time.sleep(0.05)
+
+
+def _answering(port: int) -> int | None:
+    """Returns the process id that the server on a port reports, 0 if it reports none.
+
+    Returns None if no server answers.
+    """
+    connection = http.client.HTTPConnection(HOST, port, timeout=2.0)
+    try:
+        connection.request("GET", "/health")
+        report = json.loads(connection.getresponse().read(_LONGEST_REPORT))
+        return int(report["pid"])
+    except (OSError, http.client.HTTPException):
+        return None
+    except (ValueError, KeyError, TypeError):
+        return 0
+    finally:
+        connection.close()
+
+
+def _last_words(log_path: Path) -> str:
+    lines = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
+    return "".join(f"\n  {line}" for line in (": its last words are", *lines)) if lines else ""
+
 
 SPLIT_DURATION_S: Final = 5.0
 SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
@@ -80,7 +320,7 @@ def run_demo(
             f"--duration {duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
             "the shortest is a lap of the robot and two bag files"
         )
-    if bag_dir is not None and bag_dir.exists() and not _is_empty(bag_dir):
+    if bag_dir and bag_dir.exists() and not (bag_dir.is_dir() and not any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
     port = free_port(port)
     tell: Callable[[str], object] = str if as_json else say
@@ -107,10 +347,6 @@ def run_demo(
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return 1 if wrong else 0
-
-
-def _is_empty(folder: Path) -> bool:
-    return folder.is_dir() and not any(folder.iterdir())
 
 
 def _made(bag_dir: Path | None, stack: ExitStack) -> Path:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 import time
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from opentelemetry import trace
 from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
@@ -26,11 +26,8 @@ from opentelemetry.sdk.trace.export import BatchSpanProcessor
 from opentelemetry.trace import SpanKind, Status, StatusCode
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.telemetry import Observer
+from ros2_memory.core.telemetry import Answered, Observer
 from ros2_memory.core.timebase import ns_from_unix
-
-if TYPE_CHECKING:
-    from ros2_memory.core.telemetry import Answered
 
 SERVICE: Final = "ros2-memory-server"
 MAX_CHARS: Final = 256
@@ -125,10 +122,9 @@ def provider_to(processor: SpanProcessor, *, arguments: bool = True) -> TracerPr
     resource = Resource.create()
     if str(resource.attributes.get(SERVICE_NAME, _UNNAMED)).startswith(_UNNAMED):
         resource = resource.merge(Resource({SERVICE_NAME: SERVICE}))
-    limits = SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS)
     provider = TracerProvider(
         resource=resource,
-        span_limits=limits,
+        span_limits=SpanLimits(max_attribute_length=MAX_CHARS, max_span_attribute_length=MAX_CHARS),
         shutdown_on_exit=False,
         active_span_processor=BoundedSpanProcessor(arguments=arguments),
     )
@@ -156,11 +152,10 @@ def traces_from_environment(*, arguments: bool) -> Traces:
 
 
 def _attributes(call: Answered) -> dict[str, str | int | float]:
-    stages = {f"ros2_memory.stage.{name}_ms": spent for name, spent in call.stages_ms.items()}
     return {
         "gen_ai.tool.name": call.tool,
         "ros2_memory.outcome": call.outcome,
         "ros2_memory.reply_chars": call.chars,
         "ros2_memory.correlation_id": call.correlation_id,
-        **stages,
+        **{f"ros2_memory.stage.{name}_ms": spent for name, spent in call.stages_ms.items()},
     }

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -23,18 +24,15 @@ from prometheus_client import (
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.exposition import generate_latest
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.core.telemetry import Exposition, Observer
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
+from ros2_memory.core.telemetry import Answered, Exposition, Observer
+from ros2_memory.core.timebase import Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from prometheus_client.metrics_core import Metric
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.telemetry import Answered
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.index.snapshot import Snapshot
 
@@ -102,13 +100,13 @@ class Metrics(Observer):
         return Exposition(CONTENT_TYPE_PLAIN_0_0_4, text)
 
 
+@dataclass
 class _Collector:
     """What `generate_latest` renders: the counters, and the gauges of one moment."""
 
-    def __init__(self, registry: CollectorRegistry, gauges: Sequence[Metric], version: str) -> None:
-        self._registry = registry
-        self._gauges = gauges
-        self._version = version
+    _registry: CollectorRegistry
+    _gauges: Sequence[Metric]
+    _version: str
 
     def collect(self) -> Iterator[Metric]:
         """Yields all metric families."""
@@ -119,13 +117,13 @@ class _Collector:
         yield from self._gauges
 
 
+@dataclass
 class MemoryGauges:
     """Measures a memory, and what its recorder writes about itself; for one thread at a time."""
 
-    def __init__(self, memory: Memory) -> None:
-        self._memory = memory
-        self._pid: int | None = None
-        self._restarts = 0
+    _memory: Memory
+    _pid: int | None = None
+    _restarts: int = 0
 
     def __call__(self) -> list[Metric]:
         """Returns the metric families of this moment.

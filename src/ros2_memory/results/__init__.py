@@ -10,10 +10,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from ros2_memory.core.errors import NoDataError
+from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.reply import PLAIN, TIME, result
 from ros2_memory.results.base import AnswerWithNotes
-from ros2_memory.results.episodes import Changes, Episode, Spell
 from ros2_memory.results.memory import (
     ANOTHER,
     Budget,
@@ -39,7 +38,7 @@ from ros2_memory.results.motion import (
     Visit,
     Visits,
 )
-from ros2_memory.results.recap import Before, Event, PastChange, Recap
+from ros2_memory.results.recap import Before, Changes, Episode, Event, PastChange, Recap, Spell
 from ros2_memory.results.things import (
     ComparedMover,
     ComparedThing,
@@ -74,7 +73,6 @@ from ros2_memory.results.topics import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.errors import NoDataReason
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
 

@@ -21,6 +21,7 @@ from ros2_memory.core.reply import (
     XYZ,
     Absent,
     LocalTimes,
+    Scope,
     Unit,
     an_object,
     by_name,
@@ -37,14 +38,12 @@ from ros2_memory.core.reply import (
 from ros2_memory.core.text import named, quote
 from ros2_memory.core.timebase import NS_PER_S, Ns, local_time, unix_from_ns
 from ros2_memory.results.base import AnswerWithNotes
-from ros2_memory.results.episodes import SAID
+from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
-    from ros2_memory.core.reply import Scope
-    from ros2_memory.results.episodes import Episode, Spell
 
 _MINUTE_S: Final = 60
 _MOST_MATCHED: Final = 5

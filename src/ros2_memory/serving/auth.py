@@ -181,8 +181,7 @@ def _unauthorized(*, is_wrong: bool, speaks_mcp: bool) -> Response:
     headers, why = {"WWW-Authenticate": challenge}, _WRONG if is_wrong else _MISSING
     if not speaks_mcp:
         return PlainTextResponse(why, status_code=401, headers=headers)
-    error = {"code": _REFUSED, "message": why.rstrip()}
-    body = {"jsonrpc": "2.0", "id": None, "error": error}
+    body = {"jsonrpc": "2.0", "id": None, "error": {"code": _REFUSED, "message": why.rstrip()}}
     return JSONResponse(body, status_code=401, headers=headers)
 
 

@@ -11,6 +11,7 @@ import subprocess
 import time
 from collections import deque
 from contextlib import suppress
+from dataclasses import dataclass, field
 from functools import partial
 from heapq import merge
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -18,14 +19,14 @@ from typing import TYPE_CHECKING, Final, TypeVar
 import anyio
 import anyio.to_thread
 
-from ros2_memory.columns.fill import Progress
+from ros2_memory.columns.fill import Batch, Filling, Progress
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.history.context import Call
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import Ns, ns_from_unix
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.transforms import make_statics
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
@@ -36,12 +37,8 @@ from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.fill import Batch, Filling
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Memory
 
 T = TypeVar("T")
 
@@ -62,6 +59,7 @@ _LATELY: Final = 4
 """Intervals between scans after which bags count as out of reach."""
 
 
+@dataclass
 class Backfill:
     """Stores the bags of one memory. Only `progress` may be called from several threads.
 
@@ -74,11 +72,10 @@ class Backfill:
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
     """
 
-    def __init__(self, memory: Memory, filling: Filling | None) -> None:
-        self._memory = memory
-        self.filling = filling
-        self.undecodable: dict[str, str] = {}
-        self._of_others: list[Ns] | None = None
+    _memory: Memory
+    filling: Filling | None
+    undecodable: dict[str, str] = field(default_factory=dict)
+    _of_others: list[Ns] | None = None
 
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
@@ -192,7 +189,12 @@ def make_fragments(
         TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
         for number in sorted(touched, reverse=True)
     ]
-    pieces = [piece for window in windows for piece in _pieces_of(window)]
+    # The newest `STRETCH_NS` of a window, and so on: few fragments wait to be written.
+    pieces = [
+        TimeWindow(max(window.start, stop - STRETCH_NS), stop)
+        for window in windows
+        for stop in range(window.stop, window.start, -STRETCH_NS)
+    ]
     unwritten: Ns = 0
     for nth, window in enumerate([*pieces, *stretches]):
         try:
@@ -218,12 +220,6 @@ def make_fragments(
             unwritten = 0
         memory.large.release()
     memory.columns.write_fragments()
-
-
-def _pieces_of(window: TimeWindow) -> Iterator[TimeWindow]:
-    """Yields the newest `STRETCH_NS` of a window, and so on: few fragments wait to be written."""
-    for stop in range(window.stop, window.start, -STRETCH_NS):
-        yield TimeWindow(max(window.start, stop - STRETCH_NS), stop)
 
 
 async def keep_backfilled(
@@ -262,23 +258,18 @@ async def keep_all_backfilled(
         await anyio.sleep(every_s)
 
 
+@dataclass
 class Filler:
     """Fills one store, a round at a time; see `keep_backfilled`.
 
     Without a `helper` it stores a backlog itself.
     """
 
-    def __init__(
-        self,
-        backfill: Backfill,
-        helper: Sequence[str] = (),
-        warm_up: Callable[[], bool] | None = None,
-    ) -> None:
-        self._backfill = backfill
-        self._helper = helper
-        self._warm_up = warm_up
-        self._pruned_s = -math.inf
-        self._is_precomputed = False
+    _backfill: Backfill
+    _helper: Sequence[str] = ()
+    _warm_up: Callable[[], bool] | None = None
+    _pruned_s: float = -math.inf
+    _is_precomputed: bool = False
 
     async def fill(self) -> None:
         """Stores the closed bags that there are. Raises nothing but cancellation."""

@@ -10,8 +10,10 @@ import math
 import threading
 import time
 import uuid
+from collections import deque
 from difflib import get_close_matches
 from functools import partial
+from threading import Lock
 from typing import TYPE_CHECKING, Final
 
 import anyio
@@ -27,25 +29,59 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.large_reads import LargeReads, return_free_memory
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered
-from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import Deadline, unix_from_ns
-from ros2_memory.history.context import Call
+from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
+from ros2_memory.core.text import abbreviate, shortened
+from ros2_memory.core.timebase import Deadline, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
-from ros2_memory.serving.question_log import QuestionLog
 from ros2_memory.tools.extra_tools import DECLARATIONS
-from ros2_memory.tools.replies import Reply
+from ros2_memory.tools.replies import Replies, Reply
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.telemetry import Telemetry
-    from ros2_memory.history.context import Memory
-    from ros2_memory.tools.declaration import Question, Tool, ToolDeclaration
-    from ros2_memory.tools.replies import Replies
+    from ros2_memory.tools.declaration import Question, Tool
+
+
+LONGEST_ANSWER: Final = 2_000
+LONGEST_QUESTION: Final = 500
+
+
+class QuestionLog:
+    """Keeps the latest questions, `most` at most; none where that is 0. Thread-safe."""
+
+    def __init__(self, most: int, wall: Callable[[], Ns] = time.time_ns) -> None:
+        self._wall = wall
+        self._kept: deque[JsonObject] = deque(maxlen=most)
+        self._lock = Lock()
+        self.is_on = most > 0
+        self.count = 0
+
+    def add(self, name: str, arguments: Mapping[str, object], done: Answered, answer: str) -> None:
+        """Adds a call that is over, and drops the oldest one too many. Long texts are cut."""
+        kept: JsonObject = {
+            "asked": round(unix_from_ns(self._wall() - ns_from_unix(done.duration_s)), 3),
+            "tool": name if done.tool == name else abbreviate(name),
+            "arguments": abbreviate(arguments, LONGEST_QUESTION),
+            "outcome": done.outcome,
+            "ms": round(done.duration_s * 1000, 1),
+            "answer": shortened(answer, LONGEST_ANSWER),
+        }
+        with self._lock:
+            self.count += 1
+            self._kept.append(kept)
+
+    def newest(self, most: int) -> tuple[JsonObject, ...]:
+        """Returns the latest questions as the page shows them, the newest first.
+
+        With when they came (Unix s, wall clock), how long they took, and the begin of the reply.
+        """
+        with self._lock:
+            return tuple(reversed(self._kept))[:most]
+
 
 QUICK_AT_ONCE: Final = 4
 BLOCKING_AT_ONCE: Final = 2
@@ -64,6 +100,10 @@ _REPORTED_WAIT_S: Final = 0.5
 _LONG_S: Final = 0.1
 """An answer that took longer used so much memory that what is free of it goes back."""
 _LOGGED_CHARS: Final = 300
+_WRITES: Final = (
+    "it needs a recorder, which alone saves and deletes bags, and server.write_tools=true; with "
+    "recorder=none nothing is deleted"
+)
 _LONGEST_NAME: Final = 64
 
 log = get_logger(__name__)
@@ -220,7 +260,12 @@ class Dispatcher:
     def _call(self, over: threading.Event) -> Call:
         """Returns a call whose query ends a little before the time of a call does."""
         timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
-        return Call(Deadline.after(timeout_s, partial(self._monotonic, over)))
+
+        def monotonic() -> float:
+            # Infinite when nobody waits for it any more.
+            return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
+
+        return Call(Deadline.after(timeout_s, monotonic))
 
     def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Logs a call that is over, and passes it to the observers."""
@@ -242,10 +287,6 @@ class Dispatcher:
             # A fault of an observer must not cost the reply.
             log.exception("telemetry_failed")
 
-    def _monotonic(self, over: threading.Event) -> float:
-        """Returns the time of a call's deadline: infinite when nobody waits for it any more."""
-        return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
-
     async def _outcome(
         self,
         tools: Mapping[str, Tool],
@@ -263,9 +304,9 @@ class Dispatcher:
                 raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
             if excess := excess_in_arguments(given):
                 raise InvalidArgumentsError(excess)
-            question = tool.question(given)
+            question = asked = tool.question(given)
             if part is not None:
-                question = _of_part(question, part)
+                question = lambda memory, call: asked(part(memory), call)  # noqa: E731 - of a part
             queue = self.blocking if tool.blocking else self.quick
             with anyio.move_on_after(self._call_timeout_s):
                 return await queue.run(client, partial(self._ask, question, call, wait))
@@ -311,28 +352,22 @@ class Dispatcher:
         try:
             # Around all of it: an error keeps what was read alive until it has become a reply.
             with call.reading(self._large):
-                return self._outcome_of(answer, wait)
+                try:
+                    return "ok", answer()
+                except QueryTimeoutError as error:
+                    noted = QueryTimeoutError(f"{error}{wait.note()}", error.searched_back_to)
+                    failure = BusyError(STOPPING) if self._stopping.is_set() else noted
+                    return failure.code, self._replies.error(failure)
+                except EpisodicError as error:
+                    reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
+                    return f"{error.code}{reason}", self._replies.error(error)
+                except Exception:
+                    # Caught here too, because nobody may be waiting for this thread any more.
+                    log.exception("tool_failed")
+                    return self._internal()
         finally:
             if time.monotonic() - begun > _LONG_S:
                 return_free_memory()
-
-    def _outcome_of(self, answer: Callable[[], Reply], wait: _Wait) -> tuple[str, Reply]:
-        try:
-            return "ok", answer()
-        except NoDataError as error:
-            return f"{error.code}: {error.reason}", self._replies.error(error)
-        except QueryTimeoutError as error:
-            if self._stopping.is_set():
-                stopping = BusyError(STOPPING)
-                return stopping.code, self._replies.error(stopping)
-            noted = QueryTimeoutError(f"{error}{wait.note()}", error.searched_back_to)
-            return noted.code, self._replies.error(noted)
-        except EpisodicError as error:
-            return error.code, self._replies.error(error)
-        except Exception:
-            # Caught here too, because nobody may be waiting for this thread any more.
-            log.exception("tool_failed")
-            return self._internal()
 
     def _internal(self) -> tuple[str, Reply]:
         """Returns the reply to a call that failed through a fault of this program."""
@@ -340,29 +375,16 @@ class Dispatcher:
         return "internal", self._replies.internal(str(context.get("correlation_id")))
 
 
-def _of_part(question: Question, part: Callable[[Memory], Memory]) -> Question:
-    """Returns a question that is asked of a part of the memory."""
-    return lambda memory, call: question(part(memory), call)
-
-
 def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     if name in tools:
         return tools[name]
     for each in DECLARATIONS:
         if name in {variant.name for variant in each.names}:
-            raise InvalidArgumentsError(f"{name} is not offered here: {_why_not(each)}")
+            why = _WRITES if each.writes else "server.tools is spec"
+            raise InvalidArgumentsError(f"{name} is not offered here: {why}")
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
     raise InvalidArgumentsError(f"unknown tool {abbreviate(name)}; {hint}")
-
-
-def _why_not(declaration: ToolDeclaration) -> str:
-    if declaration.writes:
-        return (
-            "it needs a recorder, which alone saves and deletes bags, and server.write_tools=true; "
-            "with recorder=none nothing is deleted"
-        )
-    return "server.tools is spec"
 
 
 class _Wait:

@@ -73,8 +73,7 @@ class FairQueue:
         await self._wait_for_turn(client)
         loop = asyncio.get_running_loop()
         try:
-            context = contextvars.copy_context()
-            running = self._threads.submit(context.run, query)
+            running = self._threads.submit(contextvars.copy_context().run, query)
         except RuntimeError as error:
             self._release(client)
             raise BusyError(STOPPING if self._stopped else _NO_THREAD) from error
@@ -111,8 +110,7 @@ class FairQueue:
             f"{self._most_waiting} questions wait already; ask again when some are answered, and "
             "fewer at once"
         )
-        own = len(self._waiting.get(client, ()))
-        if len(self._waiting[most]) <= own + 1:
+        if len(self._waiting[most]) <= len(self._waiting.get(client, ())) + 1:
             raise refusal
         last = self._waiting[most][-1]
         self._remove(most, last)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -15,11 +16,11 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.reply import moment, seconds
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import JsonObject, moment, seconds
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.context import Call, short_name
+from ros2_memory.history.context import Call, Memory, short_name
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.view import View
 from ros2_memory.insights.status import clock_faults, left_open, problems_of, unrecorded
@@ -29,9 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
-    from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
 
 TIMEOUT_S: Final = 2.0
@@ -119,12 +117,12 @@ class Health:
         return _status(self._version, ["the bag directory is being scanned"], {})
 
 
+@dataclass
 class FleetHealth:
     """Reports the state of a fleet's server: the robots' states, each by its own `Health`."""
 
-    def __init__(self, robots: Mapping[str, Health], version: str) -> None:
-        self._robots = robots
-        self._version = version
+    _robots: Mapping[str, Health]
+    _version: str
 
     def stop(self) -> None:
         """Ends the threads when they are done."""

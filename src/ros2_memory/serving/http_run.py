@@ -11,16 +11,14 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.serving.auth import MCP_PATH
 from ros2_memory.serving.connection_limits import ACCEPTED_AT_ONCE, BoundedConnection
-from ros2_memory.serving.listen import BACKLOG, bound
-from ros2_memory.serving.web_app import STREAM_PATH
+from ros2_memory.serving.listen import BACKLOG, Address, bound
+from ros2_memory.serving.web_app import STREAM_PATH, WebApp
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from ros2_memory.serving.listen import Address
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from ros2_memory.serving.web_app import WebApp
 
 log = get_logger("ros2_memory.server")
 
@@ -48,8 +46,7 @@ def serve_http(
         access_log=False,
         timeout_graceful_shutdown=1,
     )
-    listening = bound(at)
-    anyio.run(_Listener(config, server, app, when_listening).serve, [listening])
+    anyio.run(_Listener(config, server, app, when_listening).serve, [bound(at)])
 
 
 class _Listener(uvicorn.Server):

@@ -1,4 +1,9 @@
-"""The MCP server: the tools as declared, the resources, and a prompt."""
+"""The MCP server: the tools as declared, the resources, a prompt, and the view of MCP Apps.
+
+The view (SEP-1865) is one document that draws the reply of a tool in a chat, of the page's own
+drawing code. It reaches no network, whatever the client allows: what it shows is given to it by the
+client, and what it asks further goes through the client.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +11,15 @@ import itertools
 import json
 import time
 from contextlib import suppress
+from dataclasses import dataclass
+from importlib import resources
 from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
 
 import anyio
 import anyio.to_thread
-from mcp.server.apps import Apps
-from mcp.server.caching import CacheHint
+from mcp.server.apps import APP_MIME_TYPE, Apps
+from mcp.server.caching import CacheableMethod, CacheHint
 from mcp.server.lowlevel.helper_types import ReadResourceContents
 from mcp.server.mcpserver import Context, MCPServer
 from mcp.server.mcpserver.exceptions import ResourceNotFoundError
@@ -36,19 +43,38 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
+from ros2_memory.serving import page
 from ros2_memory.serving.auth import robots_of
-from ros2_memory.serving.chat_view import TOOLS_WITH_VIEW, VIEW_URI, view
 from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable, Hashable, Iterable, Mapping
 
-    from mcp.server.caching import CacheableMethod
-
     from ros2_memory.columns.fill import Progress
     from ros2_memory.core.model import JsonValue
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.tools.declaration import Tool
+
+
+VIEW_URI: Final = "ui://episodic/memory"
+TOOLS_WITH_VIEW: Final = frozenset(
+    {"recap", "visits", "find_things", "find_matches", "trajectory_summary", "compare"}
+)
+_STYLES: Final = ("page.css", "chat.css")
+_SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
+
+
+def view() -> ReadResourceContents:
+    """Returns the document."""
+    html = _joined(("chat.html",)).replace("<style></style>", f"<style>{_joined(_STYLES)}</style>")
+    html = html.replace("<script></script>", f"<script>{_joined(_SCRIPTS)}</script>")
+    return ReadResourceContents(html, APP_MIME_TYPE, {"ui": {"prefersBorder": True}})
+
+
+def _joined(names: Iterable[str]) -> str:
+    folder = resources.files(page)
+    return "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
+
 
 MESSAGES_PATH: Final = "/messages/"
 """Where the clients of event streams post, each with its session in the query string."""
@@ -115,15 +141,13 @@ MOMENT: Final = ResourceTemplate(
     mime_type=_JSON,
 )
 _TEMPLATES: Final = {
-    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type"),
-    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment"),
+    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type", "list_recorded_topics"),
+    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment", "list_moments"),
 }
-"""By prefix: the template, the tool whose reply is the text, and its argument."""
-_VALUES: Final = {
-    SCHEMA.uri_template: ("list_recorded_topics", "type"),
-    MOMENT.uri_template: ("list_moments", "moment"),
-}
-"""The values that a template's parameter can have: the tool whose rows have them, and their key."""
+"""By prefix: the template, the tool whose reply is the text, and its argument.
+
+And the tool whose rows have, under the same name, the values that it can have.
+"""
 
 
 class EpisodicServer(MCPServer[object]):
@@ -161,7 +185,9 @@ class EpisodicServer(MCPServer[object]):
         readable = dispatcher.readable
         self._resources = [each for each in offered if TOOLS_OF_RESOURCES[each.uri] in readable]
         self._templates = [
-            template for template, tool, _ in _TEMPLATES.values() if has_status and tool in readable
+            template
+            for template, tool, *_ in _TEMPLATES.values()
+            if has_status and tool in readable
         ]
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
 
@@ -222,15 +248,14 @@ class EpisodicServer(MCPServer[object]):
         if str(uri) == VIEW_URI:
             return [view()]
         name, arguments = self._resource_call(str(uri))
-        client = _client(context)
         reply = await self.dispatcher.answer(
-            name, arguments, client, for_resource=True, robots=_robots(context)
+            name, arguments, _client(context), for_resource=True, robots=_robots(context)
         )
         return [ReadResourceContents(content=reply.text, mime_type=_JSON)]
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
         """Returns the tool of a resource, and its arguments."""
-        for prefix, (template, tool, argument) in _TEMPLATES.items():
+        for prefix, (template, tool, argument, _) in _TEMPLATES.items():
             if template in self._templates and uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
         offered = [each.uri for each in self._resources]
@@ -248,9 +273,11 @@ class EpisodicServer(MCPServer[object]):
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
         of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        if of not in {each.uri_template for each in self._templates}:
+        known = (row for row in _TEMPLATES.values() if row[0] in self._templates)
+        asked = next((row for row in known if row[0].uri_template == of), None)
+        if asked is None:
             return None
-        tool, key = _VALUES[of]
+        _, _, key, tool = asked
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
         rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
         typed = argument.value.casefold()
@@ -285,17 +312,13 @@ class EpisodicServer(MCPServer[object]):
         )
 
 
+@dataclass
 class Storing:
     """How far the store of columns is filled, and at what rate it was during one call."""
 
-    def __init__(
-        self,
-        progress: Callable[[], Progress] | None,
-        monotonic: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._progress = progress
-        self._monotonic = monotonic
-        self._first: tuple[float, int] | None = None
+    _progress: Callable[[], Progress] | None
+    _monotonic: Callable[[], float] = time.monotonic
+    _first: tuple[float, int] | None = None
 
     def sentence(self) -> str | None:
         """Returns e.g. `40 % of the bags stored, about 20 s left`; None where none waits."""

@@ -131,6 +131,7 @@ class _Stream:
     unread: int = 0
 
 
+@dataclass
 class _BodyRequest:
     """One request with a body, and its response.
 
@@ -139,14 +140,13 @@ class _BodyRequest:
         has_left: whether the client disconnected before its response was complete.
     """
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self.scope = scope
-        self.size = 0
-        self.has_left = False
-        self._receive = receive
-        self._send = send
-        self._body: bytes | None = None
-        self._is_complete = False
+    scope: Scope
+    _receive: Receive
+    _send: Send
+    size: int = 0
+    has_left: bool = False
+    _body: bytes | None = None
+    _is_complete: bool = False
 
     async def chunks(self) -> AsyncIterator[bytes]:
         """Yields the body as it comes; ends early where the client leaves."""

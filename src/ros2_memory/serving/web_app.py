@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import uuid
 from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
@@ -171,6 +172,7 @@ def _session_manager(
     return server.session_manager
 
 
+@dataclass
 class McpEndpoint:
     """Answers streamable HTTP: by JSON, or by an event stream where a client wants progress.
 
@@ -184,9 +186,8 @@ class McpEndpoint:
     end their session cost nothing.
     """
 
-    def __init__(self, plain: ASGIApp, streaming: ASGIApp) -> None:
-        self._plain = plain
-        self._streaming = streaming
+    _plain: ASGIApp
+    _streaming: ASGIApp
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handles an ASGI connection."""
@@ -237,6 +238,7 @@ class WebApp:
             self._open.discard(request)
 
 
+@dataclass(eq=False)
 class _OpenRequest:
     """One request and its response.
 
@@ -244,19 +246,17 @@ class _OpenRequest:
     client had left; what it sends afterwards is discarded.
     """
 
-    def __init__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        self._scope = scope
-        self._receive = receive
-        self._send = send
-        self._is_stream = scope["path"] == STREAM_PATH
-        self._has_begun = False
-        self._is_ended = False
-        self._awaited = anyio.CancelScope()
-        self._limit = anyio.CancelScope()
+    _scope: Scope
+    _receive: Receive
+    _send: Send
+    _has_begun: bool = False
+    _is_ended: bool = False
+    _awaited: anyio.CancelScope = field(default_factory=anyio.CancelScope)
+    _limit: anyio.CancelScope = field(default_factory=anyio.CancelScope)
 
     def stop(self) -> None:
         """Ends an event stream at once, and another request after `GRACE_S`."""
-        if self._is_stream:
+        if self._scope["path"] == STREAM_PATH:
             self._is_ended = True
             self._awaited.cancel()
         self._limit.deadline = anyio.current_time() + GRACE_S

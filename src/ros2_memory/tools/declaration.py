@@ -1,26 +1,266 @@
-"""What a tool is, and how one query is declared under all its names."""
+"""What a tool is, how one query is declared under all its names, and the check of its arguments."""
 
 from __future__ import annotations
 
 import inspect
 from dataclasses import dataclass
-from functools import cached_property, partial
+from difflib import get_close_matches
+from functools import cache, cached_property, partial
+from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
+from pydantic import ValidationError
+
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.text import abbreviate
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.at_each import in_each
+from ros2_memory.tools.arguments import (
+    FORMS_OF_TIME,
+    REGION_KINDS,
+    TIME_KINDS,
+    Arguments,
+    TimeArgument,
+)
 from ros2_memory.tools.reply_size import to_json_text
-from ros2_memory.tools.schema import Signature
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from datetime import time
 
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Answer, OneAnswer
-    from ros2_memory.tools.arguments import Arguments, TimeArgument
+
+
+_MAX_UNKNOWN_NAMED: Final = 5
+_MAX_PROBLEMS_NAMED: Final = 10
+_MAX_NAME_CHARS: Final = 64
+_KINDS: Final = {
+    "string": "a text",
+    "number": "a number",
+    "integer": "a whole number",
+    "boolean": "true or false",
+    "array": "a list of texts",
+    "object": "an object",
+}
+_TIME: Final = "Unix seconds or ISO 8601 text"
+
+
+@dataclass(frozen=True)
+class Signature:
+    """The arguments of a model, with a `TimeArgument` in the place of their moment or span.
+
+    `plain_times`: the schema declares times as numbers only, and places as names only, since some
+    clients refuse an argument of two types. The other types are still accepted. Of arguments of
+    which one must be given there is the first alone, as the specification has it.
+    """
+
+    _arguments: type[Arguments]
+    _when: type[TimeArgument] | None = None
+    plain_times: bool = False
+
+    @cached_property
+    def _properties(self) -> dict[str, JsonObject]:
+        """Returns the JSON schema of each argument."""
+        properties: dict[str, JsonObject] = {}
+        for name, schema in _properties(self._arguments).items():
+            if self._when is not None and name == self._when.replaces:
+                properties.update(_properties(self._when))
+            else:
+                properties[name] = schema
+        if self.plain_times and self._when is not None:
+            for name in self._when.either[1:]:
+                del properties[name]
+        return properties
+
+    @cached_property
+    def _required(self) -> list[str]:
+        return [name for name, schema in self._properties.items() if "default" not in schema]
+
+    @property
+    def _either(self) -> tuple[str, ...]:
+        """Returns the arguments of which exactly one must be given."""
+        either = () if self._when is None else self._when.either
+        return either[:1] if self.plain_times else either
+
+    @property
+    def example(self) -> JsonObject:
+        """Returns a call with the required arguments alone."""
+        needed = {*self._required, *self._either[:1]}
+        return {name: _example(each) for name, each in self._properties.items() if name in needed}
+
+    def json_schema(self) -> JsonObject:
+        """Returns the schema that `tools/list` shows: flat, without empty defaults.
+
+        It says nothing of other arguments: the reply to an unknown one names those that are close.
+        """
+        properties: JsonObject = {}
+        for name, schema in self._properties.items():
+            shown: JsonObject = {
+                key: item
+                for key, item in schema.items()
+                if key != "examples" and not (key == "default" and item in (None, []))
+            }
+            shown = _with_list_of_types(shown)
+            properties[name] = _with_plain_times(shown) if self.plain_times else shown
+        required = [*self._required, *(self._either if self.plain_times else ())]
+        whole: JsonObject = {"type": "object", "properties": properties}
+        return {**whole, "required": [*required]} if required else whole
+
+    def parse(self, given: Mapping[str, object]) -> Arguments:
+        """Returns the checked arguments. A null for an optional one counts as not given.
+
+        Raises:
+            InvalidArgumentsError: one is unknown, missing, or invalid; the message names the first
+                ten, with the value that was given and an example, and counts the others.
+        """
+        present = {
+            name: value
+            for name, value in given.items()
+            if value is not None or name in self._required
+        }
+        problems = [*self._unknown(given), *self._missing(present), *self._unclear(present)]
+        values = dict(present)
+        if self._when is not None:
+            try:
+                values[self._when.replaces] = self._when.model_validate(present).chosen()
+            except ValidationError as error:
+                problems += self._wrong(error, given)
+        try:
+            arguments = self._arguments.model_validate(values)
+        except ValidationError as error:
+            problems += self._wrong(error, given)
+        else:
+            if not problems:
+                return arguments
+        more = len(problems) - _MAX_PROBLEMS_NAMED
+        raise InvalidArgumentsError(
+            "; ".join(problems[:_MAX_PROBLEMS_NAMED])
+            + (f"; and {more} more problems" if more > 0 else "")
+        )
+
+    def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
+        names = ", ".join(self._properties)
+        known = f"the arguments are: {names}" if names else "the tool takes none"
+        unknown = (name for name in given if name not in self._properties)
+        lacks_hint = False
+        for name in islice(unknown, _MAX_UNKNOWN_NAMED):
+            near = get_close_matches(name[:_MAX_NAME_CHARS], self._properties, n=1)
+            hint = f"; do you mean {near[0]}?" if near else ""
+            yield f"unknown argument {abbreviate(name)}{hint}"
+            lacks_hint = lacks_hint or not near
+        if lacks_hint:
+            yield known
+        if more := sum(1 for _ in unknown):
+            yield f"and {more} more unknown arguments"
+
+    def _missing(self, present: Mapping[str, object]) -> Iterator[str]:
+        for name in self._required:
+            if name not in present:
+                yield f"{name} is missing: {_expected(self._properties[name])}"
+
+    def _unclear(self, present: Mapping[str, object]) -> Iterator[str]:
+        either = self._either
+        named = [name for name in either if present.get(name) not in (None, [])]
+        if len(named) > 1:
+            yield f"{' and '.join(named)} were both given: give only one"
+        elif either and not named:
+            others = f"; or {' or '.join(either[1:])}" if either[1:] else ""
+            yield f"{either[0]} is missing: {_expected(self._properties[either[0]])}{others}"
+
+    def _wrong(self, error: ValidationError, given: Mapping[str, object]) -> Iterator[str]:
+        reported: set[str] = set()
+        for fault in error.errors(include_url=False, include_context=False, include_input=False):
+            name = str(fault["loc"][0])
+            if fault["type"] == "missing" or name in reported or name not in self._properties:
+                continue
+            reported.add(name)
+            reason = fault["msg"].removeprefix("Value error, ")
+            why = f", which {reason}" if fault["type"] == "value_error" else ""
+            expected = _expected(self._properties[name])
+            yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
+
+
+@cache
+def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
+    """Returns the JSON schema of each argument; an optional one has a default and no null."""
+    schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
+    return {name: _flat(each) for name, each in schema.items()}
+
+
+def _flat(schema: JsonObject) -> JsonObject:
+    kinds = schema.get("anyOf")
+    kept = {key: item for key, item in schema.items() if key != "title"}
+    if isinstance(kinds, list) and {"type": "null"} in kinds:
+        del kept["anyOf"]
+        some = next(kind for kind in kinds if kind != {"type": "null"})
+        return {**(some if isinstance(some, dict) else {}), **kept}
+    return kept
+
+
+def _with_list_of_types(schema: JsonObject) -> JsonObject:
+    """Returns the shorter schema that says the same: what it asks of one type concerns no other."""
+    kinds = schema.get("anyOf")
+    if not isinstance(kinds, list):
+        return schema
+    whole: JsonObject = {}
+    for kind in kinds:
+        whole |= kind if isinstance(kind, dict) else {}
+    types: JsonValue = [kind["type"] for kind in kinds if isinstance(kind, dict)]
+    return {**whole, **{key: item for key, item in schema.items() if key != "anyOf"}, "type": types}
+
+
+def _with_plain_times(schema: JsonObject) -> JsonObject:
+    plain = dict(schema)
+    for kinds in (REGION_KINDS, TIME_KINDS):
+        if plain.get("type") == [*kinds]:
+            plain["type"] = kinds[0]
+    if plain.get("description") == FORMS_OF_TIME:
+        del plain["description"]
+    return plain
+
+
+def _expected(schema: JsonObject) -> str:
+    """Describes the allowed values of an argument."""
+    what = _kind(schema)
+    bounds = [
+        f"{word} {schema[key]:.10g}"
+        for key, word in (
+            ("minimum", "at least"),
+            ("exclusiveMinimum", "more than"),
+            ("maximum", "at most"),
+        )
+        if isinstance(schema.get(key), int | float)
+    ]
+    text = f"{what} of {' and '.join(bounds)}" if bounds else what
+    if "description" in schema:
+        text += f" ({str(schema['description']).rstrip('.')})"
+    return f"{text}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else text
+
+
+def _kind(schema: JsonObject) -> str:
+    allowed, several = schema.get("enum"), schema.get("anyOf")
+    if isinstance(allowed, list):
+        return f"one of {', '.join(to_json_text(item) for item in allowed)}"
+    if isinstance(several, list):
+        return " or ".join(_kind(kind) for kind in several if isinstance(kind, dict))
+    if schema.get("type") == [*TIME_KINDS]:
+        return _TIME
+    items = schema.get("items")
+    if isinstance(items, dict) and items.get("type") == [*TIME_KINDS]:
+        return f"a list of {_TIME}"
+    kinds = schema.get("type")
+    if isinstance(kinds, list):
+        return " or ".join(_KINDS[str(kind)] for kind in kinds)
+    return _KINDS[str(kinds)]
+
+
+def _example(schema: JsonObject) -> JsonValue:
+    examples = schema.get("examples")
+    return examples[0] if isinstance(examples, list) and examples else schema.get("default")
+
 
 Question: TypeAlias = "Callable[[Memory, Call], Answer]"
 """A query with its arguments bound."""

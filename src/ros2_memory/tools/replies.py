@@ -15,9 +15,9 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.reply import Scope, file_name, shown, with_notes
+from ros2_memory.core.reply import JsonObject, Scope, file_name, shown, with_notes
 from ros2_memory.core.text import quoted_keys
-from ros2_memory.core.timebase import unix_rounded_up
+from ros2_memory.core.timebase import Ns, unix_rounded_up
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import QUOTED, fit_reply, to_json_text
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory import results
-from ros2_memory.core.reply import LocalTimes, Scope, render, shown, with_notes
+from ros2_memory.core.reply import JsonObject, Keys, LocalTimes, Scope, render, shown, with_notes
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject, Keys
 
 ROBOT_NAME: Final = "robot_name"
 """The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""

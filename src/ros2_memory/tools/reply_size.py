@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 from bisect import bisect_left
+from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -170,7 +171,9 @@ def _shorter_values(reply: JsonObject, max_chars: int) -> JsonObject:
     shortener = _weakest_shortener(reply, max_chars)
     shorter = shortener.shorten(reply)
     named = [
-        f"{_as_field(path)} ({how}{f': {kept} of {total} kept' if total else ''})"
+        # As the `fields` argument takes it: relative to a sample's value.
+        f"{path.removeprefix('samples.').removeprefix('value.')} "
+        f"({how}{f': {kept} of {total} kept' if total else ''})"
         for (path, how), (kept, total) in shortener.shortened.items()
     ]
     if len(named) > _MAX_NAMES:
@@ -202,11 +205,7 @@ def _weakest_shortener(reply: JsonObject, max_chars: int) -> _Shortener:
     return _Shortener(keys, fewest, shortest)
 
 
-def _as_field(path: str) -> str:
-    """Returns the dot-path as the `fields` argument takes it: relative to a sample's value."""
-    return path.removeprefix("samples.").removeprefix("value.")
-
-
+@dataclass
 class _Shortener:
     """Limits on the keys of an object, the elements of an array, and the characters of a text.
 
@@ -215,11 +214,10 @@ class _Shortener:
             was kept of how much, of the longest list or widest object there; (0, 0) for texts.
     """
 
-    def __init__(self, keys: int, arrays: int, text: int) -> None:
-        self._keys = keys
-        self._arrays = arrays
-        self._text = text
-        self.shortened: dict[tuple[str, str], tuple[int, int]] = {}
+    _keys: int
+    _arrays: int
+    _text: int
+    shortened: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
 
     def shorten(self, reply: JsonObject) -> JsonObject:
         """Returns the reply with everything within the limits, except notes and its rows."""

@@ -34,7 +34,7 @@ from ros2_memory.tools.arguments import (
     TransformArguments,
     ValueWhenArguments,
 )
-from ros2_memory.tools.declaration import ToolDeclaration, ToolName
+from ros2_memory.tools.declaration import Tool, ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
     from ros2_memory.history.view import TimeRange
-    from ros2_memory.tools.declaration import Tool
 
 
 def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
@@ -66,10 +65,9 @@ def build_tools(
         "tolerance": f"{settings.time_tolerance_s:g}",
         "map_frame": settings.map_frame or "no map",
     }
-    declarations = (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
     return tuple(
         tool
-        for declaration in declarations
+        for declaration in (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
         if writing or not declaration.writes
         for tool in declaration.tools(defaults, plain_times=not additions)
     )

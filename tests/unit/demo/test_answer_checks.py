@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, unix_rounded_up
 from ros2_memory.demo import judges, robot
-from ros2_memory.demo.answer_checks import (
+from ros2_memory.demo.judges import (
     CallContext,
 )
 from ros2_memory.demo.published_topics import (

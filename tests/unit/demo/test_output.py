@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from ros2_memory.demo.output import connection_hints, format_exchange
 from ros2_memory.demo.questions import QUESTIONS, Exchange, Question
+from ros2_memory.demo.run import connection_hints, format_exchange
 
 REPLY = json.dumps(
     {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},

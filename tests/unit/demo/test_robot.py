@@ -10,8 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.demo import robot
-from ros2_memory.demo.floor_plan import THINGS, wall_distances
-from ros2_memory.demo.robot import LAP_M, LAP_S, Planar
+from ros2_memory.demo.robot import LAP_M, LAP_S, THINGS, Planar, wall_distances
 
 MOMENTS = st.floats(min_value=-200.0, max_value=10_000.0)
 PLANAR = st.builds(

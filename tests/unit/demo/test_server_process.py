@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.demo import server_process
-from ros2_memory.demo.run import run_demo
-from ros2_memory.demo.server_process import free_port, running_server, server_environment
+from ros2_memory.demo import run
+from ros2_memory.demo.run import free_port, run_demo, running_server, server_environment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,7 +59,7 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
 def test_on_a_busy_machine_it_says_what_it_waits_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_process, "_SAID_AFTER_S", 0.0)
+    monkeypatch.setattr(run, "_SAID_AFTER_S", 0.0)
     said: list[str] = []
     port = free_port(0)
     with running_server(tmp_path, port, said.append, split_duration_s=5.0) as server:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.demo.answer_checks import CallContext
+    from ros2_memory.demo.judges import CallContext
     from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Tool
 

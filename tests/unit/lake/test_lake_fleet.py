@@ -13,8 +13,7 @@ import pytest
 import structlog
 
 from ros2_memory import cli
-from ros2_memory.bootstrap_fleet import build_fleet
-from ros2_memory.bootstrap_lake import engine_of
+from ros2_memory.bootstrap_fleet import build_fleet, engine_of
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
@@ -248,7 +247,7 @@ def test_an_engine_that_is_not_installed_is_named_with_its_extra(
 ) -> None:
     known = importlib.util.find_spec
     monkeypatch.setattr(
-        "ros2_memory.bootstrap_lake.find_spec",
+        "ros2_memory.bootstrap_fleet.find_spec",
         lambda name: None if name == "duckdb" else known(name),
     )
     with pytest.raises(ConfigError, match=r"lake: .*pip install '\.\[lake\]"):

@@ -9,7 +9,7 @@ import anyio
 from mcp import Client
 from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
 
-from ros2_memory.serving.chat_view import TOOLS_WITH_VIEW, VIEW_URI, view
+from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, view
 from tests.unit.serving.test_mcp_server import server
 
 if TYPE_CHECKING:

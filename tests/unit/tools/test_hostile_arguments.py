@@ -12,8 +12,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.tools.declaration import Signature
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.examples import examples
 from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested

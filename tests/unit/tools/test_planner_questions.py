@@ -14,7 +14,7 @@ from mcp.types import TextContent
 
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
-from ros2_memory.demo.answer_checks import WrongAnswerError
+from ros2_memory.demo.judges import WrongAnswerError
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of, with_store
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.answer_checks import CallContext
+    from ros2_memory.demo.judges import CallContext
     from tests.support.planner_world import World
 
 BY_WORDS = {question.words: question for question in QUESTIONS}

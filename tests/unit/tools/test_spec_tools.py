@@ -24,9 +24,8 @@ from ros2_memory.tools.arguments import (
     MotionArguments,
     RecapArguments,
 )
-from ros2_memory.tools.declaration import Tool, ToolDeclaration
+from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
-from ros2_memory.tools.schema import Signature
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of, replied

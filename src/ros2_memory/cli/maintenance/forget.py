@@ -80,20 +80,16 @@ def forget(
     times: Times,
     topic: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="GLOB", help="Delete only messages of these topics, from all bags; repeatable."
-        ),
+        "GLOB",
+        "Delete only messages of these topics, from all bags; repeatable.",
     ] = None,
     where: Annotated[
         str | None,
-        typer.Option(
-            metavar="PLACE", help="Delete only messages from when the robot was in a named place."
-        ),
+        "PLACE",
+        "Delete only messages from when the robot was in a named place.",
     ] = None,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be deleted, and delete nothing.")
-    ] = False,
+    yes: Annotated[bool, "Do not ask for confirmation."] = False,
+    dry_run: Annotated[bool, "Show what would be deleted, and delete nothing."] = False,
     as_json: AsJson = False,
     bag_dir: BagDir = None,
     verbose: Verbose = False,

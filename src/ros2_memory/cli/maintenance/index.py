@@ -91,8 +91,7 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
     """Fills the store of a robot of a fleet, or of the only one without a name."""
     setting = ROBOTS_SETTING if robot else None
     settings = robot_settings(settings, robot) if robot else settings
-    cache_mb = _cache_mb(settings)
-    memory = open_memory(settings, verbose=verbose, setting=setting, cache_mb=cache_mb)
+    memory = open_memory(settings, verbose=verbose, setting=setting, cache_mb=_cache_mb(settings))
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)
@@ -190,6 +189,5 @@ def _end_with_parent(parent: int) -> bool:
 
     Nothing is lost by the kill: bags are stored whole or not at all.
     """
-    libc = ctypes.CDLL(None, use_errno=True)
-    libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     return os.getppid() == parent

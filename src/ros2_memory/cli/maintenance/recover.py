@@ -42,18 +42,13 @@ def recover(
     ],
     force: Annotated[
         bool,
-        typer.Option(
-            "--force",
-            help="Also repair files that changed in the last 30 s. Make sure nothing writes them.",
-        ),
+        "Also repair files that changed in the last 30 s. Make sure nothing writes them.",
     ] = False,
     yes: Annotated[
         bool,
-        typer.Option("--yes", help="Do not ask where another program made the recording."),
+        "Do not ask where another program made the recording.",
     ] = False,
-    dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Show what would be changed, and change nothing.")
-    ] = False,
+    dry_run: Annotated[bool, "Show what would be changed, and change nothing."] = False,
     as_json: AsJson = False,
 ) -> bool:
     """Repair MCAP files that a crash, a full disk or a power cut left unfinished.

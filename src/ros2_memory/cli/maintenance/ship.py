@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
-import typer
-
-from ros2_memory.bootstrap import shared_parts
-from ros2_memory.bootstrap_fleet import build_robots
-from ros2_memory.bootstrap_lake import lake_location
+from ros2_memory.bootstrap import SharedParts, shared_parts
+from ros2_memory.bootstrap_fleet import build_robots, lake_location
 from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
 from ros2_memory.cli.output import print_json, print_line, print_notes
 from ros2_memory.config import Settings
@@ -25,7 +22,6 @@ from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, rest_of_end_s
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.bootstrap import SharedParts
     from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
     from ros2_memory.lake.warehouse import LakeLocation
@@ -42,12 +38,11 @@ log = get_logger(__name__)
 def ship(
     overrides: Overrides = None,
     *,
-    once: Annotated[bool, typer.Option("--once", help="Ship what is there, and end.")] = False,
+    once: Annotated[bool, "Ship what is there, and end."] = False,
     forget: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROBOT", help="Forget the time from --start to --end of a robot, and end."
-        ),
+        "ROBOT",
+        "Forget the time from --start to --end of a robot, and end.",
     ] = None,
     start: Start = None,
     end: End = None,

@@ -80,10 +80,8 @@ class Page:
             "cache-control": "no-cache",
             "etag": file.etag,
         }
-        known = dict(scope["headers"]).get(b"if-none-match", b"")
-        if known.decode("latin-1") == file.etag:
+        if dict(scope["headers"]).get(b"if-none-match", b"").decode("latin-1") == file.etag:
             await Response(status_code=304, headers=headers)(scope, receive, send)
             return
         # Uvicorn leaves the body out of the response to HEAD.
-        response = Response(file.body, media_type=file.media_type, headers=headers)
-        await response(scope, receive, send)
+        await Response(file.body, media_type=file.media_type, headers=headers)(scope, receive, send)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, RobotTrack, cut
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.model import TimeWindow
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
 

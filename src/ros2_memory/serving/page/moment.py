@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.reply import POSE_KEYS, Scope, render, rounded
+from ros2_memory.core.reply import POSE_KEYS, JsonObject, Scope, render, rounded
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import before
@@ -16,7 +14,6 @@ from ros2_memory.serving.page.span import event_shown
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.results import Recap
 
@@ -28,38 +25,13 @@ _CHANGES_S: Final = 10.0
 _IN_VIEW: Final = " in view"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MomentRequest:
-    """Either a moment `t_s`, or a stretch from `start_s` to `end_s`; Unix seconds.
-
-    `label`: only its sightings in the stretch are asked for.
-    """
-
-    t_s: float | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-    label: str = ""
-
-
-def moment_shown(memory: Memory, call: Call, request: MomentRequest) -> JsonObject:
-    """Returns where the robot was at a moment, what it saw and what had changed; or of a stretch.
+def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
+    """Returns where the robot was at a moment (Unix s), what it saw and what had changed.
 
     Raises:
-        InvalidArgumentsError: neither a moment nor a stretch was given.
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    start_s, end_s = request.start_s, request.end_s
-    if request.t_s is not None:
-        return _moment(memory, call, request.t_s)
-    if start_s is None or end_s is None:
-        raise InvalidArgumentsError("give t, or start and end, in Unix seconds")
-    if request.label:
-        return _sightings(memory, call, request.label, start_s, end_s)
-    return _stretch(memory, call, start_s, end_s)
-
-
-def _moment(memory: Memory, call: Call, at_s: float) -> JsonObject:
     found = before(memory, call, at_s, _CHANGES_S, None)
     around = recap(
         memory,
@@ -83,7 +55,13 @@ def _moment(memory: Memory, call: Call, at_s: float) -> JsonObject:
     }
 
 
-def _stretch(memory: Memory, call: Call, start_s: float, end_s: float) -> JsonObject:
+def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> JsonObject:
+    """Returns how far the robot drove in a stretch of time, what it saw and what happened.
+
+    Raises:
+        NoDataError: nothing is recorded.
+        QueryTimeoutError: the call's time is over.
+    """
     found = recap(
         memory, call, TimeRange(start_s, end_s), most_events=MOST_SEEN, with_changes=False
     )
@@ -109,8 +87,15 @@ def _seen(found: Recap) -> list[JsonValue]:
     return [*rows.values()]
 
 
-def _sightings(memory: Memory, call: Call, label: str, start_s: float, end_s: float) -> JsonObject:
-    """Returns the newest sightings of a label, over all detectors."""
+def sightings_shown(
+    memory: Memory, call: Call, label: str, start_s: float, end_s: float
+) -> JsonObject:
+    """Returns the newest sightings of a label, over all detectors.
+
+    Raises:
+        NoDataError: nothing is recorded.
+        QueryTimeoutError: the call's time is over.
+    """
     view, window = open_span(memory, call, TimeRange(start_s, end_s))
     detectors = [
         topic

@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.text import shortened
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.robots import (
     ADVICE,
     contradicting_frames,
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.index.timeline import Timeline
@@ -99,8 +98,7 @@ class Recordings:
             found = replace(memory, index=index, limits=limits, memo=Memo())
         snapshot = found.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
-            names = [str(each["name"]) for each in self._list(memory)]
-            near = get_close_matches(name, names, n=3)
+            near = get_close_matches(name, [str(each["name"]) for each in self._list(memory)], n=3)
             similar = f"; similar: {', '.join(near)}" if near else ""
             raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
         with self._lock:
@@ -160,8 +158,7 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
     rows = [_row(name, bags) for name, bags in found.items()]
     for folder, inside in folders.items():
         if len(inside) > 1 and folder not in found:
-            every = [*chain.from_iterable(inside)]
-            rows.append({**_row(folder, every), "holds": len(inside)})
+            rows.append({**_row(folder, [*chain.from_iterable(inside)]), "holds": len(inside)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
 
 

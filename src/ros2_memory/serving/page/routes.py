@@ -22,17 +22,15 @@ from starlette.routing import Route
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
-from ros2_memory.serving.page.labels import labels_shown
-from ros2_memory.serving.page.moment import MomentRequest, moment_shown
+from ros2_memory.serving.page.moment import moment_shown, sightings_shown, stretch_shown
 from ros2_memory.serving.page.recordings import Recordings
-from ros2_memory.serving.page.signals import MOST_SIGNALS, Signal
 from ros2_memory.serving.page.span import LAST_S, SpanRequest, span_shown
-from ros2_memory.serving.page.topics import topics_shown
+from ros2_memory.serving.page.topics import MOST_SIGNALS, Signal, labels_shown, topics_shown
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,7 +39,6 @@ if TYPE_CHECKING:
     from starlette.requests import Request
 
     from ros2_memory.columns.fill import Progress
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.serving.dispatch import Dispatcher
@@ -107,7 +104,7 @@ def page_routes(
         return Route(path, answer, methods=["GET"])
 
     parts: dict[str, _Work] = {
-        MOMENT_PATH: lambda given, part, call: moment_shown(part, call, moment_request(given)),
+        MOMENT_PATH: moment_asked,
         "/page/topics": lambda given, part, call: topics_shown(part, call, window_asked(given)),
         "/page/labels": lambda given, part, call: labels_shown(part, call, window_asked(given)),
         "/page/path": lambda given, part, call: path_in_box(
@@ -148,7 +145,9 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
         return False
     request = SpanRequest(last_s=_WEEK_S, patient=True)
     try:
-        _gather_static_transforms(memory, call)
+        view = View(memory, call)
+        for bag in view.snapshot.bags[-1:]:
+            static_transforms(view, sessions_of(view).of(bag.recording))
         Recordings().shown(memory, memory, call)
         for _ in range(_MOST_TRIES):
             shown = span_shown(memory, call, request)
@@ -161,12 +160,6 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
     except Exception:
         log.exception("page_not_warmed_up")
     return True
-
-
-def _gather_static_transforms(memory: Memory, call: Call) -> None:
-    view = View(memory, call)
-    for bag in view.snapshot.bags[-1:]:
-        static_transforms(view, sessions_of(view).of(bag.recording))
 
 
 def span_request(given: QueryParams) -> SpanRequest:
@@ -193,19 +186,25 @@ def span_request(given: QueryParams) -> SpanRequest:
     )
 
 
-def moment_request(given: QueryParams) -> MomentRequest:
-    """Returns what a query string asks of `/page/moment`.
+def moment_asked(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
+    """Returns what `/page/moment` shows: of `t`, or of the stretch from `start` to `end`.
+
+    With a `label`, only its sightings in the stretch.
 
     Raises:
-        InvalidArgumentsError: a number is invalid, or the label is too long.
+        InvalidArgumentsError: a number is invalid, the label is too long, or no time is given.
+        NoDataError: nothing is recorded.
+        QueryTimeoutError: the call's time is over.
     """
+    at_s, start_s, end_s = (_number(given, name) for name in ("t", "start", "end"))
     label = _short(given, "label", _LONGEST_LABEL)
-    return MomentRequest(
-        t_s=_number(given, "t"),
-        start_s=_number(given, "start"),
-        end_s=_number(given, "end"),
-        label=label,
-    )
+    if at_s is not None:
+        return moment_shown(memory, call, at_s)
+    if start_s is None or end_s is None:
+        raise InvalidArgumentsError("give t, or start and end, in Unix seconds")
+    if label:
+        return sightings_shown(memory, call, label, start_s, end_s)
+    return stretch_shown(memory, call, start_s, end_s)
 
 
 def window_asked(given: QueryParams) -> TimeWindow:

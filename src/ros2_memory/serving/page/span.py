@@ -21,9 +21,9 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Polygon
-from ros2_memory.core.reply import degrees, moment, render, rounded
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import Circle, Place, Polygon
+from ros2_memory.core.reply import JsonObject, degrees, moment, render, rounded
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_MS,
@@ -42,7 +42,7 @@ from ros2_memory.places.local_map import local_track
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import data_time_range
-from ros2_memory.serving.page.signals import Signal, signal_in
+from ros2_memory.serving.page.topics import Signal, signal_in
 from ros2_memory.things.find import find_things
 
 if TYPE_CHECKING:
@@ -51,13 +51,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.fill import Progress
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.regions import Place
-    from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import DataTimeRange, Event, Thing
-    from ros2_memory.serving.question_log import KeptQuestion, QuestionLog
+    from ros2_memory.serving.dispatch import QuestionLog
 
 MOST_POINTS: Final = 2_000
 MOST_EVENTS: Final = 300
@@ -160,13 +157,16 @@ def span_shown(
         else {"closed": filling.closed, "waiting": filling.waiting},
     }
     if questions is not None and questions.is_on:
-        shown["questions"] = [_question(each) for each in questions.newest(MOST_QUESTIONS)]
+        shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
         ranged = data_time_range(memory, call)
+        days: list[JsonValue] = [
+            [_s(start), _s(stop)] for start, stop in snapshot.timeline.thinned_times
+        ]
         shown["range"] = {
             **render(ranged, memory.index.bag_dir),
             "gaps": _gaps(ranged),
-            **_thinned_days(snapshot),
+            **({"thinned": days} if days else {}),
         }
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
@@ -255,17 +255,6 @@ def _keeps_up(filling: Progress) -> bool:
     return filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
 
 
-def _question(kept: KeptQuestion) -> JsonObject:
-    return {
-        "asked": _s(kept.asked),
-        "tool": kept.tool,
-        "arguments": kept.arguments,
-        "outcome": kept.outcome,
-        "ms": round(kept.duration_s * 1000, 1),
-        "answer": kept.answer,
-    }
-
-
 def _s(at: Ns) -> float:
     """Returns Unix seconds to the millisecond: a pixel of the page is more."""
     return round(unix_from_ns(at), 3)
@@ -278,12 +267,6 @@ def _start_s(window: TimeWindow) -> float:
 
 def _end_s(window: TimeWindow) -> float:
     return -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
-
-
-def _thinned_days(snapshot: Snapshot) -> JsonObject:
-    """Returns the times of thinned days, where there are some."""
-    times = snapshot.timeline.thinned_times
-    return {"thinned": [[_s(start), _s(stop)] for start, stop in times]} if times else {}
 
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
@@ -306,7 +289,9 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     if window.stop <= latest or not len(track.times):
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
     path = _drawn(track, places.map_frame, is_whole=found.since is None)
-    named = _places(memory, places.map_frame)
+    named: list[JsonValue] = [
+        _place(at) for at in memory.limits.places if at.frame_id == places.map_frame
+    ]
     shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
     notes = [*view.notes.sentences()]
     if found.since is not None:
@@ -318,22 +303,16 @@ def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
     """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
     found = local_track(view, view.pose_topic, window)
     if found is None:
-        why = _without_poses(view)
+        try:
+            why = f"{resolve_pose_topic(view)} has no poses"
+        except NoDataError as error:  # names the setting or tool that gives a path
+            why = error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
     frame, track = found
     newest = local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1))
     robot = None if newest is None else _last(newest[1])
     shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
     return Shown(shown, view.notes.sentences())
-
-
-def _without_poses(view: View) -> str:
-    """Returns why there is no path, and which setting or tool gives one."""
-    try:
-        topic = resolve_pose_topic(view)
-    except NoDataError as error:
-        return error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
-    return f"{topic} has no poses"
 
 
 def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
@@ -439,12 +418,8 @@ def _last(track: RobotTrack) -> JsonObject | None:
     }
 
 
-def _places(memory: Memory, frame_id: str) -> list[JsonValue]:
-    """Returns the named places of a frame, each as a circle or as corners."""
-    return [_place(each) for each in memory.limits.places if each.frame_id == frame_id]
-
-
 def _place(place: Place) -> JsonObject:
+    """Returns a named place as a circle or as corners."""
     match place.region:
         case Circle(x, y, radius_m):
             return {"name": place.name, "circle": [x, y, radius_m]}

@@ -1,32 +1,185 @@
-"""The topics for the page: how often each speaks, when it did in a span, and what can be plotted.
+"""The rows of the page: when labels were in view, the numbers of a field, and the topics.
 
-And the topics that can place the robot: those with poses, and satellite receivers.
+Of a topic it shows how often it speaks, when it did in a span, what can be plotted, and whether it
+can place the robot: poses, and satellite receivers. Numbers come in bins: the least, the mean and
+the greatest of each. Labels count without a place, too.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.reply import rounded
-from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.no_data import topics_of_robot, topics_that_show_poses, topics_with
+from ros2_memory.analysis.intervals import united
+from ros2_memory.core.errors import (
+    EpisodicError,
+    InvalidArgumentsError,
+    QueryTimeoutError,
+    UndecodableError,
+)
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.reply import JsonObject, rounded
+from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.counts.column_numbers import Part, PieceNumbers
+from ros2_memory.history.no_data import (
+    resolve_topic,
+    topics_of_robot,
+    topics_that_show_poses,
+    topics_with,
+)
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.fields import fields_of
+from ros2_memory.insights.recap import found_events
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import Census
+
+
+MOST_LABELS: Final = 60
+_BARS: Final = 400
+"""At most so many bars of a label: what lies nearer than a pixel or two is drawn as one."""
+_PATIENT_S: Final = 8.0
+
+
+def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
+    """Returns the labels that were in view longest, with how often, how long (s) and when.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    view = View(memory, replace(call, deadline=call.deadline.within(_PATIENT_S)), window.stop)
+    least = memory.limits.min_score
+    found = [each.visible for each in found_events(view, window).values() if each is not None]
+    seen = united([each.scoring(least) if least else each for each in found])
+    rows = [_label(label, *spans, window) for label, spans in seen.spans().items() if len(spans[0])]
+    rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))
+    shown: list[JsonValue] = [*rows[:MOST_LABELS]]
+    return {
+        "end": unix_from_ns(window.stop),
+        "labels": shown,
+        "labels_total": len(rows),
+    }
+
+
+def _label(
+    label: str, first: NDArray[np.int64], last: NDArray[np.int64], window: TimeWindow
+) -> JsonObject:
+    """Returns a row of a label, whose intervals are in order and do not overlap."""
+    start, stop = first.clip(window.start), last.clip(None, window.stop)
+    is_apart = start[1:] - stop[:-1] > (window.stop - window.start) // _BARS
+    begins, ends = start[np.append(True, is_apart)], stop[np.append(is_apart, True)]
+    pairs = zip(begins.tolist(), ends.tolist(), strict=True)
+    return {
+        "label": label,
+        "sightings": len(first),
+        "seconds": rounded(unix_from_ns(int((stop - start).sum())), 1),
+        "bars": [[round(unix_from_ns(each), 3) for each in pair] for pair in pairs],
+    }
+
+
+MOST_SIGNALS: Final = 4
+MOST_BINS: Final = 400
+
+
+class Signal(NamedTuple):
+    """A field (dot-path) of a topic."""
+
+    topic: str
+    field: str
+
+    @classmethod
+    def parse(cls, text: str) -> Signal:
+        """Returns the signal of `/topic:field`.
+
+        Raises:
+            InvalidArgumentsError: it has another form.
+        """
+        topic, colon, field = text.rpartition(":")
+        if not (topic and colon and field):
+            raise InvalidArgumentsError(f"a signal is /topic:field, not {text[:80]!r}")
+        return cls(topic, field)
+
+
+def signal_in(
+    memory: Memory, call: Call, signal: Signal, window: TimeWindow, span: TimeWindow
+) -> JsonObject:
+    """Returns a signal in a window, in bins as wide as those of the whole `span`.
+
+    An error in one signal is part of the answer; the others are still shown.
+    """
+    shown: JsonObject = {"topic": signal.topic, "field": signal.field}
+    try:
+        view = View(memory, call, window.stop)
+        topic = resolve_topic(view, signal.topic)
+        width = max((span.stop - span.start) // MOST_BINS, 1)
+        # Bins begin at the same times in every answer, so that these can be joined.
+        window = TimeWindow(window.start - window.start % width, window.stop)
+        parts, since, failures = _signal_parts(view, topic, signal.field, window, width)
+    except EpisodicError as error:
+        return {**shown, "error": str(error)}
+    if not parts:
+        why = f"no number under {signal.field} in this time"
+        return {**shown, "error": str(failures[0]) if failures else why}
+    shown["from"] = round(unix_from_ns(window.start), 3)
+    rows = _in_bins(parts, width)
+    for name, column in zip(("t", "low", "mean", "high"), zip(*rows, strict=True), strict=True):
+        shown[name] = [*column]
+    if since is not None:
+        shown["since"] = round(unix_from_ns(since), 3)
+    return shown
+
+
+def _signal_parts(
+    view: View, topic: str, field: str, window: TimeWindow, width: Ns
+) -> tuple[list[Part], Ns | None, Sequence[UndecodableError]]:
+    """Returns the numbers of a field, of times that no edge of a bin cuts, in order.
+
+    And since when they are known, if not all were read, and failures.
+    """
+    inside = [
+        (max(first, window.start), min(last, window.stop - 1))
+        for first, last in view.timeline.recordings(topic).values()
+        if window.overlaps(first, last)
+    ]
+    if not inside:
+        return [], None, ()
+    begin, end = min(first for first, _ in inside), max(last for _, last in inside)
+    edges = np.arange(begin - begin % width + width, end + 1, width)
+    numbers = PieceNumbers(view, topic, (field,), edges)
+    numbers.collect(window)
+    pieces = range(len(edges) + 1)
+    parts = [part for piece in pieces for part in sorted(numbers.parts(0, piece))]
+    return parts, numbers.since, numbers.failures
+
+
+def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]:
+    """Returns for each bin with numbers its middle, and the least, mean and greatest number."""
+    middles = np.array([(each.first + each.last) // 2 for each in parts], np.int64)
+    bins = middles // width
+    starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
+    sizes = np.array([each.size for each in parts], np.float64)
+    totals = np.array([each.total for each in parts])
+    lows = np.minimum.reduceat(np.array([each.least.middle for each in parts]), starts)
+    highs = np.maximum.reduceat(np.array([-each.greatest.middle for each in parts]), starts)
+    # One of them may be exact, and the other rounded to beyond it.
+    lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
+    means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
+    # Of a whole part the least and the greatest number are exact, and the sum is of rounded ones.
+    means = np.clip(means, lows, highs)
+    times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
+    columns = (lows, means, highs)
+    return [
+        (round(at, 3), *(rounded(each, 6) for each in row))
+        for at, *row in zip(times.tolist(), *(each.tolist() for each in columns), strict=True)
+    ]
+
 
 MOST_TOPICS: Final = 200
 MOST_NUMBERS: Final = 60
@@ -61,18 +214,14 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
             "numbers": [*_numbers(view, topic)],
         }
         for topic in topics[:MOST_TOPICS]
-        for type_name, census in [_newest_type(view, topic)]
+        # The type under which it was recorded last.
+        for type_name, census in [max(view.census(topic).items(), key=lambda of: of[1].last)]
     ]
     return {
         "topics": rows,
         "topics_total": len(topics),
         "places_robot": _places_robot(view),
     }
-
-
-def _newest_type(view: View, topic: str) -> tuple[str, Census]:
-    """Returns the type under which a topic was recorded last, and what is recorded under it."""
-    return max(view.census(topic).items(), key=lambda each: each[1].last)
 
 
 def _rate(view: View, topic: str) -> float | None:
