@@ -29,9 +29,8 @@ from ros2_memory.bag_dir.handover_file import (
     read_handover,
     sure_handover,
 )
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.bag_dir.moment_file import moments_of
+from ros2_memory.bag_dir.moment_file import HardLinks, moments_of
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import TimeWindow

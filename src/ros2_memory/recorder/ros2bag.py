@@ -18,13 +18,16 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Housekeeper, Recorder
-from ros2_memory.recorder.orders import Orders, Required
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
-from ros2_memory.recorder.process.environment import advice_on_silence
-from ros2_memory.recorder.process.installation import Installation, find_installation
+from ros2_memory.recorder.process.installation import (
+    Installation,
+    advice_on_silence,
+    find_installation,
+)
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_splits
+from ros2_memory.recorder.sessions import Orders, Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 

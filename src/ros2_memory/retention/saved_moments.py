@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried, is_thinned
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
+    HardLinks,
     Outcome,
     RequestQueue,
     SavedMoment,
@@ -40,7 +40,7 @@ from ros2_memory.core import directories
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
-from ros2_memory.retention.delete import size_of
+from ros2_memory.retention.clear import size_of
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:

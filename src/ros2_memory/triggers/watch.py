@@ -29,7 +29,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.triggers.rules import GLOB_MARKS, Firing
-from ros2_memory.triggers.splits import chains_to_search
+from ros2_memory.triggers.search import chains_to_search
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -65,6 +65,8 @@ from ros2_memory.storage.mcap.chunk import (
 )
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
+    Chunk,
+    DoubtError,
     McapIndex,
     chunk_columns,
     chunk_data,
@@ -81,7 +83,6 @@ from ros2_memory.storage.mcap.records import (
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
-from ros2_memory.storage.mcap.summary import Chunk, DoubtError
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
