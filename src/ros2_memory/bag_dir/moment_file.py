@@ -176,7 +176,7 @@ def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
     Raises:
         OSError: it cannot be made.
     """
-    moments = moments_of(bag_dir)
+    moments = bag_dir / MOMENTS_FOLDER
     if moments.is_symlink():
         raise OSError(f"{moments} is a symbolic link, which is not followed: remove it")
     moments.mkdir(exist_ok=True)
@@ -189,11 +189,6 @@ def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
             continue
         return folder
     raise OSError(f"{moments / name} and every number behind it is taken")
-
-
-def moments_of(bag_dir: Path) -> Path:
-    """Returns the folder of the saved moments."""
-    return bag_dir / MOMENTS_FOLDER
 
 
 def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
@@ -227,7 +222,7 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
     Raises:
         OSError: the folder of the moments cannot be listed.
     """
-    moments = moments_of(bag_dir)
+    moments = bag_dir / MOMENTS_FOLDER
     if moments.is_symlink():
         return
     try:

@@ -227,7 +227,7 @@ class Housekeeping(Housekeeper):
             OSError: the folders of requests or moments cannot be listed or written to.
         """
         self._moments.open()
-        restarted = self._triggers is not None and self._triggers.has_restarts
+        restarted = self._triggers is not None and bool(self._triggers.restarts)
         if restarted or self._moments.has_work():
             with self._index.undisturbed() as snapshot:
                 self._moments.keep(snapshot)

@@ -303,8 +303,11 @@ class Supervisor:
         self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
-            report = self._events.warn if resubscribe.is_fault else self._events.note
-            report(resubscribe.event, resubscribe.sentence, recording=current.name)
+            event, sentence = resubscribe.event, resubscribe.sentence
+            if resubscribe.is_fault:
+                self._events.warn(event, sentence, recording=current.name)
+            else:
+                self._events.info(event, reason=sentence, recording=current.name)
 
     def _check_list(self, _: ClockReading) -> None:
         """Has a new recording begin where the list of topics was changed."""

@@ -419,7 +419,9 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         _require_chunks_as_indexed(file, start, chunks)
     if not _agrees(stated, chunks, filled):
         raise DoubtError
-    if not _indexes_all(filled, stated.message_count):
+    indexes = sum([len(chunk.index_places or b"") for chunk in filled]) // INDEX_OFFSET_BYTES
+    index_length = sum([chunk.index_length for chunk in filled])
+    if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
     totals = _totals_of(file, filled, counts)
     if totals.keys() != counts.keys() or any(each.first == _NEVER for each in totals.values()):
@@ -477,12 +479,6 @@ def _require_no_content(file: OpenFile, at: int, end: int) -> None:
         at += RECORD.size + length
     if at > end:
         raise DoubtError(_OTHER_CHUNKS)
-
-
-def _indexes_all(chunks: Sequence[Chunk], messages: int) -> bool:
-    """Returns whether the message indexes have the size of so many messages."""
-    indexes = sum([len(chunk.index_places or b"") for chunk in chunks]) // INDEX_OFFSET_BYTES
-    return index_bytes(indexes, messages) == sum([chunk.index_length for chunk in chunks])
 
 
 def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]) -> bool:
