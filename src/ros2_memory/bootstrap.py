@@ -407,7 +407,7 @@ def claim(own: OwnRecordings) -> None:
     Raises:
         RecorderError: the list cannot be read, or the bag directory cannot be listed.
     """
-    from ros2_memory.storage.mcap.embedded import custom_data
+    from ros2_memory.storage.mcap.salvage import custom_data
 
     own.claim(custom_data)
 

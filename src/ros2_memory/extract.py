@@ -29,13 +29,20 @@ from ros2_memory.core.model import (
 )
 from ros2_memory.core.text import listed
 from ros2_memory.messages.conversions import (
+    ABSENT,
     ANGLES,
     Metric,
+    Route,
+    Segments,
     ValueKind,
+    descend,
     euler,
+    field_table_of_class,
     kind_of,
+    names_of,
     nanoseconds,
     number,
+    parse_path,
     quadruple,
     rotation,
     summaries_of,
@@ -44,15 +51,6 @@ from ros2_memory.messages.conversions import (
     view,
     xyz,
     xyzw,
-)
-from ros2_memory.messages.fields import (
-    ABSENT,
-    Route,
-    Segments,
-    descend,
-    field_table_of_class,
-    names_of,
-    parse_path,
 )
 from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, ReplyJson
 

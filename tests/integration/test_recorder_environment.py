@@ -10,8 +10,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.process import environment
-from ros2_memory.recorder.process.environment import (
+from ros2_memory.recorder.process import installation
+from ros2_memory.recorder.process.installation import (
     find_ros2,
     robot_environment,
     without_ours,
@@ -104,7 +104,7 @@ class TestSetupFiles:
     def test_one_that_never_ends_is_given_up(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(environment, "SETUP_TIMEOUT_S", 0.3)
+        monkeypatch.setattr(installation, "SETUP_TIMEOUT_S", 0.3)
         assert "did not come to an end" in refusal(setup_file(tmp_path, "a.bash", "sleep 600\n"))
 
     def test_bash_reads_nothing_that_it_was_not_given(self, tmp_path: Path) -> None:

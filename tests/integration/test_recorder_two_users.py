@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from ros2_memory.recorder.process.environment import advice_on_silence
+from ros2_memory.recorder.process.installation import advice_on_silence
 from tests.integration.another_user import as_nobody, needs_another_user, own_network
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import RealRecorder

@@ -21,10 +21,10 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
-from ros2_memory.recorder.orders import Orders
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception
+from ros2_memory.recorder.sessions import Orders
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, boolean, write_mcap
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.orders import Required
+    from ros2_memory.recorder.sessions import Required
     from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S

@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ros2_memory.messages.fields import names_of
+from ros2_memory.messages.conversions import names_of
 from tests.support.memories import shipped_extractor, shipped_schemas
 from tests.support.shared_bags import REAL, needs_real
 

@@ -29,9 +29,8 @@ from ros2_memory.bag_dir.handover_file import (
     read_handover,
     sure_handover,
 )
-from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.bag_dir.moment_file import moments_of
+from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
@@ -222,7 +221,9 @@ class BagDirReader(BagReader):
             name = os.path.relpath(recorded, self._bag_dir)
             links = [recorded]
             with suppress(OSError):
-                links += (each / name for each in sorted(moments_of(self._bag_dir).iterdir()))
+                links += (
+                    each / name for each in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
+                )
             path = next((each for each in links if os.path.lexists(each)), path)
         return self._confined(path)
 

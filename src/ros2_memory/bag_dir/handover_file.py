@@ -135,12 +135,20 @@ class Handover:
 
     def exclusions(self, file_name: str) -> tuple[Exclusion, ...]:
         """Returns what the cuts exclude of one bag file, if not `hides_all`; mostly nothing."""
-        found: list[Exclusion] = []
-        if self.begin is not None and self.counts_from is not None:
-            found += _exclusion(self.begin, file_name, MIN_NS, self.counts_from)
-        if self.end is not None and self.counts_until is not None:
-            found += _exclusion(self.end, file_name, self.counts_until, MAX_NS)
-        return tuple(found)
+        sides = (
+            (self.begin, MIN_NS, self.counts_from),
+            (self.end, self.counts_until, MAX_NS),
+        )
+        return tuple(
+            Exclusion(
+                start,
+                stop,
+                MIN_NS if overlap.log_from is None else overlap.log_from,
+                MAX_NS if overlap.log_until is None else overlap.log_until,
+            )
+            for overlap, start, stop in sides
+            if overlap and start is not None and stop is not None and file_name in overlap.files
+        )
 
     def rule(self, file_name: str) -> FileRule | None:
         """Returns which messages of one bag file count; None where all do, as in most files."""
@@ -289,24 +297,12 @@ def write_handovers(handovers: Mapping[Path, Handover]) -> None:
     Raises:
         RecorderError: one cannot be written.
     """
-    texts = {
-        recording / HANDOVER_FILE: _text(handover) for recording, handover in handovers.items()
-    }
+    texts: dict[Path, str] = {}
+    for recording, handover in handovers.items():
+        content = {"format": FORMAT, **_HANDOVER.dump_python(handover, by_alias=True)}
+        texts[recording / HANDOVER_FILE] = json.dumps(content, indent=1) + "\n"
     try:
         write_all_durably(texts)
     except OSError as error:
         targets = ", ".join(str(target) for target in texts)
         raise RecorderError(f"{targets} cannot be written: {error.strerror or error}") from error
-
-
-def _text(handover: Handover) -> str:
-    content = {"format": FORMAT, **_HANDOVER.dump_python(handover, by_alias=True)}
-    return json.dumps(content, indent=1) + "\n"
-
-
-def _exclusion(overlap: Overlap, file_name: str, start: Ns, stop: Ns) -> list[Exclusion]:
-    if file_name not in overlap.files:
-        return []
-    log_from = MIN_NS if overlap.log_from is None else overlap.log_from
-    log_until = MAX_NS if overlap.log_until is None else overlap.log_until
-    return [Exclusion(start, stop, log_from, log_until)]

@@ -182,12 +182,17 @@ class JsonDocument(Generic[_T]):
         name: the path of the file in the bag directory.
         content: the dataclass.
         is_ascii: whether other characters are escaped, as paths need that are not UTF-8.
+
+    Attributes:
+        current: returns the same as `read`, which it calls only once the file has changed; None
+            where that fails.
     """
 
     def __init__(self, name: str, content: type[_T], *, is_ascii: bool = True) -> None:
         self.name = name
         self._adapter = TypeAdapter(content)
         self._is_ascii = is_ascii
+        self.current = until_changed(name)(self.read)
 
     def read(self, bag_dir: Path) -> _T | None:
         """Returns the value; None where there is no file.

@@ -48,6 +48,24 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
     from pathlib import Path
 
+
+class HardLinks:
+    """The links in saved moments of one bag directory. Paths are strings, as scans have them."""
+
+    def __init__(self, bag_dir: Path) -> None:
+        self._root = f"{str(bag_dir).rstrip('/')}/"
+        self._moments = f"{self._root}{MOMENTS_FOLDER}/"
+
+    def is_saved(self, path: str) -> bool:
+        """Returns whether a path lies in the folder of the saved moments."""
+        return path.startswith(self._moments)
+
+    def recorded_as(self, path: str) -> str:
+        """Returns where the bag of a saved moment was recorded; any other path as it is."""
+        _, slash, name = path[len(self._moments) :].partition("/")
+        return f"{self._root}{name}" if slash and self.is_saved(path) else path
+
+
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 FORMAT: Final = 1
@@ -158,7 +176,7 @@ def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
     Raises:
         OSError: it cannot be made.
     """
-    moments = moments_of(bag_dir)
+    moments = bag_dir / MOMENTS_FOLDER
     if moments.is_symlink():
         raise OSError(f"{moments} is a symbolic link, which is not followed: remove it")
     moments.mkdir(exist_ok=True)
@@ -171,11 +189,6 @@ def make_moment_folder(bag_dir: Path, request: SaveRequest) -> Path:
             continue
         return folder
     raise OSError(f"{moments / name} and every number behind it is taken")
-
-
-def moments_of(bag_dir: Path) -> Path:
-    """Returns the folder of the saved moments."""
-    return bag_dir / MOMENTS_FOLDER
 
 
 def write_saved_moment(folder: Path, moment: SavedMoment) -> None:
@@ -209,7 +222,7 @@ def stored_moments_in(bag_dir: Path) -> Iterator[StoredMoment]:
     Raises:
         OSError: the folder of the moments cannot be listed.
     """
-    moments = moments_of(bag_dir)
+    moments = bag_dir / MOMENTS_FOLDER
     if moments.is_symlink():
         return
     try:

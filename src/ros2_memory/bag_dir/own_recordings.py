@@ -292,7 +292,12 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read()
-                left = [] if exists else _named_as_own(self._bag_dir)
+                folders = () if exists else self._bag_dir.iterdir()
+                left = sorted(
+                    path.name
+                    for path in folders
+                    if has_own_name(path.name) and path.is_dir() and not path.is_symlink()
+                )
             except OSError as error:
                 raise self._failure(error, "read") from error
             found = self._find_completed(custom_data)
@@ -335,7 +340,7 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._add([_row_of(name, identity)])
+        self._add([ListRow("", name, *identity, splits=0)])
         return True
 
     def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
@@ -432,7 +437,7 @@ class OwnRecordings:
                 embedded = [custom_data(path) or {} for path in files]
                 is_ours = all(ours.items() <= data.items() for data in embedded)
                 if embedded and (is_ours or (name in named and not any(embedded))):
-                    found.append(_row_of(name, identity))
+                    found.append(ListRow("", name, *identity, splits=0))
         return found
 
     def _find_ended(self) -> list[ListRow]:
@@ -613,16 +618,6 @@ def is_regular(path: Path) -> bool:
         return False
 
 
-def _named_as_own(bag_dir: Path) -> list[str]:
-    """Returns the directories that are named like recordings of this program.
-
-    Raises:
-        OSError: the bag directory cannot be listed.
-    """
-    names = [each.name for each in bag_dir.iterdir() if each.is_dir() and not each.is_symlink()]
-    return sorted(filter(has_own_name, names))
-
-
 def bags_in(folder: Path) -> list[Path]:
     """Returns the bag files in a directory.
 
@@ -630,10 +625,6 @@ def bags_in(folder: Path) -> list[Path]:
         OSError: it cannot be listed.
     """
     return sorted(path for path in folder.iterdir() if bag_kind(path.name))
-
-
-def _row_of(name: str, identity: Identity) -> ListRow:
-    return ListRow("", name, *identity, splits=0)
 
 
 def _give_to_owner(path: Path, bag_dir: Path) -> None:

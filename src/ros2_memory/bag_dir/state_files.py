@@ -106,11 +106,6 @@ class Loss:
     lost: Count
     by: Literal["counter", "stamps", "rosbag2", "forgotten", "expired", "died", "hung", "unclean"]
 
-    @property
-    def interrupts(self) -> bool:
-        """Whether this is the unexpected end of a recording."""
-        return self.by in INTERRUPTIONS
-
 
 LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)
 
@@ -133,7 +128,8 @@ def _losses(bag_dir: Path) -> Sequence[Loss]:
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
     """Returns the losses that fall between two log times; none where a file cannot be read."""
-    losses = (*(_losses(bag_dir) or ()), *(_expired(bag_dir) or ()))
+    expired = EXPIRED.current(bag_dir) or Expired()
+    losses = (*(_losses(bag_dir) or ()), *expired.gone, *expired.going)
     return [loss for loss in losses if loss.start < stop and start < loss.stop]
 
 
@@ -175,12 +171,6 @@ class Expired:
 
 
 EXPIRED: Final = JsonDocument(EXPIRED_FILE, Expired)
-
-
-@until_changed(EXPIRED_FILE)
-def _expired(bag_dir: Path) -> Sequence[Loss]:
-    found = EXPIRED.read(bag_dir) or Expired()
-    return (*found.gone, *found.going)
 
 
 # deleted.jsonl
@@ -288,14 +278,9 @@ class Superseded:
 SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded)
 
 
-@until_changed(SUPERSEDED_FILE)
-def _superseded(bag_dir: Path) -> Superseded | None:
-    return SUPERSEDED.read(bag_dir)
-
-
 def read_superseded(bag_dir: Path) -> Superseded:
     """Returns the bags that no longer count; none where the file cannot be read."""
-    return _superseded(bag_dir) or Superseded()
+    return SUPERSEDED.current(bag_dir) or Superseded()
 
 
 # leaving.json
@@ -311,14 +296,9 @@ class Leaving:
 LEAVING: Final = JsonDocument(LEAVING_FILE, Leaving)
 
 
-@until_changed(LEAVING_FILE)
-def _leaving(bag_dir: Path) -> Leaving | None:
-    return LEAVING.read(bag_dir)
-
-
 def describe_leaving(bag_dir: Path) -> str | None:
     """Returns a sentence on when `memory/` is deleted; None where it is not to be."""
-    leaving = _leaving(bag_dir)
+    leaving = LEAVING.current(bag_dir)
     if leaving is None:
         return None
     return (

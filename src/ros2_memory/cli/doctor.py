@@ -54,7 +54,7 @@ from ros2_memory.insights.status import (
     unrecorded,
 )
 from ros2_memory.queries import data_time_range
-from ros2_memory.recorder.process.environment import advice_on_rmw, rmw_of, robot_environment
+from ros2_memory.recorder.process.installation import advice_on_rmw, rmw_of, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token

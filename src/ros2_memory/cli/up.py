@@ -27,15 +27,13 @@ from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import WallClock, unix_from_ns
 from ros2_memory.recorder.process.child import Child, Patience, end_all
-from ros2_memory.recorder.process.environment import (
+from ros2_memory.recorder.process.installation import (
+    Installation,
     advice_on_rmw,
     advice_on_silence,
     advice_on_users,
-    rmw_of,
-)
-from ros2_memory.recorder.process.installation import (
-    Installation,
     find_installation,
+    rmw_of,
     setup_files_here,
 )
 from ros2_memory.recorder.process.topics import load_topics

@@ -16,7 +16,7 @@ from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCI
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.extract import FRAME, HEADINGS, POSE_FRAMES, UNMAPPED, PlanarPose
-from ros2_memory.messages.fields import Route
+from ros2_memory.messages.conversions import Route
 from ros2_memory.storage.base import SEQUENCE, Definition
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats
     from ros2_memory.extract import Plan, PointPose, SchemaExtractor
-    from ros2_memory.messages.fields import Segments
+    from ros2_memory.messages.conversions import Segments
     from ros2_memory.storage.base import IntArray
 
     Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"

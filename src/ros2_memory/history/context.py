@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.listed_splits import Absent, Listings
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.retention.inventory import Foreign
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader
 

@@ -152,7 +152,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
     bag_dir, touched = view.bag_dir, view.gaps(window)
     if not touched:
         return
-    known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.interrupts]
+    known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.by in INTERRUPTIONS]
     if explained and not known:
         return
     found: dict[str, list[str]] = {}

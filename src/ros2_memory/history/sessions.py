@@ -17,8 +17,8 @@ from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.results import OneAnswer
-    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.retention.inventory import Foreign
 
 P = ParamSpec("P")
 A = TypeVar("A", bound=MomentAnswer)

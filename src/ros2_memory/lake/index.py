@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.files import Days, Lake, LakeFile
-    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.retention.inventory import Foreign
 
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""

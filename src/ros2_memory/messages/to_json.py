@@ -16,23 +16,25 @@ import numpy as np
 
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.messages.conversions import (
+    ABSENT,
     Degrees,
     Metric,
     ValueKind,
     euler,
+    field_table_of,
+    field_table_of_class,
     kind_of_class,
     nanoseconds,
     summaries_of,
     xyz,
 )
-from ros2_memory.messages.fields import ABSENT, field_table_of, field_table_of_class
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.fields import Array, FieldTable
+    from ros2_memory.messages.conversions import Array, FieldTable
 
 T = TypeVar("T")
 

@@ -61,10 +61,6 @@ class EventLog:
         """Logs an event of normal operation."""
         _log.info(event, **values)
 
-    def note(self, event: str, sentence: str, **values: object) -> None:
-        """Logs an event of normal operation, with its reason."""
-        _log.info(event, reason=sentence, **values)
-
     def warn(self, event: str, sentence: str, **values: object) -> None:
         """Logs a fault that does not stop recording."""
         self._note_error(sentence)

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Loss, append_losses
 from ros2_memory.core import directories
@@ -31,9 +31,8 @@ from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.retention.clear import remove_if_empty
+from ros2_memory.retention.clear import left_by_repair, remove_emptied, remove_if_empty, size_of
 from ros2_memory.retention.collect import Collected, GarbageCollector
-from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
@@ -228,7 +227,7 @@ class Housekeeping(Housekeeper):
             OSError: the folders of requests or moments cannot be listed or written to.
         """
         self._moments.open()
-        restarted = self._triggers is not None and self._triggers.has_restarts
+        restarted = self._triggers is not None and bool(self._triggers.restarts)
         if restarted or self._moments.has_work():
             with self._index.undisturbed() as snapshot:
                 self._moments.keep(snapshot)

@@ -26,7 +26,7 @@ from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.retention.collect import Collected
-from ros2_memory.retention.foreign import ForeignBags
+from ros2_memory.retention.inventory import ForeignBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.bag_table import TableChange
     from ros2_memory.retention.collect import GarbageCollector
-    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.retention.inventory import Foreign
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["IndexManager", "Snapshot"]

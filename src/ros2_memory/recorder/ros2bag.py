@@ -18,13 +18,16 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.base import Housekeeper, Recorder
-from ros2_memory.recorder.orders import Orders, Required
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
-from ros2_memory.recorder.process.environment import advice_on_silence
-from ros2_memory.recorder.process.installation import Installation, find_installation
+from ros2_memory.recorder.process.installation import (
+    Installation,
+    advice_on_silence,
+    find_installation,
+)
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception, newest_splits
+from ros2_memory.recorder.sessions import Orders, Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB
 
@@ -91,12 +94,10 @@ class Ros2BagRecorder(Recorder):
     ) -> None:
         self._bag_dir = bag_dir.absolute()
         self._split_duration_s = split_duration_s
-        self._use_sim_time = use_sim_time
         self._setup_files = tuple(setup_files)
         self._repeat_latched = tuple(repeat_latched)
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
-        self._own = own or OwnRecordings(self._bag_dir)
         self._checked = False
         by_setting = {
             str(each["topic"]): "recording.required"
@@ -106,7 +107,6 @@ class Ros2BagRecorder(Recorder):
         self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
         self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
-        self._min_free_bytes = round(min_free_gb * GB)
         self._reception = Reception(
             reader,
             self._queue_bytes,
@@ -115,24 +115,22 @@ class Ros2BagRecorder(Recorder):
             # Each recording would receive the log of an excluded time again.
             volatile={ROSOUT} - excluding.keys() if excluding else (),
         )
-        self._supervisor = Supervisor(
-            Orders(
-                bag_dir=self._bag_dir,
-                split_duration_s=split_duration_s,
-                session_duration_s=session_duration_s,
-                min_free_bytes=self._min_free_bytes,
-                start_child=self._start_child,
-                reader=reader,
-                clock=WallClock(),
-                topics=self._topics,
-                own=self._own,
-                reception=self._reception,
-                required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
-                simulated=use_sim_time,
-                advice=lambda: advice_on_silence(self._ros.env),
-            ),
-            housekeeper or Housekeeper(),
+        self._orders = Orders(
+            bag_dir=self._bag_dir,
+            split_duration_s=split_duration_s,
+            session_duration_s=session_duration_s,
+            min_free_bytes=round(min_free_gb * GB),
+            start_child=self._start_child,
+            reader=reader,
+            clock=WallClock(),
+            topics=self._topics,
+            own=own or OwnRecordings(self._bag_dir),
+            reception=self._reception,
+            required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
+            simulated=use_sim_time,
+            advice=lambda: advice_on_silence(self._ros.env),
         )
+        self._supervisor = Supervisor(self._orders, housekeeper or Housekeeper())
 
     def check(self) -> None:
         """Makes the environment of `ros2` and reads its options from its help."""
@@ -190,10 +188,10 @@ class Ros2BagRecorder(Recorder):
             node_name=node_name(name),
             cache_bytes=self._queue_bytes,
             # Below the limit at which recording pauses, so it ends only if it was not paused.
-            min_free_bytes=self._min_free_bytes // 2,
-            use_sim_time=self._use_sim_time,
+            min_free_bytes=self._orders.min_free_bytes // 2,
+            use_sim_time=self._orders.simulated,
             repeat_latched=self._repeat_latched,
-            bag_dir_id=self._own.bag_dir_id,
+            bag_dir_id=self._orders.own.bag_dir_id,
             known_options=self._ros.options,
         )
         return Child.start(argv, self._ros.env, keep_open=self._keep_open)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import signal
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import flush_bags
@@ -15,6 +16,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.recorder.handover.transfer import (
     READY_TIMEOUT_S,
+    SUBSCRIBE_TIMEOUT_S,
     HandoverPlan,
     HandoverTransfer,
     Step,
@@ -27,15 +29,65 @@ from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
-    from ros2_memory.core.timebase import Ns
+    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.orders import Orders
     from ros2_memory.recorder.policies import ClockReading
+    from ros2_memory.recorder.process.child import Child
+    from ros2_memory.recorder.process.topics import TopicsFile
+    from ros2_memory.recorder.reception.reception import Reception
     from ros2_memory.recorder.session import SplitChanges
+    from ros2_memory.storage.base import BagReader
+
+
+@dataclass(frozen=True, slots=True)
+class Required:
+    """An entry of `recording.required`: a name or a glob, and the least messages a second."""
+
+    topic: str
+    min_hz: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Orders:
+    """What to record, and with what. Durations are in seconds.
+
+    Attributes:
+        bag_dir: where recordings are made.
+        split_duration_s: how long one bag file is.
+        session_duration_s: how long a recording lasts before the next takes over.
+        min_free_bytes: what must be free on the disk for recording to continue.
+        start_child: starts the `ros2 bag record` of a recording, given its name and directory.
+        reader: reads splits that are closed.
+        clock: the wall clock.
+        topics: the list of topics to record.
+        own: the list of recordings that were made here.
+        reception: plans how topics are subscribed, and measures how they arrive.
+        required: the topics without which recording counts as failed.
+        simulated: log times come from a simulated clock.
+        advice: says what to do where publishers are subscribed to and not heard.
+        subscribe_timeout_s: how long a handover waits for topics (see `handover.transfer`).
+    """
+
+    bag_dir: Path
+    split_duration_s: float
+    session_duration_s: float
+    min_free_bytes: int
+    start_child: Callable[[str, Path], Child]
+    reader: BagReader
+    clock: Clock
+    topics: TopicsFile
+    own: OwnRecordings
+    reception: Reception
+    required: Sequence[Required] = ()
+    simulated: bool = False
+    advice: Callable[[], str] = str
+    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
+
 
 SETTLE_S: Final = 5.0
 """A recording this young writes its headers and latched messages, which do not end a silence."""

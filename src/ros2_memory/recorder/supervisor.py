@@ -6,15 +6,15 @@ wait. `policies` and `handover.transfer` decide what to do, and `sessions` does 
 
 from __future__ import annotations
 
+import os
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.transfer import Step
-from ros2_memory.recorder.heartbeat_writer import HEARTBEAT_S, heartbeat_of
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
     RESUME_FACTOR,
@@ -35,8 +35,10 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.base import Housekeeper
-    from ros2_memory.recorder.orders import Orders
+    from ros2_memory.recorder.sessions import Orders
 
+HEARTBEAT_S: Final = 5.0
+"""How often `recorder.json` is written."""
 OBSERVE_S: Final = 0.5
 SPACE_S: Final = 1.0
 MOMENTS_S: Final = 1.0
@@ -301,8 +303,11 @@ class Supervisor:
         self._rotate_now = False
         if resubscribe is not None:
             self._reception.rotation_begun(resubscribe, now.monotonic_s)
-            report = self._events.warn if resubscribe.is_fault else self._events.note
-            report(resubscribe.event, resubscribe.sentence, recording=current.name)
+            event, sentence = resubscribe.event, resubscribe.sentence
+            if resubscribe.is_fault:
+                self._events.warn(event, sentence, recording=current.name)
+            else:
+                self._events.info(event, reason=sentence, recording=current.name)
 
     def _check_list(self, _: ClockReading) -> None:
         """Has a new recording begin where the list of topics was changed."""
@@ -386,17 +391,8 @@ class Supervisor:
         if self._disk.away:
             return
         last, now, state = self._beat, self._orders.clock.now(), state or self._state
-        beat = heartbeat_of(
-            self._orders,
-            self._events,
-            self._housekeeper.status(),
-            self._sessions,
-            self._topic_watch,
-            now=now,
-            state=state,
-            since=last.since if last is not None and last.state is state else now,
-            announced=announced,
-        )
+        since = last.since if last is not None and last.state is state else now
+        beat = self._heartbeat(now, state, since, announced)
         if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
             return
         self._beat = beat
@@ -406,6 +402,42 @@ class Supervisor:
             self._events.fail_once("heartbeat_not_written", "", str(error))
         else:
             self._events.resolve("heartbeat_not_written", "")
+
+    def _heartbeat(
+        self, now: Ns, state: RecorderState, since: Ns, announced: str | None
+    ) -> Heartbeat:
+        """Returns what `recorder.json` is to say now."""
+        sessions, watch, events = self._sessions, self._topic_watch, self._events
+        names = dict.fromkeys(session.name for session in sessions.running)
+        if announced is not None:
+            names[announced] = None
+        subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
+        silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
+        return Heartbeat(
+            pid=os.getpid(),
+            updated=now,
+            state=state,
+            recordings=tuple(names),
+            since=since,
+            bytes_written=sessions.bytes_written,
+            subscribed=tuple(sorted(subscribed)),
+            silent=tuple(sorted(silent | watch.gone)),
+            last_error=events.last_error,
+            last_error_at=events.last_error_at,
+            recovered=events.recovered,
+            interval_s=HEARTBEAT_S,
+            restarts=sessions.restarts,
+            missing=watch.missing(sessions),
+            lost=self._reception.lost_in_last_hour(now),
+            waiting_for=watch.waiting_for if state is RecorderState.WAITING else None,
+            cut_short=tuple(sorted(self._reception.cut_short)),
+            listed=self._orders.topics.selection.listed,
+            list_refused=self._orders.topics.refused,
+            process=process_of(os.getpid()),
+            advice=self._orders.advice() if watch.shortfall.unheard else None,
+            **asdict(self._housekeeper.status()),
+            **asdict(watch.shortfall),
+        )
 
     @property
     def _state(self) -> RecorderState:

@@ -28,7 +28,7 @@ from ros2_memory.recorder.proposal import (
     chosen,
     judge,
 )
-from ros2_memory.recorder.reception.profiles import QueuePlan, qos_overrides
+from ros2_memory.recorder.reception.reception import QueuePlan, qos_overrides
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

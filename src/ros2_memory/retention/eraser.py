@@ -51,7 +51,7 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.retention.delete import repair_name
+from ros2_memory.retention.clear import repair_name
 from ros2_memory.retention.repair import (
     Identity,
     beside,
@@ -189,7 +189,15 @@ class Eraser:
         if not paths[0].lstat().st_size:
             return None
         summary = self._reader.summarize(paths[0])
-        topics = [each for each in erasure.topics if _may_take(erasure, summary, each)]
+        topics = [
+            topic
+            for topic in erasure.topics
+            if any(
+                topic in erasure.latched or (start <= total.last and total.first < stop)
+                for total in summary.of(topic)
+                for start, stop in erasure.windows
+            )
+        ]
         holder = self._holder(erasure, topics, paths, inode)
         if not holder.counts:
             return None
@@ -410,15 +418,6 @@ class Eraser:
 
     def _name(self, path: Path) -> str:
         return os.path.relpath(path, self._bag_dir)
-
-
-def _may_take(erasure: Erasure, summary: BagSummary, topic: str) -> bool:
-    """Returns whether a file may hold messages of a topic that go."""
-    return any(
-        topic in erasure.latched or (start <= each.last and each.first < stop)
-        for each in summary.of(topic)
-        for start, stop in erasure.windows
-    )
 
 
 def _without(listed: MessageList, file: str, ids: Ids) -> MessageList:

@@ -33,8 +33,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_thinned
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns

@@ -22,17 +22,22 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.hard_links import HardLinks
-from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENT_FILE, is_carried, is_thinned
+from ros2_memory.bag_dir.layout import (
+    HANDOVER_FILE,
+    MOMENT_FILE,
+    MOMENTS_FOLDER,
+    is_carried,
+    is_thinned,
+)
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
+    HardLinks,
     Outcome,
     RequestQueue,
     SavedMoment,
     SaveRequest,
     StoredMoment,
     make_moment_folder,
-    moments_of,
     stored_moments_in,
     write_saved_moment,
 )
@@ -40,7 +45,7 @@ from ros2_memory.core import directories
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
-from ros2_memory.retention.delete import size_of
+from ros2_memory.retention.clear import size_of
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:
@@ -216,8 +221,8 @@ class MomentKeeper:
                     known = self._begin(SavedMoment(request), stored, snapshot)
                 except OSError as error:
                     known = (
-                        f"the bags cannot be saved in {moments_of(self._bag_dir)} by hard links: "
-                        f"{error.strerror or error}"
+                        f"the bags cannot be saved in {self._bag_dir / MOMENTS_FOLDER} by hard "
+                        f"links: {error.strerror or error}"
                     )
             if isinstance(known, str):
                 _log.warning("moment_refused", label=request.label, reason=known)
@@ -257,7 +262,7 @@ class MomentKeeper:
 
         Which messages of a bag count is decided when its recording is over, which may be later.
         """
-        moments = moments_of(self._bag_dir)
+        moments = self._bag_dir / MOMENTS_FOLDER
         if moments.is_symlink():
             return
         for root, _ in directories.walk(moments):
@@ -405,7 +410,7 @@ class MomentKeeper:
     def _remove_unbegun(self) -> None:
         """Removes files of a moment that a crash interrupted before it started."""
         with suppress(OSError):
-            for folder in moments_of(self._bag_dir).iterdir():
+            for folder in (self._bag_dir / MOMENTS_FOLDER).iterdir():
                 if _OWN_FOLDER.fullmatch(folder.name) and not (folder / MOMENT_FILE).exists():
                     (folder / f".{MOMENT_FILE}.tmp").unlink(missing_ok=True)
                     with suppress(OSError):

@@ -2,26 +2,171 @@
 
 from __future__ import annotations
 
+import json
+import struct
 from abc import abstractmethod
+from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from rosbags.interfaces import Nodetype
+from rosbags.serde.utils import SIZEMAP
+
+from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.storage.base import BagReader, batched
-from ros2_memory.storage.decoding import Decoding
-from ros2_memory.storage.errors import raise_if_lost, reading
+from ros2_memory.storage.errors import UnreadableError, raise_if_lost, reading
 from ros2_memory.storage.mcap.bag_file import McapBags
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC
+from ros2_memory.typestore import Typestores
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from contextlib import AbstractContextManager
     from pathlib import Path
+
+    from rosbags.interfaces.typing import FieldDesc, Typesdict
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import Batch, Channel, Definition, Record
     from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.sqlite_bag import SqliteBags
+    from ros2_memory.typestore import MessageType
+
+_HEADER_BYTES: Final = 4
+# A float128 is not aligned to its own size.
+_SIZES: Final[Mapping[str, int]] = {
+    str(name): size for name, size in SIZEMAP.items() if name != "float128"
+}
+
+MAX_OBJECTS: Final = 200_000
+"""Texts and messages in one message; each is an object when it is decoded."""
+_COUNTED_FROM_BYTES: Final = 256 << 10
+
+
+class _StoppedError(Exception):
+    """There are more objects than are counted, or the payload does not fit its definition."""
+
+
+def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
+    """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
+
+    One byte of it can become an object of a hundred. The length that a sequence states counts. A
+    payload that does not fit its definition otherwise is left to decoding, which names the fault.
+    """
+    if len(payload) < _COUNTED_FROM_BYTES:
+        return False
+    walk = _Walk(definitions, payload)
+    with suppress(_StoppedError, struct.error, IndexError):
+        walk.message(root)
+    return walk.objects > MAX_OBJECTS
+
+
+class _Walk:
+    """Goes through the fields of a payload, in either byte order, and counts texts and messages."""
+
+    def __init__(self, definitions: Typesdict, payload: bytes) -> None:
+        self.objects = 0
+        self._definitions = definitions
+        self._payload = payload
+        self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
+        self._position = _HEADER_BYTES
+
+    def message(self, name: str) -> None:
+        self._count()
+        fields = self._definitions[name][1]
+        if not fields:
+            self._advance(1, 1)
+        for _, field in fields:
+            self._field(field)
+
+    def _field(self, field: FieldDesc) -> None:
+        if field[0] == Nodetype.BASE:
+            self._primitive(field[1][0])
+        elif field[0] == Nodetype.NAME:
+            self.message(str(field[1]))
+        elif field[0] == Nodetype.ARRAY:
+            element, count = field[1]
+            self._elements(element, count)
+        else:
+            self._elements(field[1][0], self._length())
+
+    def _elements(self, element: FieldDesc, count: int) -> None:
+        size = _SIZES.get(element[1][0]) if element[0] == Nodetype.BASE else None
+        if size is None:
+            if element[0] == Nodetype.NAME and self.objects + count > MAX_OBJECTS:
+                self.objects += count
+                raise _StoppedError
+            for _ in range(count):
+                self._field(element)
+        elif count:
+            self._advance(size, size * count)
+
+    def _primitive(self, name: str) -> None:
+        if name == "string":
+            self._count()
+            self._advance(1, self._length())
+        elif name in _SIZES:
+            self._advance(_SIZES[name], _SIZES[name])
+        else:
+            raise _StoppedError
+
+    def _length(self) -> int:
+        at = self._advance(4, 4)
+        length: int = self._length_of.unpack_from(self._payload, at)[0]
+        return length
+
+    def _advance(self, alignment: int, size: int) -> int:
+        """Goes past an aligned value, and returns where it begins."""
+        at = self._position + -(self._position - _HEADER_BYTES) % alignment
+        self._position = at + size
+        if self._position > len(self._payload):
+            raise _StoppedError
+        return at
+
+    def _count(self) -> None:
+        self.objects += 1
+        if self.objects > MAX_OBJECTS:
+            raise _StoppedError
+
+
+_MAX_KNOWN = 10_000
+_MAX_JSON_BYTES = 4 << 20
+"""A byte of JSON can become thirty of memory."""
+_EMPTY_MESSAGE_BYTES = 8
+"""The CDR header, the one byte of a message without fields, and padding."""
+
+
+def _json(payload: bytes) -> object:
+    if len(payload) > _MAX_JSON_BYTES:
+        raise UnreadableError(f"it is longer than the {_MAX_JSON_BYTES >> 20} MiB that are read")
+    value: object = json.loads(payload)
+    return value
+
+
+def _deserialized(found: MessageType, payload: bytes) -> object:
+    """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
+    # The recorder may not have found the text of an empty definition.
+    if found.fieldless and len(payload) > _EMPTY_MESSAGE_BYTES:
+        raise UnreadableError(
+            "the definition in the bag is empty and the message is not; put the package's .msg"
+            " folder into reader.custom_msg_paths"
+        )
+    if holds_too_many(found.definitions, found.name, payload):
+        raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
+    return found.deserialize(payload)
+
+
+def _reason(record: Record, error: Exception) -> str:
+    if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
+        return "its compressed payload is damaged or too large"
+    words = " ".join(str(error).split())[:160] or type(error).__name__
+    if isinstance(error, UnreadableError):
+        return f"the payload is not decoded: {words}"
+    if record.channel.encoding == "json":
+        return f"the payload is not JSON: {words}"
+    return f"the payload does not fit the definition: {words}"
 
 
 MUCH_DECODED_BYTES: Final = 1 << 20
@@ -54,7 +199,10 @@ class FileReader(BagReader):
     """
 
     def __init__(self, custom_msg_paths: Sequence[Path | str], large: LargeReads) -> None:
-        self._decoding = Decoding(custom_msg_paths)
+        self._typestores = Typestores(custom_msg_paths)
+        # By identity, since hashing a channel hashes its definition; the channel is kept, so that
+        # its identity is not given to another.
+        self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
         self._large = large
 
     @abstractmethod
@@ -127,18 +275,58 @@ class FileReader(BagReader):
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded, or None."""
-        return self._decoding.undecodable(channel)
+        decoder = self._decoder(channel)
+        return decoder if isinstance(decoder, str) else None
 
     def decode(self, record: Record) -> object:
         """Decodes the message of a record."""
         if len(record.payload) > MUCH_DECODED_BYTES:
             self._large.acquire()
-        return self._decoding.decode(record)
+        channel = record.channel
+        decoder = self._decoder(channel)
+        if isinstance(decoder, str):
+            raise UndecodableError(channel.topic, channel.type, decoder)
+        try:
+            return decoder(record.payload)
+        # rosbags raises whatever the generated code runs into; a payload may hold anything.
+        except Exception as error:
+            reason = _reason(record, error)
+            raise UndecodableError(channel.topic, channel.type, reason) from error
 
     def encode(self, channel: Channel, message: object) -> bytes:
         """Encodes a decoded message of a channel."""
-        return self._decoding.encode(channel, message)
+        found = self._type_of(channel)
+        reason = f"messages encoded as {channel.encoding} are not written"
+        if channel.encoding != "cdr" or isinstance(found, str):
+            raise UndecodableError(channel.topic, channel.type, reason)
+        try:
+            return found.serialize(message)
+        # rosbags raises whatever the generated code runs into, as for `decode`.
+        except Exception as error:
+            reason = f"the message is not encoded: {' '.join(str(error).split())[:160]}"
+            raise UndecodableError(channel.topic, channel.type, reason) from error
 
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of the channel's messages, or None."""
-        return self._decoding.definition(channel)
+        found = self._type_of(channel) if channel.encoding == "cdr" else ""
+        return None if isinstance(found, str) else found.fields
+
+    def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
+        known = self._known.get(id(channel))
+        if known is not None:
+            return known[1]
+        decoder: Callable[[bytes], object] | str = _json
+        if channel.encoding == "cdr":
+            found = self._type_of(channel)
+            found = found if isinstance(found, str) else found.compiled()
+            decoder = found if isinstance(found, str) else partial(_deserialized, found)
+        elif channel.encoding != "json":
+            decoder = f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
+        if len(self._known) >= _MAX_KNOWN:
+            self._known.clear()
+        self._known[id(channel)] = (channel, decoder)
+        return decoder
+
+    def _type_of(self, channel: Channel) -> MessageType | str:
+        schema = channel.schema
+        return self._typestores.lookup(schema.name, schema.encoding, schema.text)

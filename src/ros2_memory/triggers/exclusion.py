@@ -118,7 +118,11 @@ def excluded_intervals(
                 stop = each.stop
                 if run.holds:
                     held += _carried(run.first, each, recordings[at + 1 :], rule.stale)
-                elif _is_taken_over(each, recordings[at + 1 :]):
+                # Another recording ran when it ended.
+                elif any(
+                    each.start <= later.start < each.stop < later.stop
+                    for later in recordings[at + 1 :]
+                ):
                     stop = (each.stop if run.lasts else run.last) + rule.stale
             if run.holds is True:
                 held.append((run.first, stop))
@@ -164,11 +168,6 @@ def _valid_until(
         # The clock was set back: nothing is sure but that the condition may hold.
         return run.last + 1
     return stop if run.lasts else min(stop, run.last + stale)
-
-
-def _is_taken_over(ended: RecordingConditions, others: Iterable[RecordingConditions]) -> bool:
-    """Returns whether another recording ran when one ended."""
-    return any(ended.start <= each.start < ended.stop < each.stop for each in others)
 
 
 def _carried(

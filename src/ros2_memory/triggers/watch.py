@@ -29,7 +29,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.triggers.rules import GLOB_MARKS, Firing
-from ros2_memory.triggers.splits import chains_to_search
+from ros2_memory.triggers.search import chains_to_search
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -69,6 +69,9 @@ class Triggers:
         split_duration_s: how long one split is.
         is_recorded: whether a topic is among those that the recorder is to record.
         monotonic: a clock that never steps, in seconds.
+
+    Attributes:
+        restarts: those of the recording that are still to be evaluated; from when to when.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class Triggers:
         self._monotonic = monotonic
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
-        self._restarts: list[tuple[Ns, Ns]] = []
+        self.restarts: list[tuple[Ns, Ns]] = []
         self._deleted = 0
         self._is_written = False
         self._reported: dict[str, Ns] = {}
@@ -103,12 +106,7 @@ class Triggers:
     def note_restart(self, first: Ns, at: Ns) -> None:
         """Records that the recording ended unexpectedly and restarted between two wall times."""
         with self._lock:
-            self._restarts.append((first, at))
-
-    @property
-    def has_restarts(self) -> bool:
-        """Whether a restart is still to be evaluated."""
-        return bool(self._restarts)
+            self.restarts.append((first, at))
 
     def look(self, snapshot: Snapshot) -> None:
         """Searches what was closed since the last look. Nothing may be deleted meanwhile.
@@ -120,7 +118,7 @@ class Triggers:
         state = deepcopy(self._loaded(snapshot))
         self._search_closed(state, snapshot)
         with self._lock:
-            restarts, self._restarts = self._restarts, []
+            restarts, self.restarts = self.restarts, []
             deleted, self._deleted = self._deleted, 0
         for first, at in restarts:
             for rule in self._rules.values():

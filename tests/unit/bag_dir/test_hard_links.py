@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.hard_links import HardLinks
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call

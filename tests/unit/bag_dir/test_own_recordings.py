@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.own_recordings import LIST, ListRow, OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
-from ros2_memory.storage.mcap.embedded import custom_data
+from ros2_memory.storage.mcap.salvage import custom_data
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples

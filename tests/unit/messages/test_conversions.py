@@ -7,6 +7,7 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ros2_memory.messages.conversions import (
+    ABSENT,
     euler,
     nanoseconds,
     rotation,
@@ -14,7 +15,6 @@ from ros2_memory.messages.conversions import (
     xyz,
     xyzw,
 )
-from ros2_memory.messages.fields import ABSENT
 from tests.support import bags
 
 NAN = math.nan

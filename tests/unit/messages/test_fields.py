@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ros2_memory.messages.fields import (
+from ros2_memory.messages.conversions import (
     ABSENT,
     Route,
     descend,

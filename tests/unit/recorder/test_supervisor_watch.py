@@ -9,7 +9,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
-from ros2_memory.recorder.orders import Required
+from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import World, assert_what_stands_counts_once, events
 
 pytestmark = pytest.mark.usefixtures("no_flushing")

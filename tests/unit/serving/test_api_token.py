@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.recorder.process.environment import without_ours
+from ros2_memory.recorder.process.installation import without_ours
 from ros2_memory.serving.auth import LONGEST_TOKEN, SHORTEST_TOKEN, api_token, take_token
 
 if TYPE_CHECKING:

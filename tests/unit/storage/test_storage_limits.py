@@ -20,7 +20,6 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.messages.to_json import MAX_EXACT_NUMBERS
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema
-from ros2_memory.storage.decoding import Decoding
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_CHUNK_MESSAGES,
@@ -211,21 +210,21 @@ class TestMessages:
         def record(count: int) -> Record:
             return Record(known, 1, 1, b"\0\1\0\0" + struct.pack("<I", count) + bytes(count))
 
-        few = Decoding().decode(record(1000))
+        few = McapReader().decode(record(1000))
         assert len(getattr(few, "data", ())) == 1000
         with pytest.raises(UndecodableError, match="more than 200000 texts or messages"):
-            Decoding().decode(record(300_000))
+            McapReader().decode(record(300_000))
 
     def test_a_large_array_of_numbers_is_decoded(self) -> None:
         known = Channel("/t", "cdr", Schema("pkg/msg/Wide", "ros2msg", b"uint8[] data\n"))
         payload = b"\0\1\0\0" + struct.pack("<I", MB) + bytes(MB)
-        assert len(getattr(Decoding().decode(Record(known, 1, 1, payload)), "data", ())) == MB
+        assert len(getattr(McapReader().decode(Record(known, 1, 1, payload)), "data", ())) == MB
 
     def test_json_longer_than_is_read_is_refused(self) -> None:
         known = Channel("/t", "json", Schema("Thing", "jsonschema", b"{}"))
         payload = b"[" + b"0," * (2 * MB) + b"0]"
         with pytest.raises(UndecodableError, match="longer than the 4 MiB"):
-            Decoding().decode(Record(known, 1, 1, payload))
+            McapReader().decode(Record(known, 1, 1, payload))
 
     def test_an_array_of_too_many_numbers_is_reported_by_its_length(
         self,

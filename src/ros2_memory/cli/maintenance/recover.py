@@ -14,10 +14,10 @@ from typing import Annotated, Final
 import typer
 from rich.console import Console
 
-from ros2_memory.bag_dir.hard_links import HardLinks
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE
 from ros2_memory.bag_dir.metadata_yaml import is_named_by_rosbag2
+from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import AsJson
@@ -27,7 +27,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArguments
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
-from ros2_memory.retention.delete import size_of
+from ros2_memory.retention.clear import size_of
 from ros2_memory.retention.repair import Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S

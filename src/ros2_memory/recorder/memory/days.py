@@ -40,13 +40,13 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.recorder.memory.rounding import rounded
 from ros2_memory.recorder.memory.thinning import (
     MINUTE_NS,
     TopicThinning,
     has_numbers,
     is_said,
     is_sampled,
+    rounded,
 )
 
 if TYPE_CHECKING:

@@ -4,17 +4,206 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import structlog
+
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.child import run_bounded
 from ros2_memory.recorder.process.command import HELP_ARGV, options_in_help
-from ros2_memory.recorder.process.environment import find_ros2, rmw_of, robot_environment
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+SETUP_TIMEOUT_S: Final = 60.0
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+# The script prints each file's name before it sources the file, so that a file that fails or exits
+# can be named. What files print goes to stderr. They do not see the arguments, which some would
+# take for their own. An empty entry ends the names and begins the environment.
+_SOURCE_ALL: Final = (
+    'files=("$@"); set --; '
+    'for file in "${files[@]}"; do printf "%s\\0" "$file"; . "$file" >&2 || exit; done; '
+    'printf "\\0"; exec env -0'
+)
+_OURS: Final = frozenset(
+    {
+        "VIRTUAL_ENV",
+        "VIRTUAL_ENV_PROMPT",
+        "PYTHONHOME",
+        "PYTHONEXECUTABLE",
+        "BASH_ENV",  # bash would source it
+        # The service manager's channels belong to the daemon.
+        "NOTIFY_SOCKET",
+        "WATCHDOG_PID",
+        "WATCHDOG_USEC",
+        "LISTEN_FDS",
+        "LISTEN_PID",
+        "JOURNAL_STREAM",
+        "CREDENTIALS_DIRECTORY",
+        # The server's, from an environment file that both programs have.
+        "MEMORY_API_TOKEN",
+    }
+)
+_SHELLS_OWN: Final = ("_", "SHLVL", "PWD", "OLDPWD")
+# The recorder's lines are read by a program: whole lines, on stderr, without colours, in rcutils'
+# default form. A robot may well be set to another one.
+_READABLE_OUTPUT: Final = {
+    "RCUTILS_COLORIZED_OUTPUT": "0",
+    "RCUTILS_LOGGING_BUFFERED_STREAM": "1",
+    "RCUTILS_LOGGING_USE_STDOUT": "0",
+    "RCUTILS_CONSOLE_OUTPUT_FORMAT": "[{severity}] [{time}] [{name}]: {message}",
+    "PYTHONUNBUFFERED": "1",
+}
+
+
+def robot_environment(
+    setup_files: Sequence[Path],
+    log_dir: Path,
+    inherited: Mapping[str, str] | None = None,
+) -> dict[str, str]:
+    """Returns the environment for `ros2`: the inherited one without ours, after the setup files.
+
+    `ROS_DOMAIN_ID`, the RMW's settings and everything else of the robot pass through.
+
+    Args:
+        setup_files: bash scripts, sourced in this order; none where `ros2` is on PATH already.
+        log_dir: where ROS writes the log of each run, unless the environment has ROS_LOG_DIR.
+        inherited: the environment to begin with; the process's own where None.
+
+    Raises:
+        RecorderError: a setup file is missing or fails; the message names it.
+    """
+    base = without_ours(os.environ if inherited is None else inherited)
+    if setup_files:
+        # Setup files set it; an earlier value is not the robot's.
+        base.pop("PYTHONPATH", None)
+        base = _sourced(setup_files, base)
+    return {"ROS_LOG_DIR": str(log_dir), **base, **_READABLE_OUTPUT}
+
+
+def without_ours(inherited: Mapping[str, str]) -> dict[str, str]:
+    """Removes our virtual environment and the service manager's variables from an environment."""
+    prefixes = [inherited["VIRTUAL_ENV"]] if inherited.get("VIRTUAL_ENV") else []
+    if sys.prefix != sys.base_prefix:
+        prefixes.append(sys.prefix)
+    env = {name: value for name, value in inherited.items() if name not in _OURS}
+    for name in ("PATH", "PYTHONPATH"):
+        if name in env:
+            parts = env[name].split(os.pathsep)
+            kept = [part for part in parts if not any(map(Path(part).is_relative_to, prefixes))]
+            env[name] = os.pathsep.join(kept)
+    if not env.get("PYTHONPATH"):
+        env.pop("PYTHONPATH", None)
+    return env
+
+
+def rmw_of(env: Mapping[str, str]) -> str:
+    """Returns the RMW that nodes in an environment use; `rmw_fastrtps_cpp` unless it is set."""
+    return env.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"
+
+
+def advice_on_rmw(env: Mapping[str, str]) -> str | None:
+    """Returns what a recorder needs with an RMW that is not Fast DDS; None with Fast DDS."""
+    rmw = rmw_of(env)
+    if "zenoh" in rmw:
+        return (
+            "over Zenoh nodes find each other through a router (`ros2 run rmw_zenoh_cpp "
+            "rmw_zenohd`): does it run, and has the recorder the nodes' ROS_DOMAIN_ID, "
+            "ZENOH_SESSION_CONFIG_URI and ZENOH_CONFIG_OVERRIDE? see docs/how-to/robot.md"
+        )
+    if "cyclonedds" in rmw:
+        return (
+            "has the recorder the nodes' ROS_DOMAIN_ID and CYCLONEDDS_URI, which names the "
+            "network interfaces? see docs/how-to/robot.md"
+        )
+    return None
+
+
+def advice_on_users(env: Mapping[str, str]) -> str | None:
+    """Returns what a recorder needs to hear nodes of another user; None where it needs nothing.
+
+    rmw_fastrtps sets its own transports in the discovery range LOCALHOST, whatever
+    FASTDDS_BUILTIN_TRANSPORTS is, and among them shared memory that another user cannot read.
+    """
+    if "fastrtps" not in rmw_of(env):
+        return None
+    local = env.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST"
+    if local or env.get("ROS_LOCALHOST_ONLY") == "1":
+        return (
+            "if the publishers run under another user: in the discovery range LOCALHOST Fast DDS "
+            "uses shared memory, which users do not share, and FASTDDS_BUILTIN_TRANSPORTS changes "
+            "nothing; run the recorder as the robot's user, or see docs/how-to/systemd.md for what "
+            "a wider range takes and exposes"
+        )
+    if env.get("FASTDDS_BUILTIN_TRANSPORTS") != "UDPv4":
+        return (
+            "if the publishers run under another user, set FASTDDS_BUILTIN_TRANSPORTS=UDPv4 "
+            "for the recorder: Fast DDS does not share memory between users"
+        )
+    return None
+
+
+def advice_on_silence(env: Mapping[str, str]) -> str:
+    """Returns advice for subscriptions that receive nothing, by the environment."""
+    if advice := advice_on_rmw(env) or advice_on_users(env):
+        return advice
+    if "fastrtps" not in rmw_of(env):
+        return "is the robot's RMW_IMPLEMENTATION the recorder's, and does a firewall block DDS?"
+    return "do the publishers publish, and does a firewall block DDS?"
+
+
+def find_ros2(env: Mapping[str, str], *, sourced: bool = False) -> str:
+    """Returns the path of the `ros2` program.
+
+    `sourced`: the environment is that after the setup files.
+
+    Raises:
+        RecorderError: it is not on the environment's PATH.
+    """
+    found = shutil.which("ros2", path=env.get("PATH", os.defpath))
+    if found is None:
+        where = "after sourcing recorder.setup_files" if sourced else "on PATH"
+        raise RecorderError(
+            f"`ros2` was not found {where}; name the setup.bash of the ROS 2 distribution, and of "
+            "the workspace with the robot's own messages, in recorder.setup_files"
+        )
+    return str(Path(found).absolute())
+
+
+def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, str]:
+    for file in setup_files:
+        if not file.is_file():
+            raise RecorderError(f"{file} is not there; correct recorder.setup_files")
+    bash = shutil.which("bash", path=base.get("PATH", os.defpath))
+    if bash is None:
+        raise RecorderError("there is no bash on PATH, which recorder.setup_files need")
+    # Absolute: bash looks a bare name up on PATH.
+    names = [str(file.absolute()) for file in setup_files]
+    argv = [bash, "--noprofile", "--norc", "-c", _SOURCE_ALL, "ros2-memory-setup", *names]
+    finished = run_bounded(argv, base, SETUP_TIMEOUT_S)
+    begun, ended, entries = os.fsdecode(finished.stdout).partition("\0\0")
+    printed = finished.stderr.decode("utf-8", errors="replace")
+    if finished.returncode != 0 or not ended:
+        raise RecorderError(_failure(begun, finished.returncode, printed))
+    for line in printed.splitlines():
+        _log.warning("setup_file_said", text=line)
+    pairs = (entry.partition("=") for entry in entries.split("\0") if entry)
+    return {name: value for name, _, value in pairs if name not in _SHELLS_OWN}
+
+
+def _failure(begun: str, status: int, errors: str) -> str:
+    name = begun.rstrip("\0").rpartition("\0")[2] or "the shell"
+    printed = " ".join(errors.split())[-300:]
+    return (
+        f"{name} failed with status {status}"
+        f"{f' ({printed})' if printed else ''}; correct it, or recorder.setup_files"
+    )
+
 
 HELP_TIMEOUT_S: Final = 60.0
 DISTRIBUTIONS: Final = Path("/opt/ros")

@@ -3,20 +3,371 @@
 from __future__ import annotations
 
 import struct
+from collections import deque
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from itertools import pairwise
+from statistics import fmean, median_low
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+import yaml
+
+from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
-from ros2_memory.recorder.reception.losses import Position, Progress, reader_of
-from ros2_memory.recorder.reception.profiles import HOLD_S, TopicFlow, offered_by_all
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.reception.losses import Kind
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.storage.base import BagReader, Schema
+
+HOUR_NS: Final[Ns] = 3600 * NS_PER_S
+RECENT: Final = 6
+"""After so many splits nothing is waited for any more."""
+FEWEST: Final = 10
+"""Messages that show a cadence."""
+REGULAR: Final = 0.9
+"""The part of all steps that must be of one length, or nothing is expected."""
+LONGEST_NS: Final[Ns] = 5 * NS_PER_S
+"""A longer hole is a publisher that was silent, and reported as that."""
+MOST_MISSING: Final = 10_000
+_TOLERANCE: Final = 0.25
+_HEADERS: Final = frozenset({"std_msgs/Header", "std_msgs/msg/Header", "Header"})
+_TIMES: Final = frozenset(
+    f"builtin_interfaces/{middle}{name}" for middle in ("", "msg/") for name in ("Time", "Duration")
+)
+_COUNTERS: Final = frozenset(
+    {
+        "seq",
+        "sequence",
+        "sequence_number",
+        "sequence_id",
+        "seq_num",
+        "seq_id",
+        "counter",
+        "msg_counter",
+        "message_counter",
+        "packet_counter",
+        "frame_counter",
+        "frame_number",
+    }
+)
+_SIZES: Final = {
+    **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
+    **dict.fromkeys(("int16", "uint16"), 2),
+    **dict.fromkeys(("int32", "uint32", "float32"), 4),
+    **dict.fromkeys(("int64", "uint64", "float64"), 8),
+}
+_UNSIGNED: Final = {"uint16": "<H", "uint32": "<I", "uint64": "<Q", "int32": "<i", "int64": "<q"}
+
+Kind = Literal["counter", "stamps"]
+
+
+class Position(NamedTuple):
+    """Where one message lies: its counter or stamp (ns), and its log time."""
+
+    value: int
+    log_time: Ns
+
+
+class Progress(NamedTuple):
+    """The messages of a topic in one split, at least one, by log time, and what shows holes."""
+
+    kind: Kind
+    positions: Sequence[Position]
+
+
+class Hole(NamedTuple):
+    """Messages that are missing between two that are not.
+
+    An open one may still turn out to be a late message: too few follow to tell.
+    """
+
+    before: Position
+    after: Position
+    missing: int
+    is_open: bool = False
+
+
+@dataclass(slots=True)
+class _Series:
+    """What the recordings have of a topic, by value; the first message is settled."""
+
+    kind: Kind
+    positions: list[Position]
+    heard: int = 0
+    """How many splits had been measured when it last came."""
+
+
+class LossCounter:
+    """What is missing in the splits of one bag directory, measured one after the other."""
+
+    def __init__(self) -> None:
+        self._measured = 0
+        # Of each recording, how many splits had been measured when it was last heard of.
+        self._heard: dict[str, int] = {}
+        # Up to which log time each recording has been measured.
+        self._reached: dict[str, Ns] = {}
+        self._series: dict[str, _Series] = {}
+        self._lately: deque[Loss] = deque(maxlen=10_000)
+        self._counted: set[str] = set()
+
+    def begun(self, recording: str) -> None:
+        """Notes that a recording begins, which may have what another one misses."""
+        self._heard[recording] = self._measured
+
+    def unclear(self, topics: Collection[str] | None = None) -> None:
+        """Notes that a split does not show what it has of these topics; None: of any."""
+        for topic in [*self._series] if topics is None else topics:
+            self._series.pop(topic, None)
+
+    def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
+        """Takes the next split of a recording; returns the losses that are certain by now."""
+        self._measured += 1
+        self._heard[recording] = self._measured
+        for topic, found in split.items():
+            reached = max(self._reached.get(recording, 0), found.positions[-1].log_time)
+            self._reached[recording] = reached
+            self._add(topic, found)
+        for name, heard in [*self._heard.items()]:
+            if self._measured - heard >= RECENT:
+                del self._heard[name]
+                self._reached.pop(name, None)
+        return self._settle(min(self._reached.get(name, 0) for name in self._heard))
+
+    def flush(self) -> list[Loss]:
+        """Returns what no further split will fill."""
+        return self._settle(MAX_NS)
+
+    def reported(self, topic: str, start: Ns, stop: Ns, lost: int) -> list[Loss]:
+        """Takes rosbag2's own count of a topic; returns it where nothing else counts the topic."""
+        if topic in self._counted:
+            return []
+        loss = Loss(topic, start, stop, lost, "rosbag2")
+        self._lately.append(loss)
+        return [loss]
+
+    def in_last_hour(self, now: Ns) -> dict[str, int]:
+        """Returns how many messages of each topic are missing of the last hour."""
+        found: dict[str, int] = {}
+        for loss in self._lately:
+            if loss.stop > now - HOUR_NS:
+                found[loss.topic] = found.get(loss.topic, 0) + loss.lost
+        return found
+
+    def _add(self, topic: str, found: Progress) -> None:
+        """Puts what a split has of a topic together with what is known of it."""
+        positions, series = found.positions, self._series.get(topic)
+        steps = enumerate(pairwise(positions), 1)
+        back = [at for at, (one, other) in steps if one.value >= other.value]
+        if len(back) > 1:  # several publishers
+            self.unclear([topic])
+            return
+        first, last = positions[0] if series is None else series.positions[0], positions[-1]
+        if back and last.value < positions[back[0] - 1].value:
+            # Its publisher began anew. Else what it had sent before came again, as latched.
+            series, positions = None, positions[back[0] :]
+        elif last.value < first.value and last.log_time > first.log_time:
+            series = None
+        known = [] if series is None else series.positions
+        by_value = dict(sorted((*known, *positions), reverse=True))
+        merged = [Position(*item) for item in sorted(by_value.items())]
+        if series is not None:
+            merged = [position for position in merged if position.value >= first.value]
+        self._series[topic] = _Series(found.kind, merged, self._measured)
+
+    def _settle(self, until: Ns) -> list[Loss]:
+        """Returns the losses up to a log time that all recordings have reached."""
+        losses: list[Loss] = []
+        for topic, series in self._series.items():
+            positions, is_over = series.positions, until == MAX_NS
+            is_over |= self._measured - series.heard >= RECENT
+            settled = max(
+                (at for at, position in enumerate(positions) if position.log_time <= until),
+                default=0,
+            )
+            found = holes(positions, series.kind)
+            if found is not None:
+                self._counted.add(topic)
+            for hole in found or ():
+                if hole.after.value > positions[settled].value:
+                    break
+                if hole.is_open and not is_over:
+                    settled = positions.index(hole.before)
+                    break
+                losses.append(
+                    Loss(
+                        topic, hole.before.log_time, hole.after.log_time, hole.missing, series.kind
+                    )
+                )
+            series.positions = positions[settled:]
+        self._lately += losses
+        return losses
+
+
+def reader_of(schema: Schema) -> tuple[Kind, Callable[[bytes], int]] | None:
+    """Returns what shows holes in messages of this type; None where nothing does.
+
+    The returned function takes a payload, and raises `struct.error` for one that does not fit.
+    """
+    if schema.encoding != "ros2msg":
+        return None
+    fields = _fields(schema.text.decode(errors="replace"))
+    before: list[str] = []
+    for kind, name in fields:
+        if name in _COUNTERS and kind in _UNSIGNED:
+            return "counter", partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+        if kind not in {"string", *_SIZES, *_HEADERS, *_TIMES}:
+            break
+        before.append(kind)
+    if fields and fields[0][0] in _HEADERS:
+        return "stamps", _stamp
+    return None
+
+
+def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
+    """Returns the holes between messages, in the order of their positions.
+
+    None where no cadence is to be seen, so that nothing can be expected: few messages, irregular
+    ones, or several publishers.
+
+    A message that was stamped late leaves a wide step, too, but then the next ones follow in a
+    burst. So what counts is how far behind the cadence the messages after the step remain.
+    """
+    if len(positions) < FEWEST:
+        return None
+    if sum(one.value >= other.value for one, other in pairwise(positions)) > 1:
+        return None
+    steps = [(one, other, other.value - one.value) for one, other in pairwise(positions)]
+    lengths = [length for _, _, length in steps if length > 0]
+    usual = 1 if kind == "counter" else median_low(lengths or [0])
+    allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
+    regular = [length for length in lengths if abs(length - usual) <= allowed]
+    if usual <= 0 or len(regular) < REGULAR * len(steps):
+        return None
+    period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
+    found: list[Hole] = []
+    for index, (one, other, length) in enumerate(steps):
+        missing = round(length / period) - 1
+        wide = length > (2 - _TOLERANCE) * period
+        short = other.log_time - one.log_time <= LONGEST_NS and missing <= MOST_MISSING
+        if not (wide and short):
+            continue
+        enough = 1 if kind == "counter" else missing + FEWEST
+        later = positions[index + 1 : index + 1 + enough]
+        behind = min(each.value - nth * period for nth, each in enumerate(later, 1)) - one.value
+        if (missing := round(behind / period)) > 0:
+            found.append(Hole(one, other, missing, len(later) < enough))
+    return found
+
+
+def _fields(text: str) -> list[tuple[str, str]]:
+    """Returns type and name of each field of the message itself."""
+    found: list[tuple[str, str]] = []
+    for raw in text.splitlines():
+        line = raw.partition("#")[0].strip()
+        if line.startswith("==="):
+            break
+        words = line.split()
+        if len(words) >= 2 and "=" not in "".join(words[1:3]):
+            found.append((words[0], words[1]))
+    return found
+
+
+def _stamp(payload: bytes) -> int:
+    seconds, nanoseconds = struct.unpack_from("<iI", payload, 4)
+    return int(seconds) * NS_PER_S + int(nanoseconds)
+
+
+def _counter(payload: bytes, before: Sequence[str], form: str) -> int:
+    at = 0
+    for kind in before:
+        if kind in _SIZES:
+            at = _aligned(at, _SIZES[kind]) + _SIZES[kind]
+            continue
+        at = _aligned(at, 4)
+        if kind != "string":
+            at += 8
+        if kind == "string" or kind in _HEADERS:
+            at += 4 + int(struct.unpack_from("<I", payload, 4 + at)[0])
+    return int(struct.unpack_from(form, payload, 4 + _aligned(at, struct.calcsize(form)))[0])
+
+
+def _aligned(at: int, size: int) -> int:
+    return -(-at // size) * size
+
+
+HOLD_S: Final = 2.0
+"""A queue holds what arrives within so many seconds."""
+MESSAGE_BYTES: Final = 256
+"""What a queued message takes besides its payload, in bytes: sample, change and allocation."""
+
+# Enumerations are numbers up to Iron (rmw/types.h), names since.
+_RELIABLE: Final = frozenset({"reliable", 1})
+_LATCHED: Final = frozenset({"transient_local", 1})
+
+
+@dataclass(frozen=True, slots=True)
+class OfferedQos:
+    """What all publishers of a topic offer: `reliable`, and `latched` (transient local)."""
+
+    reliable: bool
+    latched: bool
+    publishers: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFlow:
+    """How a topic arrives.
+
+    Attributes:
+        offered: what all of its publishers offer.
+        burst: the most messages within `HOLD_S`.
+        largest: the largest payload in bytes.
+    """
+
+    offered: OfferedQos
+    burst: int
+    largest: int
+
+    @property
+    def message_bytes(self) -> int:
+        """What one of its messages may take in a queue, in bytes."""
+        return self.largest + MESSAGE_BYTES
+
+    def joined(self, newer: TopicFlow) -> TopicFlow:
+        """Returns the newer flow, with peaks of this one that fade by a tenth with each split."""
+        return TopicFlow(
+            newer.offered,
+            max(newer.burst, self.burst * 9 // 10),
+            max(newer.largest, self.largest * 9 // 10),
+        )
+
+
+def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
+    """Returns what all publishers offer, by rosbag2's `offered_qos_profiles` in one bag.
+
+    Best effort if any publisher is, volatile if any is; None where the texts list no publisher, as
+    those of other programs.
+    """
+    profiles: list[Mapping[str, object]] = []
+    for text in texts:
+        try:
+            listed: object = yaml.safe_load(text)
+        except yaml.YAMLError:
+            return None
+        if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+            return None
+        profiles += listed
+    if not profiles:
+        return None
+    return OfferedQos(
+        reliable=all(each.get("reliability") in _RELIABLE for each in profiles),
+        latched=all(each.get("durability") in _LATCHED for each in profiles),
+        publishers=len(profiles),
+    )
+
 
 SPLIT_BYTES: Final = 64 * 2**20
 """Of a larger split only the last seconds are measured, and no holes, to spare the processor."""

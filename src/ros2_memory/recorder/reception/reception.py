@@ -13,19 +13,17 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
+import yaml
 
 from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import counted, listed
-from ros2_memory.recorder.reception.losses import LossCounter
-from ros2_memory.recorder.reception.measure import Arrivals, measure_split
-from ros2_memory.recorder.reception.profiles import (
-    QueuePlan,
+from ros2_memory.recorder.reception.measure import (
+    Arrivals,
+    LossCounter,
     TopicFlow,
-    plan_queues,
-    qos_overrides,
-    too_shallow_topics,
+    measure_split,
 )
 
 if TYPE_CHECKING:
@@ -35,6 +33,111 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Loss
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
+
+DEFAULT_DEPTH: Final = 10
+"""The depth with which rosbag2 subscribes by itself."""
+HEADROOM: Final = 2
+"""Queues are made so many times as deep as measured, where memory allows."""
+
+
+@dataclass(frozen=True, slots=True)
+class QueuePlan:
+    """The depth of each queue. `cut_short` hold less than `HOLD_S`, for want of memory."""
+
+    depths: Mapping[str, int]
+    cut_short: frozenset[str] = frozenset()
+
+    def depth(self, topic: str) -> int:
+        """Returns the depth of a topic's queue; without a plan it is rosbag2's own."""
+        return self.depths.get(topic, DEFAULT_DEPTH)
+
+
+def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
+    """Returns depths that hold `HOLD_S` of each topic and together take at most `queue_bytes`.
+
+    Where that is not enough, no topic takes more than an equal share of what the smaller ones
+    leave. At least one message of each is held, however large.
+    """
+    depths: dict[str, int] = {}
+    for factor in (HEADROOM, 1):
+        depths = {topic: max(DEFAULT_DEPTH, factor * flow.burst) for topic, flow in flows.items()}
+        if (
+            sum(depth * flows[topic].message_bytes for topic, depth in depths.items())
+            <= queue_bytes
+        ):
+            return QueuePlan(depths)
+    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
+    # One message of each, and shares of what is then left.
+    left, topics = queue_bytes - sum(each.message_bytes for each in flows.values()), len(wanted)
+    for topic in sorted(wanted, key=lambda each: wanted[each] * flows[each].message_bytes):
+        size = flows[topic].message_bytes
+        more = min(wanted[topic] - 1, max(0, left) // topics // size)
+        depths[topic] = 1 + more
+        left -= more * size
+        topics -= 1
+    short = frozenset(topic for topic, depth in depths.items() if depth < flows[topic].burst)
+    return QueuePlan(depths, short)
+
+
+def too_shallow_topics(
+    flows: Mapping[str, TopicFlow], planned: QueuePlan, active: QueuePlan
+) -> frozenset[str]:
+    """Returns the topics whose queues hold less than `HOLD_S`, and would be deeper as planned."""
+    return frozenset(
+        topic
+        for topic, flow in flows.items()
+        if active.depth(topic) < flow.burst and active.depth(topic) < planned.depth(topic)
+    )
+
+
+def qos_overrides(
+    flows: Mapping[str, TopicFlow],
+    plan: QueuePlan,
+    *,
+    latched: Collection[str],
+    weakest: Collection[str] = (),
+    volatile: Collection[str] = (),
+) -> str:
+    """Returns YAML for `--qos-profile-overrides-path`.
+
+    Args:
+        flows: the topics whose QoS is known.
+        plan: the depths of their queues.
+        latched: the topics that count as latched and may have many publishers. All of their
+            messages are asked for, unless their publishers are known to be volatile, or it is one
+            of `volatile`.
+        weakest: topics with a publisher that was refused. They are asked for with what fits every
+            publisher: rosbag2 itself asks for more where it knows none of them yet.
+        volatile: topics whose earlier messages are not asked for again, though they are latched.
+    """
+    profiles: dict[str, dict[str, str | int]] = {
+        topic: {
+            "history": "keep_last",
+            "depth": DEFAULT_DEPTH,
+            "reliability": "best_effort",
+            "durability": "volatile",
+        }
+        for topic in weakest
+    }
+    for topic, flow in flows.items():
+        profiles[topic] = {
+            "history": "keep_last",
+            "depth": plan.depth(topic),
+            "reliability": "reliable" if flow.offered.reliable else "best_effort",
+            "durability": (
+                "transient_local" if flow.offered.latched and topic not in volatile else "volatile"
+            ),
+        }
+    for topic in latched:
+        if topic not in flows or (flows[topic].offered.latched and topic not in volatile):
+            reliable = topic not in flows or flows[topic].offered.reliable
+            profiles[topic] = {
+                "history": "keep_all",
+                "reliability": "reliable" if reliable else "best_effort",
+                "durability": "transient_local",
+            }
+    return yaml.safe_dump(profiles, sort_keys=True)
+
 
 DEEPEN_EVERY_S: Final = 60.0
 """At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.retention.foreign import Foreign
+    from ros2_memory.retention.inventory import Foreign
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""

@@ -65,6 +65,8 @@ from ros2_memory.storage.mcap.chunk import (
 )
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
+    Chunk,
+    DoubtError,
     McapIndex,
     chunk_columns,
     chunk_data,
@@ -81,7 +83,6 @@ from ros2_memory.storage.mcap.records import (
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
-from ros2_memory.storage.mcap.summary import Chunk, DoubtError
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
@@ -429,7 +430,10 @@ class McapBags:
                     data = last_used(chunk)
             except UnreadableError as error:
                 lost = self._lost(file, chunk, wanted, window, str(error))
-                return _lost_row(lost, newest_first=newest_first) if lost else None
+                if lost is None:
+                    return None
+                at = lost.last if newest_first else lost.first
+                return Rows([at], [0], lambda _place, _time: lost)
             columns = self._chunk_columns(file, chunk, wanted, data)
             column = joined([each.between(window.start, window.stop) for each in columns])
             if not column.times.size:
@@ -741,10 +745,6 @@ def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
     for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
         if after.end < before.start:
             yield from (before, after)
-
-
-def _lost_row(lost: LostError, *, newest_first: bool) -> Rows[Record | LostError]:
-    return Rows([lost.last if newest_first else lost.first], [0], lambda _place, _time: lost)
 
 
 def _rows(

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
     from ros2_memory.storage.mcap.chunk import Column
-    from ros2_memory.storage.mcap.summary import Chunk
+    from ros2_memory.storage.mcap.index import Chunk
     from ros2_memory.storage.zstd_bag import Uncompressed
 
 MAX_GROUP_CHUNKS: Final = 4096

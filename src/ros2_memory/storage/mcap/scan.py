@@ -25,6 +25,7 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.mcap.chunk import ChunkOpener, column_of
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
+    Chunk,
     McapIndex,
     add_column,
     beyond_disorder,
@@ -38,7 +39,6 @@ from ros2_memory.storage.mcap.records import (
     file_records,
     statistics,
 )
-from ros2_memory.storage.mcap.summary import Chunk
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -17,10 +17,9 @@ from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
-from ros2_memory.storage.mcap.embedded import retold
 from ros2_memory.storage.mcap.records import is_finished
-from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage
-from ros2_memory.storage.sqlite_cut import cut_sqlite
+from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, retold
+from ros2_memory.storage.sqlite_bag import cut_sqlite
 from ros2_memory.typestore import full_name
 
 if TYPE_CHECKING:

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
-from ros2_memory.recorder.memory.rounding import rounded
 from ros2_memory.recorder.memory.thinning import (
     EXTREMES_NS,
     MINUTE_NS,
     STANDING_NS,
     TopicThinning,
     is_said,
+    rounded,
 )
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, detections, make, odom, text, write_mcap

@@ -7,12 +7,13 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.process.environment import (
+from ros2_memory.recorder.process.installation import (
     advice_on_rmw,
     advice_on_silence,
     advice_on_users,
+    find_installation,
+    setup_files_here,
 )
-from ros2_memory.recorder.process.installation import find_installation, setup_files_here
 
 NOTHING = {"PATH": "/nonexistent"}
 

@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from ros2_memory.recorder.reception import measure
-from ros2_memory.recorder.reception.measure import burst_of, measure_split
-from ros2_memory.recorder.reception.profiles import OfferedQos
+from ros2_memory.recorder.reception.measure import OfferedQos, burst_of, measure_split
 from ros2_memory.recorder.reception.reception import (
     ASK_AGAIN_S,
     DEEPEN_EVERY_S,

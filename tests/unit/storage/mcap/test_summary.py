@@ -10,8 +10,7 @@ from mcap.opcode import Opcode
 
 from ros2_memory.storage.errors import UnreadableError
 from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.mcap.index import index_from_summary
-from ros2_memory.storage.mcap.summary import DoubtError, read_summary
+from ros2_memory.storage.mcap.index import DoubtError, index_from_summary, read_summary
 from tests.support.bags import boolean, text, write_mcap
 from tests.support.mcap_surgery import SMALL, chunks_of, edit_summary
 
