@@ -5,7 +5,6 @@ Nothing here looks at a message or asks the memory. Times of answers are Unix se
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -244,8 +243,3 @@ class _Asker:
         answer = (unix(mine[0].start), unix(mine[-1].end))
         text = f"When did you first begin and last end {when}: {name}?"
         return Question(ENDS, text, answer, name, day)
-
-
-def has_word(word: str, text: str) -> bool:
-    """Returns whether a text has a word, or words in a row, as a whole."""
-    return re.search(rf"(?<!\w){re.escape(word)}(?!\w)", text, re.IGNORECASE) is not None
