@@ -37,8 +37,6 @@ ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
 _JOINED_AGAIN_S: Final = 5.0
 """Least time between two looks into the lake for a robot that is asked for and not known."""
-LAKE_REFRESH_S: Final = 60.0
-"""How old what is known of a lake may be: at most one commit of a table is made in this time."""
 
 
 def build_fleet(settings: Settings) -> Fleet | None:
@@ -103,11 +101,10 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
     bag_dir = settings.fleet.robots.get(name)
     if lake is None:
         return Robot(name, own.recording.bag_dir, mounted)
-    from ros2_memory.lake.reader import lake_memory
+    from ros2_memory.lake.memory import LakeIndex, lake_memory
 
     shipped = lake_memory(
-        lake,
-        name,
+        LakeIndex(lake, name, WallClock()),
         WallClock(),
         limits,
         extractor=shared.extractor,
@@ -115,7 +112,6 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         large=shared.large,
         store=build_columns_of_lake(own, name, shared.reader),
         settings=reading_of(own, shared.schemas),
-        refresh_s=LAKE_REFRESH_S,
     )
     if bag_dir is None:
         return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)

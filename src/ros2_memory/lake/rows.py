@@ -12,7 +12,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -43,7 +43,6 @@ from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
-    from datetime import date
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -51,7 +50,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
-    from ros2_memory.lake.tables import Row
+    from ros2_memory.lake.tables import Row, ShippedBag
     from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Batch, Channel, Record
 
@@ -67,34 +66,6 @@ _LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
 _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
-
-
-class ShippedBag(NamedTuple):
-    """The columns of `bags` that identify a bag.
-
-    Attributes:
-        robot: its name.
-        bag_id: see `bag_id_of`.
-        day: (UTC) of its start.
-        file: its path below the bag directory.
-        size: of its file (bytes).
-        sha256: of the bytes of its file, in hexadecimal.
-        mtime_ns: of its file.
-        made_of: see `made_of`.
-        start_ns: log time of its first message.
-        end_ns: of its last one.
-    """
-
-    robot: str
-    bag_id: str
-    day: date
-    file: str
-    size: int
-    sha256: str
-    mtime_ns: Ns
-    made_of: str
-    start_ns: Ns
-    end_ns: Ns
 
 
 def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:

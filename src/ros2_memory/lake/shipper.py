@@ -32,8 +32,8 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.lake.forgetting import Tombstone, append_tombstone, forget_in_lake
-from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, of_bags, overlapping
+from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
 from ros2_memory.lake.upkeep import compact, expire
 
 if TYPE_CHECKING:
