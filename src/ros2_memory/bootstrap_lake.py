@@ -100,7 +100,7 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     opened.callback(gc.unfreeze)
     opened.callback(engine.close)
     catalog = opened.enter_context(location.opened())
-    return Lake(catalog, engine, location.namespace, location.translated)
+    return Lake(catalog, engine, location.translated)
 
 
 def engine_of(node: DuckdbNode) -> LakeEngine:

@@ -8,7 +8,7 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, InitVar, dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
@@ -31,10 +31,9 @@ from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
-from ros2_memory.lake.forgetting import Tombstone, append_tombstone, forget_in_lake
 from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
 from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
-from ros2_memory.lake.upkeep import compact, expire
+from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -119,6 +118,7 @@ class _Ready(NamedTuple):
     replaced: Sequence[ShippedBag]
 
 
+@dataclass(eq=False, repr=False)
 class Shipper:
     """Ships the bags of several robots into one lake, whose lock the caller holds.
 
@@ -133,25 +133,22 @@ class Shipper:
         most_bags: of one commit.
     """
 
-    def __init__(
-        self,
-        lake: LakeTables,
-        robots: Sequence[RobotBags],
-        clock: Clock,
-        *,
-        messages: Sequence[str] = (),
-        tombstones: Collection[Tombstone] = (),
-        pause: Callable[[], object] = lambda: None,
-        alive: Callable[[], object] = lambda: None,
-        most_bags: int = MOST_BAGS,
-    ) -> None:
-        self._lake = lake
-        self._clock = clock
-        self._tombstones = set(tombstones)
-        self._pause = pause
-        self._alive = alive
-        self._most_bags = most_bags
-        self._robots = [_OneRobot(robot, lake, clock, messages) for robot in robots]
+    lake: LakeTables
+    robots: Sequence[RobotBags]
+    clock: Clock
+    _: KW_ONLY
+    messages: Sequence[str] = ()
+    tombstones: InitVar[Collection[Tombstone]] = ()
+    pause: Callable[[], object] = lambda: None
+    alive: Callable[[], object] = lambda: None
+    most_bags: int = MOST_BAGS
+
+    def __post_init__(self, tombstones: Collection[Tombstone]) -> None:
+        """Knows nothing yet of what the robots have."""
+        self._tombstones = {*tombstones}
+        self._robots = [
+            _OneRobot(robot, self.lake, self.clock, self.messages) for robot in self.robots
+        ]
 
     def run(self) -> Shipped:
         """Ships what is new: one pass over all robots.
@@ -163,10 +160,10 @@ class Shipper:
         batch: list[_Ready] = []
         rows = 0
         for one in [one for one in self._robots if self._forget(one.robot, done)]:
-            for ready in one.ready(self._tombstones, self._alive, done):
+            for ready in one.ready(self._tombstones, self.alive, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
-                if len(batch) >= self._most_bags or rows >= MOST_ROWS:
+                if len(batch) >= self.most_bags or rows >= MOST_ROWS:
                     self._commit(batch, done)
                     batch, rows = [], 0
         if batch:
@@ -179,9 +176,9 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be read or written.
         """
-        now = self._clock.now()
-        compact(self._lake, now, self._alive)
-        expire(self._lake, now - grace if grace else MAX_NS)
+        now = self.clock.now()
+        compact(self.lake, now, self.alive)
+        expire(self.lake, now - grace if grace else MAX_NS)
 
     def _forget(self, robot: RobotBags, done: Shipped) -> bool:
         """Forgets what the robot's bag directory asks for; returns whether that is known.
@@ -199,10 +196,10 @@ class Shipper:
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self._tombstones]
         for tombstone in new:
-            append_tombstone(self._lake.location.state_dir, tombstone, done=False)
+            append_tombstone(self.lake.location.state_dir, tombstone, done=False)
         for tombstone in new:
-            self._alive()
-            gone = forget_in_lake(self._lake, tombstone)
+            self.alive()
+            gone = forget_in_lake(self.lake, tombstone)
             done.forgotten += gone.bags
             done.problems += [
                 f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
@@ -224,7 +221,7 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
-        self._pause()
+        self.pause()
         bags = [bag for ready in batch for bag in (ready.bag, *ready.replaced)]
         # Few files have to be looked at for it.
         condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
@@ -233,7 +230,7 @@ class Shipper:
             for name, table in TABLES.items():
                 filled = table.filled([row for ready in batch for row in ready.rows[name]])
                 rows += filled.num_rows
-                self._lake.replace(name, condition, filled)
+                self.lake.replace(name, condition, filled)
         except LakeError:
             self._look_again()
             raise
@@ -244,6 +241,7 @@ class Shipper:
             one.shipped([ready for ready in batch if ready.of is one], done)
 
 
+@dataclass(eq=False, repr=False)
 class _OneRobot:
     """What is to be shipped of one robot, and what is known of the bags that it has.
 
@@ -251,14 +249,14 @@ class _OneRobot:
     neither those that it had: a hub runs for years.
     """
 
-    def __init__(
-        self, robot: RobotBags, lake: LakeTables, clock: Clock, messages: Sequence[str]
-    ) -> None:
-        self.robot = robot
-        self._lake = lake
-        self._clock = clock
-        self._messages = messages
-        self._may_write = True
+    robot: RobotBags
+    lake: LakeTables
+    clock: Clock
+    messages: Sequence[str]
+    may_write: bool = True
+
+    def __post_init__(self) -> None:
+        """Knows nothing yet."""
         self.look_again()
 
     def look_again(self) -> None:
@@ -305,12 +303,14 @@ class _OneRobot:
                 of_file = by_file.get(shipped.file)
                 if of_file is not None and self._is_cut(of_file, bag):
                     continue
-                rows = rows_of(robot.memory, bag, shipped, self._messages)
+                rows = rows_of(robot.memory, bag, shipped, self.messages)
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{robot.name}: {error}")
                 continue
             replaced = {before} if before is not None else set()
-            if of_file is not None and _holds(of_file, shipped):
+            # As where its first messages were deleted by request: what is left lies within it.
+            start, end = shipped.start_ns, shipped.end_ns
+            if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
                 replaced.add(of_file)
             yield _Ready(self, shipped, rows, [*replaced])
         self._confirm(confirmed, done)
@@ -354,7 +354,7 @@ class _OneRobot:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
             of_time = overlapping(self.robot.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
-            for row in self._lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
+            for row in self.lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
                 self._known.setdefault(row["bag_id"], ShippedBag(**row))
 
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
@@ -404,7 +404,7 @@ class _OneRobot:
             size=bag.size,
             sha256=before.sha256 if before is not None and is_read else sha256_of(bag.path),
             mtime_ns=bag.mtime_ns,
-            made_of=made_of(robot.memory, bag, robot.config, self._messages),
+            made_of=made_of(robot.memory, bag, robot.config, self.messages),
             start_ns=bag.start,
             end_ns=bag.end,
         )
@@ -421,7 +421,7 @@ class _OneRobot:
 
     def _confirm(self, bags: Sequence[ShippedBag], done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
-        robot, lake = self.robot, self._lake.lake_id
+        robot, lake = self.robot, self.lake.lake_id
         if not has_recorded(robot.bag_dir):
             return
         try:
@@ -429,18 +429,18 @@ class _OneRobot:
                 self._receipts = read_receipts(robot.bag_dir)
             known = self._receipts
             missing = [
-                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self._clock.now())
+                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self.clock.now())
                 for bag in bags
                 if not (is_shipped(known, bag.file, bag.size) and known[bag.file].lake == lake)
             ]
             if missing:
                 append_receipts(robot.bag_dir, missing)
                 known.update((receipt.bag, receipt) for receipt in missing)
-            self._may_write = True
+            self.may_write = True
         except OSError as error:
-            if self._may_write:
+            if self.may_write:
                 log.warning("receipts_not_written", robot=robot.name, reason=str(error))
-            self._may_write = False
+            self.may_write = False
             done.problems.append(
                 f"{robot.name}: no receipts can be written into {robot.bag_dir} "
                 f"({error.strerror or error}): its recorder cannot wait for shipping"
@@ -450,11 +450,3 @@ class _OneRobot:
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:
     """Returns whether the rows of a bag would be the same; a copy has another path and mtime."""
     return before == now._replace(mtime_ns=before.mtime_ns, file=before.file)
-
-
-def _holds(old: ShippedBag, new: ShippedBag) -> bool:
-    """Returns whether a bag of the same path is an older state of another one.
-
-    As where its first messages were deleted by request: what is left lies within it.
-    """
-    return old.start_ns <= new.start_ns and new.end_ns <= old.end_ns

@@ -233,10 +233,12 @@ def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
-    bounds = And(
-        _is(GreaterThanOrEqual, "bag_id", min(ids)), _is(LessThanOrEqual, "bag_id", max(ids))
+    return And(
+        _is(EqualTo, "robot", robot),
+        _is(GreaterThanOrEqual, "bag_id", min(ids)),
+        _is(LessThanOrEqual, "bag_id", max(ids)),
+        _is(In, "bag_id", ids),
     )
-    return And(_is(EqualTo, "robot", robot), bounds, _is(In, "bag_id", ids))
 
 
 def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
@@ -263,14 +265,12 @@ def overlapping(
     return And(of_robot, _is(In, "topic", topics)) if topics else of_robot
 
 
-def open_tables(
-    catalog: IcebergCatalog, names: Iterable[str], namespace: str = NAMESPACE
-) -> dict[str, IcebergTable]:
+def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
     """Returns tables by name; makes those that are missing, and adds columns that are new."""
-    catalog.create_namespace_if_not_exists(namespace)
+    catalog.create_namespace_if_not_exists(NAMESPACE)
     found: dict[str, IcebergTable] = {}
     for name in names:
-        table, identifier = TABLES[name], f"{namespace}.{name}"
+        table, identifier = TABLES[name], f"{NAMESPACE}.{name}"
         try:
             opened = catalog.load_table(identifier)
         except NoSuchTableError:

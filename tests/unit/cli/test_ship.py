@@ -15,8 +15,8 @@ from ros2_memory import bootstrap_lake, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
-from ros2_memory.lake.forgetting import TOMBSTONES_FILE
 from ros2_memory.lake.lease import WarehouseLease, writing_alone
+from ros2_memory.lake.upkeep import TOMBSTONES_FILE
 from tests.support.fleets import seeded, write_robot
 from tests.support.lakes import lake_column
 
