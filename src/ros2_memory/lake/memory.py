@@ -7,7 +7,7 @@ import json
 import threading
 from bisect import bisect_right
 from collections import Counter
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
 from operator import attrgetter
@@ -124,6 +124,7 @@ def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date 
     return found, order[begin - 1] if begin else None
 
 
+@dataclass(eq=False, repr=False)
 class LakeIndex:
     """What a lake has of one robot, as of some seconds ago. Thread-safe.
 
@@ -131,39 +132,31 @@ class LakeIndex:
     have the paths that they had on the robot. Which messages count at a handover was decided when
     they were shipped.
 
-    Args:
+    Attributes:
         lake: the lake.
         robot: its name there.
         clock: the wall clock.
         refresh_s: how old (s) the index may be: at most one commit of a table is made meanwhile.
         days: how many days are looked at together, at least: the newest; more of few bags.
         most_bags: so many bags at most, where that is more days.
-
-    Attributes:
-        bag_dir: names no directory.
-        lake: see above; likewise `robot`.
+        bag_dir: names no directory that there is.
     """
 
-    def __init__(
-        self,
-        lake: Lake,
-        robot: str,
-        clock: Clock,
-        *,
-        refresh_s: float = 60.0,
-        days: int = 31,
-        most_bags: int = MOST_BAGS,
-    ) -> None:
-        self.bag_dir = Path("/") / robot
-        self.lake = lake
-        self.robot = robot
-        self._clock = clock
-        self._refresh_s = refresh_s
-        self._fewest_days = days
-        self._most_bags = most_bags
-        self._lock = threading.Lock()
-        self._windows: dict[date, _Window] = {}
-        self._snapshot: Snapshot | None = None
+    lake: Lake
+    robot: str
+    clock: Clock
+    _: KW_ONLY
+    refresh_s: float = 60.0
+    days: int = 31
+    most_bags: int = MOST_BAGS
+    bag_dir: Path = field(init=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+    _windows: dict[date, _Window] = field(default_factory=dict, init=False)
+    _snapshot: Snapshot | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Names the directory."""
+        self.bag_dir = Path("/") / self.robot
 
     @property
     def published(self) -> Snapshot | None:
@@ -179,7 +172,7 @@ class LakeIndex:
             RefusedError: the lake cannot be read.
         """
         known = self._snapshot
-        if known is None or self._clock.now() - known.scanned_at > self._refresh_s * 1e9:
+        if known is None or self.clock.now() - known.scanned_at > self.refresh_s * 1e9:
             known = self.refresh()
         if reach is None or known.older is None or reach > known.older:
             return known
@@ -191,14 +184,14 @@ class LakeIndex:
     def refresh(self) -> Snapshot:
         """Looks into the lake now; what was just seen there for another robot is not old."""
         with self._lock:
-            self.lake.refresh(self._refresh_s / _LOOKS)
-            window = self._window(date.max, self._fewest_days)
+            self.lake.refresh(self.refresh_s / _LOOKS)
+            window = self._window(date.max, self.days)
             timeline = window.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
             self._snapshot = Snapshot(
                 timeline,
                 silent_topics=frozenset(silent.difference(timeline.topics())),
-                scanned_at=self._clock.now(),
+                scanned_at=self.clock.now(),
                 older=window.older,
             )
             return self._snapshot
@@ -227,7 +220,7 @@ class LakeIndex:
         """Returns the newest days up to one; only those are read of which a file is new."""
         known = self._windows.get(until, _Window())
         of_robot = self.lake.days("bags", self.robot)
-        made_of, day_before = newest(of_robot, until, self._most_bags, fewest)
+        made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
         window = replace(known, older=None if day_before is None else end_of(day_before))
         if made_of != known.made_of:
             new = {day: files for day, files in made_of.items() if known.made_of.get(day) != files}
@@ -293,23 +286,25 @@ class _Head(NamedTuple):
     has_payloads: bool
 
 
+@dataclass(eq=False, repr=False)
 class LakeReader(BagReader):
     """An adapter of `BagReader`: the bags of one robot in a lake.
 
     Messages of one time are in the order of their topics. Of images, clouds, scans and the like a
     lake has the times alone: to read their payloads is refused.
 
-    Args:
+    Attributes:
         index: its bags.
         decoder: decodes messages, as it does those of files.
         large: the turn to hold much of a bag.
     """
 
-    def __init__(self, index: LakeIndex, decoder: BagReader, large: LargeReads) -> None:
-        self._large = large
-        self._index = index
-        self._decoder = decoder
-        self._heads: ByteLru[Sequence[_Head]] = ByteLru(_HEADS_BYTES)
+    index: LakeIndex
+    decoder: BagReader
+    large: LargeReads
+    _heads: ByteLru[Sequence[_Head]] = field(
+        default_factory=lambda: ByteLru(_HEADS_BYTES), init=False
+    )
 
     def reads(self, path: Path) -> bool:
         """Returns True: all files of the index are of the lake."""
@@ -323,7 +318,7 @@ class LakeReader(BagReader):
 
     def summarize(self, path: Path) -> BagSummary:
         """Returns the summary of a bag of the index."""
-        return self._index.bag(path).file.summary
+        return self.index.bag(path).file.summary
 
     def records(
         self,
@@ -356,7 +351,7 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        here = self._index.bag(path)
+        here = self.index.bag(path)
         wanted = [head for head in self._heads_of(here) if head.channel.topic in topics]
         names = sorted({head.channel.topic for head in wanted})
         for head in wanted:
@@ -371,7 +366,7 @@ class LakeReader(BagReader):
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
             if is_large(data):
-                self._large.acquire()
+                self.large.acquire()
             try:
                 batch = unpacked_messages(data, head.channel)
             except ValueError as error:
@@ -382,24 +377,24 @@ class LakeReader(BagReader):
 
     def times_alone(self, path: Path) -> Collection[str]:
         """Returns the topics whose payloads were not shipped: their messages are large."""
-        heads = self._heads_of(self._index.bag(path))
+        heads = self._heads_of(self.index.bag(path))
         return {head.channel.topic for head in heads if not head.has_payloads}
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels of which the bag has messages."""
-        return [head.channel for head in self._heads_of(self._index.bag(path))]
+        return [head.channel for head in self._heads_of(self.index.bag(path))]
 
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded; None if its type is known."""
-        return self._decoder.undecodable(channel)
+        return self.decoder.undecodable(channel)
 
     def decode(self, record: Record) -> object:
         """Decodes a message as that of a file."""
-        return self._decoder.decode(record)
+        return self.decoder.decode(record)
 
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of a channel's messages, as of that of a file."""
-        return self._decoder.definition(channel)
+        return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
         known = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
@@ -423,7 +418,7 @@ class LakeReader(BagReader):
         With it those of other `topics` are read, which are asked for next. Who has read one bag
         and goes on, reads those beside it, too.
         """
-        messages = self._index.lake.messages
+        messages = self.index.lake.messages
         known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
         if known is None:
             beside = [messages.get((*state, number)) for state in bag.together.items()]
@@ -438,8 +433,8 @@ class LakeReader(BagReader):
     def _select(self, sql: str, bag: LakeBag, bags: list[str], **more: Sequence[str]) -> pa.Table:
         """Returns the rows of a select over the channels of some bags of a day."""
         first, last = min(bags), max(bags)
-        lake = self._index.lake
-        of_day = lake.days("channels", self._index.robot).get(bag.day, ())
+        lake = self.index.lake
+        of_day = lake.days("channels", self.index.robot).get(bag.day, ())
         files = [file for file in of_day if file.first <= last and first <= file.last]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)

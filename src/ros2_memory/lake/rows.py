@@ -12,6 +12,7 @@ import json
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -139,7 +140,7 @@ class _BagRows:
         self._memory = memory
         self._bag = bag
         self._whole = whole
-        view = View(memory, Call())
+        self._view = view = View(memory, Call())
         self._pose_topic = view.pose_topic
         self._poses = poses_of_bag(view, bag, self._pose_topic)
         self._thing = Labels(memory.limits.labels).key
@@ -189,15 +190,15 @@ class _BagRows:
 
         The first of them has the place that other rows name.
         """
-        view = View(self._memory, Call())
         window = TimeWindow(self._bag.start, self._bag.end + 1)
-        places = robot_places(view, window)
+        places = robot_places(self._view, window)
         if places is None:
             return []
-        frames = dict.fromkeys((places.map_frame, places.pose_frame))
-        tracks = [(frame, RobotTracks(view, frame).over(window).track) for frame in frames]
-        within = [(frame, cut(track, window)) for frame, track in tracks]
-        return [(frame, track) for frame, track in within if len(track.times)]
+        tracks = [
+            (frame, cut(RobotTracks(self._view, frame).over(window).track, window))
+            for frame in dict.fromkeys((places.map_frame, places.pose_frame))
+        ]
+        return [(frame, track) for frame, track in tracks if len(track.times)]
 
     def _vertices(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
@@ -207,7 +208,7 @@ class _BagRows:
             yield {**same, "time_ns": time, "x": x, "y": y, "heading": known, "begins": begins}
 
     def _things(self) -> Iterator[Row]:
-        for one in Watching(View(self._memory, Call())).in_bag(self._bag):
+        for one in Watching(self._view).in_bag(self._bag):
             for sights in one.sights:
                 for spot in sights.spots.tolist():
                     best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
@@ -229,7 +230,7 @@ class _BagRows:
     def _events(self) -> dict[str, TopicEvents]:
         """Returns the events on each topic that can have some."""
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        found = events_of_bag(View(self._memory, Call()), self._bag, topics)
+        found = events_of_bag(self._view, self._bag, topics)
         return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
 
     def _driven(self) -> Row:
@@ -261,21 +262,17 @@ class _BagRows:
         """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
         # By identity, since hashing a channel hashes its definition.
         found: dict[int, _Messages] = {}
-        size = 0
         every, window = tuple(self._types), TimeWindow.everything()
         for batch in self._memory.reader.batches(self._bag.path, every, window):
             channel = batch.channel
             if id(channel) not in found:
                 is_whole = channel.topic in self._whole
-                payloads: list[bytes] | None = (
-                    [] if is_whole or channel.type not in BULKY_TYPES else None
-                )
-                found[id(channel)] = _Messages(channel, is_whole, payloads)
-            size += found[id(channel)].add(batch)
-            droppable = [messages for messages in found.values() if not messages.is_whole]
-            while size > _MOST_BYTES and droppable:
-                largest = max(droppable, key=lambda messages: messages.size)
-                size -= largest.size
+                has_payloads = is_whole or channel.type not in BULKY_TYPES
+                found[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
+            found[id(channel)].add(batch)
+            droppable = [one for one in found.values() if one.size and not one.is_whole]
+            while droppable and sum(one.size for one in found.values()) > _MOST_BYTES:
+                largest = max(droppable, key=attrgetter("size"))
                 largest.payloads, largest.size = None, 0
                 droppable.remove(largest)
         order = sorted(found.values(), key=lambda one: (one.channel.topic, one.channel.type))
@@ -385,16 +382,13 @@ class _Messages:
     parts: list[Batch] = field(default_factory=list)
     size: int = 0
 
-    def add(self, batch: Batch) -> int:
-        """Takes more messages; returns how many bytes of payloads they have."""
+    def add(self, batch: Batch) -> None:
+        """Takes more messages."""
         # Without the buffer, in which are those of other channels.
         self.parts.append(replace(batch, buffer=b""))
-        if self.payloads is None:
-            return 0
-        self.payloads += map(batch.payload, range(batch.sizes.size))
-        size = int(batch.sizes.sum())
-        self.size += size
-        return size
+        if self.payloads is not None:
+            self.payloads += map(batch.payload, range(batch.sizes.size))
+            self.size += int(batch.sizes.sum())
 
     def row(self, number: int) -> Row:
         """Returns its row, the n-th of the bag; without payloads where these take too much."""

@@ -79,7 +79,7 @@ def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
             [robot_bags("hall", bag_dir)],
             FixedClock(LATER),
             messages=("/chatter",),
-            tombstones=read_tombstones(where.state_dir),
+            tombstones={*read_tombstones(where.state_dir)},
         ).run()
 
 

@@ -199,7 +199,7 @@ class _Shipping:
                 self.robots,
                 WallClock(),
                 messages=self.settings.lake.messages,
-                tombstones=tombstones,
+                tombstones={*tombstones},
                 pause=self._pause,
                 alive=self._alive,
             )
