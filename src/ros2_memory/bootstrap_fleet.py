@@ -15,7 +15,7 @@ from ros2_memory.bootstrap import (
     reading_of,
     shared_parts,
 )
-from ros2_memory.bootstrap_lake import open_lake, require_extra
+from ros2_memory.bootstrap_lake import open_lake
 from ros2_memory.config import NullRecorderNode, is_robot_name
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.logging_setup import get_logger
@@ -142,7 +142,7 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
     Raises:
         ConfigError: there are none, or their settings are refused.
     """
-    require_extra()
+    # The extra is there: whoever ships has asked for `lake_location`.
     from ros2_memory.lake.shipper import RobotBags
 
     if not settings.fleet.robots:

@@ -23,26 +23,17 @@ if TYPE_CHECKING:
     from ros2_memory.lake.warehouse import LakeLocation
 
 
-def require_extra() -> None:
-    """Checks that the extra `lake` is installed.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    for name in ("pyarrow", "pyiceberg"):
-        if find_spec(name) is None:
-            raise ConfigError(
-                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
-            )
-
-
 def lake_location(settings: Settings) -> LakeLocation:
     """Returns where the lake is.
 
     Raises:
         ConfigError: no warehouse is given, its secrets cannot be read, or the extra is missing.
     """
-    require_extra()
+    for name in ("pyarrow", "pyiceberg"):
+        if find_spec(name) is None:
+            raise ConfigError(
+                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
+            )
     from ros2_memory.lake.warehouse import LakeLocation, location_of
 
     lake = settings.lake

@@ -83,9 +83,12 @@ def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
 
 def id_of_file(robot: str, recording: str, file: str, first: Ns) -> str:
     """Returns the id of a bag that need not be there any more; see `bag_id_of`."""
-    name = json.dumps([robot, recording, file, first])
-    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
-    return f"{max(first, 0):016x}{digest[:16]}"
+    return f"{max(first, 0):016x}{_digest([robot, recording, file, first])}"
+
+
+def _digest(value: object) -> str:
+    """Returns half of the hash of a JSON value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def sha256_of(path: Path) -> str:
@@ -113,11 +116,9 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     among = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, among), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
-    parts = json.dumps(
-        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted],
-        sort_keys=True,
+    return _digest(
+        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted]
     )
-    return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def rows_of(
@@ -270,7 +271,7 @@ class _BagRows:
                 has_payloads = is_whole or channel.type not in BULKY_TYPES
                 found[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             found[id(channel)].add(batch)
-            droppable = [one for one in found.values() if one.size and not one.is_whole]
+            droppable = [one for one in found.values() if not one.is_whole]
             while droppable and sum(one.size for one in found.values()) > _MOST_BYTES:
                 largest = max(droppable, key=attrgetter("size"))
                 largest.payloads, largest.size = None, 0
