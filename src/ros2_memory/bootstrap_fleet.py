@@ -41,26 +41,17 @@ if TYPE_CHECKING:
 # ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
 
 
-def require_extra() -> None:
-    """Checks that the extra `lake` is installed.
-
-    Raises:
-        ConfigError: it is not.
-    """
-    for name in ("pyarrow", "pyiceberg"):
-        if find_spec(name) is None:
-            raise ConfigError(
-                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
-            )
-
-
 def lake_location(settings: Settings) -> LakeLocation:
     """Returns where the lake is.
 
     Raises:
         ConfigError: no warehouse is given, its secrets cannot be read, or the extra is missing.
     """
-    require_extra()
+    for name in ("pyarrow", "pyiceberg"):
+        if find_spec(name) is None:
+            raise ConfigError(
+                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
+            )
     from ros2_memory.lake.warehouse import LakeLocation, location_of
 
     lake = settings.lake
@@ -118,7 +109,7 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     opened.callback(gc.unfreeze)
     opened.callback(engine.close)
     catalog = opened.enter_context(location.opened())
-    return Lake(catalog, engine, location.namespace, location.translated)
+    return Lake(catalog, engine, location.translated)
 
 
 def engine_of(node: DuckdbNode) -> LakeEngine:
@@ -146,8 +137,6 @@ ROBOTS_SETTING: Final = "fleet.robots"
 """The setting that names the bags of robots."""
 _JOINED_AGAIN_S: Final = 5.0
 """Least time between two looks into the lake for a robot that is asked for and not known."""
-LAKE_REFRESH_S: Final = 60.0
-"""How old what is known of a lake may be: at most one commit of a table is made in this time."""
 
 
 def build_fleet(settings: Settings) -> Fleet | None:
@@ -212,11 +201,10 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
     bag_dir = settings.fleet.robots.get(name)
     if lake is None:
         return Robot(name, own.recording.bag_dir, mounted)
-    from ros2_memory.lake.reader import lake_memory
+    from ros2_memory.lake.memory import LakeIndex, lake_memory
 
     shipped = lake_memory(
-        lake,
-        name,
+        LakeIndex(lake, name, WallClock()),
         WallClock(),
         limits,
         extractor=shared.extractor,
@@ -224,7 +212,6 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         large=shared.large,
         store=build_columns(own, shared.reader, of_lake=name),
         settings=reading_of(own, shared.schemas),
-        refresh_s=LAKE_REFRESH_S,
     )
     if bag_dir is None:
         return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)
@@ -255,7 +242,7 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
     Raises:
         ConfigError: there are none, or their settings are refused.
     """
-    require_extra()
+    # The extra is there: whoever ships has asked for `lake_location`.
     from ros2_memory.lake.shipper import RobotBags
 
     if not settings.fleet.robots:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
 import signal
 from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
+from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, SummaryOffset
+from mcap.stream_reader import breakup_chunk
 from rosbags.highlevel import AnyReader
 
 from tests.integration.ros_recordings import (
@@ -20,6 +23,7 @@ from tests.integration.ros_recordings import (
     is_closed,
     messages,
     metadata,
+    records,
     summary_of,
 )
 from tests.support.ros_processes import (
@@ -141,6 +145,21 @@ def test_every_published_message_is_recorded_once(session: Session) -> None:
         assert dict(found) == session.published
 
 
+def test_what_is_recorded_is_what_the_closed_form_says(session: Session) -> None:
+    with AnyReader([session.small.directory]) as reader:
+        odometry = [c for c in reader.connections if c.topic == "/odom"]
+        read: list[Any] = [
+            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(odometry)
+        ]
+    assert len(read) == session.published["/odom"]
+    for tick, message in enumerate(read):
+        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        assert stamp == session.t0 + tick * 50_000_000
+        at = message.pose.pose.position
+        assert math.isclose(math.hypot(at.x, at.y - 2.0), 2.0)
+        assert math.isclose(at.x, 2.0 * math.sin(tick / 80), abs_tol=1e-12)
+
+
 def test_the_types_that_have_no_wheel_can_be_read_as_themselves(session: Session) -> None:
     with AnyReader([session.small.directory]) as reader:
         vision = [c for c in reader.connections if c.topic == "/vision/scene/scene_objects"]
@@ -233,6 +252,50 @@ def test_metadata_yaml_states_what_the_files_hold(session: Session) -> None:
 
 
 @needs_recorded
+def test_a_file_is_built_as_the_real_ones_are(session: Session) -> None:
+    for number, real in ((0, "session_mcap/session_mcap_0"), (1, "session_mcap/session_mcap_1")):
+        own_file, real_file = session.default.splits()[number], RECORDED / f"{real}.mcap"
+        assert skeleton(own_file) == skeleton(real_file)
+        assert declares_once(real_file)
+        assert declares_once(own_file)
+    # The second one's summary has the latched topic, of which it holds no message.
+    own = summary_of(session.default.splits()[1])
+    assert own.statistics is not None
+    assert own.statistics.channel_count == len(own.channels) - 1
+
+
+@needs_recorded
+def test_chunks_are_compressed_as_in_the_real_ones(session: Session) -> None:
+    for split in session.small.splits():
+        chunks = summary_of(split).chunk_indexes
+        assert all(
+            chunk.compression == ("zstd" if chunk.uncompressed_size >= 1024 else "")
+            for chunk in chunks
+        )
+        assert len(chunks) > 2
+    assert skeleton(session.small.splits()[0]) == skeleton(
+        RECORDED / "session_killed_chunk64k" / "session_killed_chunk64k_0.mcap"
+    )
+
+
+@needs_recorded
+def test_channels_and_schemas_are_those_of_the_real_ones(session: Session) -> None:
+    own = summary_of(session.default.splits()[0])
+    real = summary_of(RECORDED / "session_mcap" / "session_mcap_0.mcap")
+    real_channels = {channel.topic: channel for channel in real.channels.values()}
+    for channel in own.channels.values():
+        same = real_channels[channel.topic]
+        assert channel.message_encoding == same.message_encoding
+        assert channel.metadata == same.metadata
+        schema, real_schema = own.schemas[channel.schema_id], real.schemas[same.schema_id]
+        assert (schema.name, schema.encoding) == (real_schema.name, real_schema.encoding)
+        # Distributions differ in their comments.
+        assert fields(schema) == fields(real_schema)
+        if schema.name in {"std_msgs/msg/Bool", "geometry_msgs/msg/Twist"}:
+            assert schema.data == real_schema.data
+
+
+@needs_recorded
 def test_metadata_has_the_shape_of_the_real_one(session: Session) -> None:
     real = metadata(RECORDED / "session_mcap")
     assert shape(metadata(session.default.directory)) == shape(real)
@@ -261,6 +324,40 @@ def test_channel_ids_differ_between_the_splits_of_one_recording(session: Session
     assert ids[0] != ids[1]
 
 
+def skeleton(file: Path) -> list[object]:
+    """The kinds of records in their order, runs taken together, and what is fixed in them."""
+    found: list[object] = []
+    for record in records(file, emit_chunks=True):
+        match record:
+            case Header():
+                assert record.library
+                found.append(("Header", record.profile))
+            case Chunk():
+                found.append(("Chunk", record.uncompressed_crc))
+            case Metadata():
+                found.append(("Metadata", record.name, *record.metadata))
+            case SummaryOffset():
+                found.append(("SummaryOffset", record.group_opcode))
+            case _:
+                found.append(type(record).__name__)
+    once = [kind for kind, _ in groupby(found)]
+    chunk = [("Chunk", 0), "MessageIndex"]
+    while any(once[at : at + 4] == chunk * 2 for at in range(len(once))):
+        at = next(at for at in range(len(once)) if once[at : at + 4] == chunk * 2)
+        del once[at : at + 2]
+    return once
+
+
+def declares_once(file: Path) -> bool:
+    """Whether each schema and channel comes right before its first message, and only there."""
+    kinds = {Schema: "S", Channel: "C", Message: "M"}
+    chunks = [record for record in records(file, emit_chunks=True) if isinstance(record, Chunk)]
+    inside = [record for chunk in chunks for record in breakup_chunk(chunk)]
+    in_order = re.fullmatch(r"((S?C)?M)+", "".join(kinds[type(record)] for record in inside))
+    declared = [(type(r), r.id) for r in inside if isinstance(r, Schema | Channel)]
+    return in_order is not None and len(declared) == len(set(declared))
+
+
 def shape(value: Any) -> Any:
     """Keys and types of what YAML holds; of a list, that of its elements."""
     if isinstance(value, dict):
@@ -270,6 +367,12 @@ def shape(value: Any) -> Any:
         assert all(other == shapes[0] for other in shapes)
         return shapes[:1]
     return type(value)
+
+
+def fields(schema: Schema) -> list[str]:
+    """The definition's lines without comments."""
+    lines = (line.split("#")[0].strip() for line in schema.data.decode().splitlines())
+    return [line for line in lines if line]
 
 
 def spoken(log: str) -> list[str]:

@@ -14,6 +14,7 @@ from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 import pytest
@@ -29,16 +30,17 @@ from tests.integration.ros_recordings import (
     records,
     summary_of,
 )
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import (
     RECORDERS,
+    SHARED_MEMORY,
     installation,
     publishing_robot,
     ros_environment,
     wait_for,
 )
 from tests.support.shared_bags import RECORDED, needs_recorded
-from tests.timing import each_in_time
+from tests.timing import each_in_time, in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -76,6 +78,17 @@ STARTED = {
 }
 
 
+# All that `ros2 bag record --help` of Jazzy lists.
+JAZZY_OPTIONS = """
+    --help --output --storage --topics --services --topic-types --all --all-topics --all-services
+    --regex --exclude-regex --exclude-topic-types --exclude-topics --exclude-services
+    --include-unpublished-topics --include-hidden-topics --no-discovery --polling-interval
+    --ignore-leaf-topics --qos-profile-overrides-path --serialization-format --max-bag-size
+    --max-bag-duration --max-cache-size --disable-keyboard-controls --start-paused --use-sim-time
+    --node-name --custom-data --snapshot-mode --log-level --storage-config-file
+    --storage-preset-profile --compression-queue-size --compression-threads
+    --compression-threads-priority --compression-mode --compression-format
+"""
 # Overrides of a profile, and what they are refused with; None: they are taken.
 OVERRIDES = {
     "{reliability: reliable, durability: transient_local}": (
@@ -180,6 +193,28 @@ def test_other_signals_leave_the_recording_open(
     assert not (recording.directory / "metadata.yaml").exists()
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_at_the_very_beginning_kills_it_before_it_has_a_directory(
+    env: dict[str, str], tmp_path: Path, number: signal.Signals
+) -> None:
+    in_time(lambda: kill_at_once(env, Path(mkdtemp(dir=tmp_path)), number))
+
+
+def kill_at_once(env: dict[str, str], folder: Path, number: signal.Signals) -> None:
+    with Recording(env, folder / "a", "-e", "/odom") as recording:
+        # As these tests may, where they run in the background of a shell.
+        until(lambda: not ignores(recording.process.pid, number))
+        # 1: SIGINT came while CPython imported `site`, which it takes for a fatal error.
+        assert recording.stop(number) in {-number, 1 if number == signal.SIGINT else -number}
+    assert not recording.directory.exists()
+
+
+def ignores(pid: int, number: signal.Signals) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    (mask,) = [line.split()[1] for line in status.splitlines() if line.startswith("SigIgn:")]
+    return bool(int(mask, 16) >> (number - 1) & 1)
+
+
 def test_a_sigint_that_was_ignored_before_it_began_ends_it_all_the_same(
     started: dict[str, Recording],
 ) -> None:
@@ -229,6 +264,16 @@ def _is_past(moment: int) -> bool:
     return time.time_ns() > moment
 
 
+def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str]) -> None:
+    record = ["ros2", "bag", "record"]
+    asked = subprocess.run([*record, "--help"], env=quiet, capture_output=True, check=False)
+    assert (asked.returncode, asked.stderr) == (0, b"")
+    listed = re.findall(r"^  (?:-\w.*, )?(--[\w-]+)", asked.stdout.decode(), re.MULTILINE)
+    assert set(listed) == set(JAZZY_OPTIONS.split())
+    wrong = subprocess.run([*record, "--wrong"], env=quiet, capture_output=True, check=False)
+    assert wrong.returncode == 2
+
+
 @each_in_time
 def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
@@ -236,6 +281,24 @@ def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Pat
         assert recording.process.wait(timeout=PATIENCE_S) == 1
     said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
     assert recording.said == said
+
+
+@each_in_time
+def test_what_a_killed_recorder_leaves_in_shared_memory_is_removed_with_its_environment(
+    real: RealRecorder | None, tmp_path: Path
+) -> None:
+    with (
+        ros_environment(tmp_path, real=real) as env,
+        Recording(env, tmp_path / "a", "-e", "/odom") as recording,
+    ):
+        recording.await_said("Recording...")
+        maps = Path(f"/proc/{recording.process.pid}/maps").read_text()
+        # Its own; those named by a port it may share with other tests' recorders.
+        pattern = rf"{SHARED_MEMORY}/fast(?:rtps|dds)_[0-9a-f]{{16}}"
+        own = {Path(name) for name in re.findall(pattern, maps)}
+        recording.stop(signal.SIGKILL)
+        assert any(file.exists() for file in own)
+    assert not any(file.exists() for file in own)
 
 
 @each_in_time

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SEED = 0xC0FFEE
+KINDS = {worlds.HOME: 1, worlds.SPLITS: 12}
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +41,12 @@ def test_a_world_of_splits_has_the_stated_messages_and_one_that_the_power_ended(
     assert 1261 <= np.median(counts) <= 1361
     recordings = {path.parent for path in (splits / "bags").rglob("*.mcap")}
     assert sum(not (each / "metadata.yaml").exists() for each in recordings) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_world_is_the_same_for_the_same_seed_and_another_for_another(kind: str) -> None:
+    facts = [worlds.World(kind, seed, KINDS[kind]).facts() for seed in (SEED, SEED, SEED + 1)]
+    assert facts[0] == facts[1] != facts[2]
 
 
 @needs_real

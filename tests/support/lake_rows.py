@@ -17,10 +17,9 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.index import MOST_BAGS
-from ros2_memory.lake.reader import lake_memory
-from ros2_memory.lake.rows import ShippedBag, bag_id_of, rows_of
-from ros2_memory.lake.tables import TABLES, Row, day_of, open_tables
+from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, lake_memory
+from ros2_memory.lake.rows import bag_id_of, rows_of
+from ros2_memory.lake.tables import TABLES, Row, ShippedBag, day_of, open_tables
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.clocks import FixedClock
@@ -71,8 +70,7 @@ def lake_robots(
     lake, clock, decoder = Lake(catalog, engine), FixedClock(now), McapReader()
     return {
         name: lake_memory(
-            lake,
-            name,
+            LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags),
             clock,
             limits or QuerySettings(),
             extractor=extractor(),
@@ -80,10 +78,7 @@ def lake_robots(
             store=None
             if stores is None
             else ColumnStore([stores / name / FILE], decoder.definition),
-            refresh_s=0,
             large=LargeReads(),
-            days=days,
-            most_bags=most_bags,
         )
         for name in names
     }

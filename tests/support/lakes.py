@@ -101,7 +101,7 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
                 assert Shipper(tables, robots, FixedClock(LATER)).run().bags == shipped
     with where.opened() as catalog:
         engine = DuckdbEngine()
-        lake = Lake(catalog, engine, where.namespace, where.translated)
+        lake = Lake(catalog, engine, where.translated)
         assert lake.robots() == ["hall"]
         sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
         files = chain.from_iterable(lake.days("sightings", "hall").values())

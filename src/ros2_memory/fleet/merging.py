@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from heapq import merge
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -35,7 +34,7 @@ from ros2_memory.tools.reply_json import ROBOT_NAME
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.core.errors import EpisodicError
     from ros2_memory.core.model import JsonValue
@@ -150,8 +149,8 @@ def merged(
         max_chars: where the reply would be longer, rows for each robot are given shortly.
     """
     order = sorted(replies, key=lambda reply: (reply.is_ahead, -(reply.latest or 0), reply.name))
-    failed: JsonObject = {FAILED: {name: error.code for name, error in failures.items()}}
-    failed = failed if failures else {}
+    codes: JsonObject = {name: error.code for name, error in failures.items()}
+    failed: JsonObject = {FAILED: codes} if codes else {}
     notes = _notes_on(order, failures)
     if any("columns" in reply.body for reply in order):
         found = _one_table(order)
@@ -186,15 +185,21 @@ def _rows(
         (key for key in rule.rows for value in values.values() if key in value),
         next(iter(rule.rows)),
     )
-    newest = partial(_time_of, rule.rows[key])
-    order: Callable[[JsonObject], float] = newest if oldest_first else lambda row: -newest(row)
-    inherited = {name for name, how in rule.merging.items() if how == "inherited"}
+    time_key = rule.rows[key]
+
+    def order(row: JsonObject) -> float:
+        is_going_on = row.get(time_key, 0) is None
+        time = math.inf if is_going_on else _number(row.get(time_key))
+        return time if oldest_first else -time
+
+    names = {name for name, how in rule.merging.items() if how == "inherited"}
+    inherited = {robot: _without(value, value.keys() - names) for robot, value in values.items()}
     found: list[JsonObject] = []
     for is_ahead in (False, True):
         # Each reply is in order. A robot whose clock is ahead does not have the newest row.
         lists = [
             [
-                {ROBOT_NAME: reply.name, **_only(values[reply.name], inherited), **row}
+                {ROBOT_NAME: reply.name, **inherited[reply.name], **row}
                 for row in _list(values[reply.name].get(key))
             ]
             for reply in replies
@@ -205,7 +210,7 @@ def _rows(
     if key == MATCHES:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
-    rest = {name: _without(value, {key, *inherited}) for name, value in values.items()}
+    rest = {name: _without(value, {key, *names}) for name, value in values.items()}
     is_cut = len(found) > len(found[:limit]) or any(value.get("more") for value in values.values())
     more: JsonObject = {"more": True} if rule.marks_more and is_cut else {}
     return {**rows, **_rest(rule, replies, rest), **more}
@@ -361,10 +366,6 @@ def _without(value: JsonObject, keys: set[str]) -> JsonObject:
     return {key: item for key, item in value.items() if key not in keys}
 
 
-def _only(value: JsonObject, keys: set[str]) -> JsonObject:
-    return {key: item for key, item in value.items() if key in keys}
-
-
 def _items(reply: JsonObject, key: str) -> list[JsonValue]:
     found = reply.get(key)
     return found if isinstance(found, list) else []
@@ -376,9 +377,3 @@ def _list(value: JsonValue) -> list[JsonObject]:
 
 def _number(value: JsonValue) -> float:
     return value if isinstance(value, int | float) else 0
-
-
-def _time_of(key: str, row: JsonObject) -> float:
-    """Returns the time of a row; infinite where it is not over."""
-    value = row.get(key)
-    return math.inf if value is None and key in row else _number(value)

@@ -1,13 +1,19 @@
-"""The robots of a fleet, each with a memory of its own."""
+"""The robots of a fleet, each with a memory of its own, and one question to many of them."""
 
 from __future__ import annotations
 
+import contextvars
 import threading
-from dataclasses import dataclass
+import time
+from collections import deque
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory.core.errors import (
+    BusyError,
+    EpisodicError,
     InvalidArgumentsError,
     LakeError,
     NoDataError,
@@ -15,8 +21,10 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     RefusedError,
 )
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock
+from ros2_memory.history.context import Stages
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -27,7 +35,17 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_MOST_NAMED = 50
+_MOST_NAMED: Final = 50
+AT_ONCE: Final = 4
+"""Robots that are asked at once: most of it is Python, which runs one thread at a time."""
+_OF_ONE: Final = 0.4
+"""The part of the time of a call that one robot of several may take."""
+_OF_ALL: Final = 0.9
+"""The part that all may take together, or one alone; the rest is for merging the answers."""
+_GRACE: Final = 0.05
+"""How much later than its limit a robot counts as stuck: a disk that hangs heeds no limit."""
+
+log = get_logger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,42 +95,32 @@ class FromLake(NamedTuple):
         return (note,)
 
 
+@dataclass(eq=False, repr=False)
 class Robot:
     """One robot of a fleet. Its memory is built when it is first needed; no bag is read for that.
 
-    Args:
+    Attributes:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
         build: what builds its memory.
         lake: its memory over what was shipped to a lake.
         is_mounted: whether there is a memory besides that of the lake.
-
-    Attributes:
-        name: see above; likewise `bag_dir`, `lake` and `is_mounted`.
     """
 
-    def __init__(
-        self,
-        name: str,
-        bag_dir: Path,
-        build: Callable[[], Memory],
-        *,
-        lake: Memory | None = None,
-        is_mounted: bool = True,
-    ) -> None:
-        self.name = name
-        self.bag_dir = bag_dir
-        self.lake = lake
-        self.is_mounted = is_mounted
-        self._build = build
-        self._lock = threading.Lock()
-        self._memory: Memory | None = None
+    name: str
+    bag_dir: Path
+    build: Callable[[], Memory]
+    _: KW_ONLY
+    lake: Memory | None = None
+    is_mounted: bool = True
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+    _memory: Memory | None = field(default=None, init=False)
 
     def memory(self) -> Memory:
         """Returns the robot's memory, always the same one."""
         with self._lock:
             if self._memory is None:
-                self._memory = self._build()
+                self._memory = self.build()
             return self._memory
 
     def asked(
@@ -178,37 +186,34 @@ def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tupl
     return found, FromLake.of(lake, call)
 
 
+@dataclass(eq=False, repr=False)
 class Fleet:
     """The robots that one server answers for.
 
-    Args:
-        robots: all of them; no two have one name.
+    Attributes:
+        robots: all of them, by their names.
         clock: the wall clock, read once for a question to several.
         shared_map: whether coordinates mean the same place for all of them.
         join: returns the robots that a lake has besides those of some names, where there is one.
             It looks there, unless it did so a moment ago.
-
-    Attributes:
-        robots: by their names.
-        clock: see above.
-        shared_map: see above.
-        grows: whether robots may join.
     """
 
-    def __init__(
-        self,
-        robots: Iterable[Robot],
-        clock: Clock,
-        *,
-        shared_map: bool = False,
-        join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
-    ) -> None:
-        self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
-        self.clock = clock
-        self.shared_map = shared_map
-        self.grows = join is not None
-        self._join = join
-        self._lock = threading.Lock()
+    given: InitVar[Iterable[Robot]]
+    clock: Clock
+    _: KW_ONLY
+    shared_map: bool = False
+    join: Callable[[Collection[str]], Iterable[Robot]] | None = None
+    robots: Mapping[str, Robot] = field(init=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+
+    def __post_init__(self, given: Iterable[Robot]) -> None:
+        """Has the robots by name; no two have one."""
+        self.robots = {robot.name: robot for robot in given}
+
+    @property
+    def grows(self) -> bool:
+        """Whether robots may join."""
+        return self.join is not None
 
     def joined(self) -> Sequence[Robot]:
         """Returns the robots that were shipped to the lake for the first time since; adds them.
@@ -216,10 +221,10 @@ class Fleet:
         Raises:
             EpisodicError: the lake cannot be read.
         """
-        if self._join is None:
+        if self.join is None:
             return ()
         with self._lock:
-            found = [*self._join(self.robots)]
+            found = [*self.join(self.robots)]
             # A new dict: other threads iterate over the old one.
             self.robots = {**self.robots, **{robot.name: robot for robot in found}}
         return found
@@ -254,3 +259,110 @@ def names_of(robots: Iterable[Robot]) -> str:
     if not names:
         return "is none"
     return f"{'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"
+
+
+class FanOut:
+    """Asks robots in threads, a few at a time: each has its time limit, and none waits for one.
+
+    A robot that is stuck is not asked again until it is done.
+
+    So a hanging disk blocks one thread, however many questions follow. Thread-safe.
+    """
+
+    def __init__(self, at_once: int = AT_ONCE) -> None:
+        self._at_once = at_once
+        self._is_done: dict[str, Callable[[], bool]] = {}
+
+    def ask(
+        self, robots: Sequence[Robot], work: Callable[[Robot, Call], T], call: Call
+    ) -> Mapping[str, T | EpisodicError]:
+        """Returns, by robot and in their order, what `work` returned, or the error why not.
+
+        Every robot is in it. Takes 0.95 of the time that is left of the call, at most.
+        """
+        left_s, begun_s = call.deadline.left_s(), time.monotonic()
+        limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
+        waiting = deque(robots)
+        running: dict[str, tuple[Future[T | EpisodicError], Call, float]] = {}
+        done: dict[str, T | EpisodicError] = {}
+        while waiting or running:
+            now_s = time.monotonic()
+            while waiting and len(running) < self._at_once:
+                robot = waiting.popleft()
+                own_s = min(limit_s, begun_s + left_s * _OF_ALL - now_s)
+                refused = self._refused(robot, call, own_s)
+                if refused is not None:
+                    done[robot.name] = refused
+                    continue
+                own = replace(
+                    call,
+                    deadline=call.deadline.within(own_s),
+                    stages=Stages(),
+                    used_active=False,
+                    used_thinned=False,
+                )
+                until_s = now_s + own_s + left_s * _GRACE
+                running[robot.name] = _asked(robot, work, own), own, until_s
+            # Without a deadline there is nothing to wake up for but an answer.
+            first_s = min((until_s for *_, until_s in running.values()), default=now_s)
+            futures = [future for future, *_ in running.values()]
+            wait(futures, min(max(first_s - now_s, 0), threading.TIMEOUT_MAX), FIRST_COMPLETED)
+            for name, (future, own, until_s) in [*running.items()]:
+                if future.done():
+                    done[name] = future.result()
+                elif time.monotonic() >= until_s:
+                    self._is_done[name] = future.done
+                    do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
+                    text = f"no answer in {limit_s:.3g} s; {do} a shorter window"
+                    done[name] = QueryTimeoutError(text)
+                else:
+                    continue
+                del running[name]
+                _add_costs(own, call)
+        return {robot.name: done[robot.name] for robot in robots}
+
+    def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
+        """Returns why a robot is not asked: it is stuck, or no time is left."""
+        if robot.name in self._is_done and not self._is_done[robot.name]():
+            return BusyError(
+                "still busy with an earlier question that it did not finish in time: is its disk "
+                "reachable?"
+            )
+        if own_s <= 0 or call.deadline.expired():
+            return QueryTimeoutError(
+                "not asked: the time of the call was up; ask about fewer robots, or a shorter time"
+            )
+        self._is_done.pop(robot.name, None)
+        return None
+
+
+def _add_costs(own: Call, call: Call) -> None:
+    """Adds what a robot's answer took to what the whole call did."""
+    for stage, spent in [*own.stages.spent.items()]:
+        call.stages.add(stage, spent)
+    call.used_active |= own.used_active
+    call.used_thinned |= own.used_thinned
+
+
+def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:
+    """Returns what a robot will answer, in a thread of its own."""
+    answer: Future[T | EpisodicError] = Future()
+
+    def run() -> None:
+        try:
+            answer.set_result(work(robot, call))
+        except EpisodicError as error:
+            answer.set_result(error)
+        except Exception:
+            log.exception("robot_failed", robot=robot.name)
+            fault = "failed through a fault in this server; its log has the cause"
+            answer.set_result(EpisodicError(fault))
+
+    # A daemon: one that hangs must not keep the program from ending.
+    threading.Thread(
+        target=contextvars.copy_context().run,
+        args=(run,),
+        name=f"robot-{robot.name}",
+        daemon=True,
+    ).start()
+    return answer

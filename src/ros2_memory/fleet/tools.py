@@ -7,7 +7,7 @@ several, their replies become one (`merging`), and what keeps a robot from answe
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
@@ -29,7 +29,6 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_rounded_up,
 )
-from ros2_memory.fleet.fan_out import AT_ONCE, FanOut
 from ros2_memory.fleet.merging import (
     ANSWER_FOR_ALL,
     MATCHES,
@@ -42,7 +41,7 @@ from ros2_memory.fleet.merging import (
     reason_of,
     shipped_to,
 )
-from ros2_memory.fleet.robots import Robot, StoppedClock, names_of
+from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, StoppedClock, names_of
 from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 
@@ -249,31 +248,32 @@ class _FleetQuestion:
         return int(limit) if isinstance(limit, int | float) else None
 
 
+@dataclass(eq=False)
 class _Page:
     """The `limit` rows that come first, of the rows of robots that answered so far. Thread-safe.
 
     The newest rows come first, or the oldest.
     """
 
-    def __init__(self, limit: int | None, *, oldest_first: bool) -> None:
-        self._limit = limit
-        self._oldest_first = oldest_first
-        self._lock = threading.Lock()
-        self._times: list[Ns] = []
+    limit: int | None
+    _: KW_ONLY
+    oldest_first: bool
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+    _times: list[Ns] = field(default_factory=list, init=False)
 
     def add(self, times: Iterable[Ns]) -> None:
         """Adds the times of a robot's rows."""
         with self._lock:
-            self._times = sorted((*self._times, *times), reverse=not self._oldest_first)
-            del self._times[self._limit :]
+            self._times = sorted((*self._times, *times), reverse=not self.oldest_first)
+            del self._times[self.limit :]
 
     def window(self) -> TimeWindow | None:
         """Returns where a row's time must lie for a place on the page; None while there is room."""
         with self._lock:
-            if self._limit is None or len(self._times) < max(self._limit, 1):
+            if self.limit is None or len(self._times) < max(self.limit, 1):
                 return None
             last = self._times[-1]
-        if self._oldest_first:
+        if self.oldest_first:
             return TimeWindow(MIN_NS, last + _SHOWN_NS)
         return TimeWindow(last - _SHOWN_NS, MAX_NS)
 

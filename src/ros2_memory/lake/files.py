@@ -9,7 +9,9 @@ from __future__ import annotations
 import math
 import threading
 import time
+from collections import defaultdict
 from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
 from datetime import date, timedelta
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -116,35 +118,27 @@ def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, d
         yield str(data.partition[positions["robot"]]), day, file
 
 
+@dataclass(eq=False, repr=False)
 class Lake:
     """The tables of a lake as they are now, and the engine that reads them. Thread-safe.
 
-    Args:
+    Attributes:
         catalog: of the tables.
         engine: what runs selects.
-        namespace: of the tables in the catalogue.
         translated: turns the errors of catalogues and stores into those of this program.
-
-    Attributes:
         messages: packed ones that were read last, of all robots.
     """
 
-    def __init__(
-        self,
-        catalog: IcebergCatalog,
-        engine: LakeEngine,
-        namespace: str = NAMESPACE,
-        translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext(),
-    ) -> None:
-        self.messages: ByteLru[bytes] = ByteLru(_MESSAGE_BYTES)
-        self._translated = translated
-        self._catalog = catalog
-        self._engine = engine
-        self._namespace = namespace
-        self._lock = threading.Lock()
-        self._looked_at = -math.inf
-        self._tables: dict[str, IcebergTable] = {}
-        self._partitions = {name: Partitions() for name in TABLES}
+    catalog: IcebergCatalog
+    engine: LakeEngine
+    translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext()
+    messages: ByteLru[bytes] = field(default_factory=lambda: ByteLru(_MESSAGE_BYTES), init=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+    _looked_at: float = field(default=-math.inf, init=False)
+    _tables: dict[str, IcebergTable] = field(default_factory=dict, init=False)
+    _partitions: defaultdict[str, Partitions] = field(
+        default_factory=lambda: defaultdict(Partitions), init=False
+    )
 
     def refresh(self, within_s: float = 0.0) -> None:
         """Looks for what was committed since, unless that was done within so many seconds.
@@ -178,7 +172,7 @@ class Lake:
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(file.location for file in files)
         found = DataFiles(TABLES[name].arrow_schema, locations, store)
-        return self._engine.select(sql, name, found, parameters or {})
+        return self.engine.select(sql, name, found, parameters or {})
 
     def _days(self, name: str) -> Mapping[str, Days]:
         with self._looking():
@@ -187,13 +181,13 @@ class Lake:
 
     @contextmanager
     def _looking(self) -> Iterator[None]:
-        with self._lock, self._translated("looking into the lake"):
+        with self._lock, self.translated("looking into the lake"):
             yield
 
     def _table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:
             try:
-                self._tables[name] = self._catalog.load_table(f"{self._namespace}.{name}")
+                self._tables[name] = self.catalog.load_table(f"{NAMESPACE}.{name}")
             except NoSuchTableError:
                 return None
         return self._tables[name]

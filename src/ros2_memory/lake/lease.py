@@ -24,6 +24,7 @@ from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S, iso_local
+from ros2_memory.lake.tables import NAMESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -117,7 +118,7 @@ class WarehouseLease:
     def __init__(self, location: LakeLocation, clock: Clock) -> None:
         self._location = location
         self._clock = clock
-        self._file = f"{location.warehouse}/{location.namespace}/writer.json"
+        self._file = f"{location.warehouse}/{NAMESPACE}/writer.json"
         self._store = load_file_io({**location.properties, **location.secrets}, self._file)
         self._id = _id_in(location.state_dir)
         self._until: Ns = 0

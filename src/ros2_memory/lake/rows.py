@@ -12,7 +12,8 @@ import json
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -43,7 +44,6 @@ from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
-    from datetime import date
     from pathlib import Path
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
-    from ros2_memory.lake.tables import Row
+    from ros2_memory.lake.tables import Row, ShippedBag
     from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Batch, Channel, Record
 
@@ -69,34 +69,6 @@ _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
 
 
-class ShippedBag(NamedTuple):
-    """The columns of `bags` that identify a bag.
-
-    Attributes:
-        robot: its name.
-        bag_id: see `bag_id_of`.
-        day: (UTC) of its start.
-        file: its path below the bag directory.
-        size: of its file (bytes).
-        sha256: of the bytes of its file, in hexadecimal.
-        mtime_ns: of its file.
-        made_of: see `made_of`.
-        start_ns: log time of its first message.
-        end_ns: of its last one.
-    """
-
-    robot: str
-    bag_id: str
-    day: date
-    file: str
-    size: int
-    sha256: str
-    mtime_ns: Ns
-    made_of: str
-    start_ns: Ns
-    end_ns: Ns
-
-
 def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
     """Returns the id of a bag: of its robot, its recording, its file's name and its first message.
 
@@ -111,9 +83,12 @@ def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
 
 def id_of_file(robot: str, recording: str, file: str, first: Ns) -> str:
     """Returns the id of a bag that need not be there any more; see `bag_id_of`."""
-    name = json.dumps([robot, recording, file, first])
-    digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
-    return f"{max(first, 0):016x}{digest[:16]}"
+    return f"{max(first, 0):016x}{_digest([robot, recording, file, first])}"
+
+
+def _digest(value: object) -> str:
+    """Returns half of the hash of a JSON value."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def sha256_of(path: Path) -> str:
@@ -141,11 +116,9 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     among = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, among), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
-    parts = json.dumps(
-        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted],
-        sort_keys=True,
+    return _digest(
+        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted]
     )
-    return hashlib.sha256(parts.encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def rows_of(
@@ -168,7 +141,7 @@ class _BagRows:
         self._memory = memory
         self._bag = bag
         self._whole = whole
-        view = View(memory, Call())
+        self._view = view = View(memory, Call())
         self._pose_topic = view.pose_topic
         self._poses = poses_of_bag(view, bag, self._pose_topic)
         self._thing = Labels(memory.limits.labels).key
@@ -218,15 +191,15 @@ class _BagRows:
 
         The first of them has the place that other rows name.
         """
-        view = View(self._memory, Call())
         window = TimeWindow(self._bag.start, self._bag.end + 1)
-        places = robot_places(view, window)
+        places = robot_places(self._view, window)
         if places is None:
             return []
-        frames = dict.fromkeys((places.map_frame, places.pose_frame))
-        tracks = [(frame, RobotTracks(view, frame).over(window).track) for frame in frames]
-        within = [(frame, cut(track, window)) for frame, track in tracks]
-        return [(frame, track) for frame, track in within if len(track.times)]
+        tracks = [
+            (frame, cut(RobotTracks(self._view, frame).over(window).track, window))
+            for frame in dict.fromkeys((places.map_frame, places.pose_frame))
+        ]
+        return [(frame, track) for frame, track in tracks if len(track.times)]
 
     def _vertices(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
@@ -236,7 +209,7 @@ class _BagRows:
             yield {**same, "time_ns": time, "x": x, "y": y, "heading": known, "begins": begins}
 
     def _things(self) -> Iterator[Row]:
-        for one in Watching(View(self._memory, Call())).in_bag(self._bag):
+        for one in Watching(self._view).in_bag(self._bag):
             for sights in one.sights:
                 for spot in sights.spots.tolist():
                     best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
@@ -258,7 +231,7 @@ class _BagRows:
     def _events(self) -> dict[str, TopicEvents]:
         """Returns the events on each topic that can have some."""
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        found = events_of_bag(View(self._memory, Call()), self._bag, topics)
+        found = events_of_bag(self._view, self._bag, topics)
         return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
 
     def _driven(self) -> Row:
@@ -290,21 +263,17 @@ class _BagRows:
         """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
         # By identity, since hashing a channel hashes its definition.
         found: dict[int, _Messages] = {}
-        size = 0
         every, window = tuple(self._types), TimeWindow.everything()
         for batch in self._memory.reader.batches(self._bag.path, every, window):
             channel = batch.channel
             if id(channel) not in found:
                 is_whole = channel.topic in self._whole
-                payloads: list[bytes] | None = (
-                    [] if is_whole or channel.type not in BULKY_TYPES else None
-                )
-                found[id(channel)] = _Messages(channel, is_whole, payloads)
-            size += found[id(channel)].add(batch)
-            droppable = [messages for messages in found.values() if not messages.is_whole]
-            while size > _MOST_BYTES and droppable:
-                largest = max(droppable, key=lambda messages: messages.size)
-                size -= largest.size
+                has_payloads = is_whole or channel.type not in BULKY_TYPES
+                found[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
+            found[id(channel)].add(batch)
+            droppable = [one for one in found.values() if not one.is_whole]
+            while droppable and sum(one.size for one in found.values()) > _MOST_BYTES:
+                largest = max(droppable, key=attrgetter("size"))
                 largest.payloads, largest.size = None, 0
                 droppable.remove(largest)
         order = sorted(found.values(), key=lambda one: (one.channel.topic, one.channel.type))
@@ -414,16 +383,13 @@ class _Messages:
     parts: list[Batch] = field(default_factory=list)
     size: int = 0
 
-    def add(self, batch: Batch) -> int:
-        """Takes more messages; returns how many bytes of payloads they have."""
+    def add(self, batch: Batch) -> None:
+        """Takes more messages."""
         # Without the buffer, in which are those of other channels.
         self.parts.append(replace(batch, buffer=b""))
-        if self.payloads is None:
-            return 0
-        self.payloads += map(batch.payload, range(batch.sizes.size))
-        size = int(batch.sizes.sum())
-        self.size += size
-        return size
+        if self.payloads is not None:
+            self.payloads += map(batch.payload, range(batch.sizes.size))
+            self.size += int(batch.sizes.sum())
 
     def row(self, number: int) -> Row:
         """Returns its row, the n-th of the bag; without payloads where these take too much."""

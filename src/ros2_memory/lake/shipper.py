@@ -8,7 +8,7 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
@@ -31,10 +31,9 @@ from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
-from ros2_memory.lake.forgetting import Tombstone, append_tombstone, forget_in_lake
-from ros2_memory.lake.rows import ShippedBag, bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, day_of, of_bags, overlapping
-from ros2_memory.lake.upkeep import compact, expire
+from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
+from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -55,36 +54,6 @@ MOST_ROWS: Final = 200_000
 """Of one batch: they are in memory until it is committed."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
 """A bag lies in the lake up to so far from where it begins and ends now: more of it counted."""
-
-
-@dataclass(frozen=True, slots=True)
-class RobotBags:
-    """One robot whose bags are shipped.
-
-    Attributes:
-        name: the robot.
-        memory: over its bag directory.
-        reader: reads whole files, also messages that count in another recording.
-        config: names the settings that rows depend on.
-    """
-
-    name: str
-    memory: Memory
-    reader: BagReader
-    config: str
-
-    @property
-    def bag_dir(self) -> Path:
-        """The bag directory."""
-        return self.memory.index.bag_dir
-
-    def name_of(self, bag: BagFile) -> str:
-        """Returns the path of a bag below the bag directory."""
-        return relative(bag.file, str(self.bag_dir))
-
-    def is_moment(self, bag: BagFile) -> bool:
-        """Returns whether a bag is a copy in a saved moment."""
-        return self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")
 
 
 @dataclass(slots=True)
@@ -113,12 +82,13 @@ class _Seen:
 class _Ready(NamedTuple):
     """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
-    of: _OneRobot
+    of: RobotBags
     bag: ShippedBag
     rows: Mapping[str, Sequence[Row]]
     replaced: Sequence[ShippedBag]
 
 
+@dataclass(eq=False, repr=False)
 class Shipper:
     """Ships the bags of several robots into one lake, whose lock the caller holds.
 
@@ -133,25 +103,21 @@ class Shipper:
         most_bags: of one commit.
     """
 
-    def __init__(
-        self,
-        lake: LakeTables,
-        robots: Sequence[RobotBags],
-        clock: Clock,
-        *,
-        messages: Sequence[str] = (),
-        tombstones: Collection[Tombstone] = (),
-        pause: Callable[[], object] = lambda: None,
-        alive: Callable[[], object] = lambda: None,
-        most_bags: int = MOST_BAGS,
-    ) -> None:
-        self._lake = lake
-        self._clock = clock
-        self._tombstones = set(tombstones)
-        self._pause = pause
-        self._alive = alive
-        self._most_bags = most_bags
-        self._robots = [_OneRobot(robot, lake, clock, messages) for robot in robots]
+    lake: LakeTables
+    robots: Sequence[RobotBags]
+    clock: Clock
+    _: KW_ONLY
+    messages: Sequence[str] = ()
+    tombstones: set[Tombstone] = field(default_factory=set)
+    pause: Callable[[], object] = lambda: None
+    alive: Callable[[], object] = lambda: None
+    most_bags: int = MOST_BAGS
+
+    def __post_init__(self) -> None:
+        """Has everything looked at, in the bag directories and in the lake."""
+        for robot in self.robots:
+            robot.may_write = True
+        self._look_again()
 
     def run(self) -> Shipped:
         """Ships what is new: one pass over all robots.
@@ -162,11 +128,11 @@ class Shipper:
         done = Shipped()
         batch: list[_Ready] = []
         rows = 0
-        for one in [one for one in self._robots if self._forget(one.robot, done)]:
-            for ready in one.ready(self._tombstones, self._alive, done):
+        for robot in [robot for robot in self.robots if self._forget(robot, done)]:
+            for ready in robot.ready(self, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
-                if len(batch) >= self._most_bags or rows >= MOST_ROWS:
+                if len(batch) >= self.most_bags or rows >= MOST_ROWS:
                     self._commit(batch, done)
                     batch, rows = [], 0
         if batch:
@@ -179,9 +145,9 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be read or written.
         """
-        now = self._clock.now()
-        compact(self._lake, now, self._alive)
-        expire(self._lake, now - grace if grace else MAX_NS)
+        now = self.clock.now()
+        compact(self.lake, now, self.alive)
+        expire(self.lake, now - grace if grace else MAX_NS)
 
     def _forget(self, robot: RobotBags, done: Shipped) -> bool:
         """Forgets what the robot's bag directory asks for; returns whether that is known.
@@ -197,26 +163,26 @@ class Shipper:
                 "is shipped until it is repaired, since what was forgotten could come back"
             )
             return False
-        new = [tombstone for tombstone in wanted if tombstone not in self._tombstones]
+        new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
         for tombstone in new:
-            append_tombstone(self._lake.location.state_dir, tombstone, done=False)
+            append_tombstone(self.lake.location.state_dir, tombstone, done=False)
         for tombstone in new:
-            self._alive()
-            gone = forget_in_lake(self._lake, tombstone)
+            self.alive()
+            gone = forget_in_lake(self.lake, tombstone)
             done.forgotten += gone.bags
             done.problems += [
                 f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
                 for kept in gone.kept_by
             ]
-            self._tombstones.add(tombstone)
+            self.tombstones.add(tombstone)
         if new:
             self._look_again()
         return True
 
     def _look_again(self) -> None:
         """Has everything looked at again, in the bag directories and in the lake."""
-        for one in self._robots:
-            one.look_again()
+        for robot in self.robots:
+            robot.look_again()
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
         """Commits a batch.
@@ -224,7 +190,7 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
-        self._pause()
+        self.pause()
         bags = [bag for ready in batch for bag in (ready.bag, *ready.replaced)]
         # Few files have to be looked at for it.
         condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
@@ -233,33 +199,50 @@ class Shipper:
             for name, table in TABLES.items():
                 filled = table.filled([row for ready in batch for row in ready.rows[name]])
                 rows += filled.num_rows
-                self._lake.replace(name, condition, filled)
+                self.lake.replace(name, condition, filled)
         except LakeError:
             self._look_again()
             raise
         done.bags += len(batch)
         done.rows += rows
         log.info("bags_shipped", bags=len(batch), rows=rows)
-        for one in self._robots:
-            one.shipped([ready for ready in batch if ready.of is one], done)
+        for robot in self.robots:
+            robot.shipped([ready for ready in batch if ready.of is robot], self, done)
 
 
-class _OneRobot:
-    """What is to be shipped of one robot, and what is known of the bags that it has.
+@dataclass(eq=False, repr=False)
+class RobotBags:
+    """One robot whose bags are shipped, and what is known of those that it has.
 
-    `seen` has the newest state of each by its file, `known` what the lake has of them by their ids;
-    neither those that it had: a hub runs for years.
+    `_seen` has the newest state of each by its file, `_known` what the lake has of them by their
+    ids; neither those that it had: a hub runs for years.
+
+    Attributes:
+        name: the robot.
+        memory: over its bag directory.
+        reader: reads whole files, also messages that count in another recording.
+        config: names the settings that rows depend on.
+        may_write: whether receipts could be written the last time.
     """
 
-    def __init__(
-        self, robot: RobotBags, lake: LakeTables, clock: Clock, messages: Sequence[str]
-    ) -> None:
-        self.robot = robot
-        self._lake = lake
-        self._clock = clock
-        self._messages = messages
-        self._may_write = True
-        self.look_again()
+    name: str
+    memory: Memory
+    reader: BagReader
+    config: str
+    may_write: bool = field(default=True, init=False)
+
+    @property
+    def bag_dir(self) -> Path:
+        """The bag directory."""
+        return self.memory.index.bag_dir
+
+    def name_of(self, bag: BagFile) -> str:
+        """Returns the path of a bag below the bag directory."""
+        return relative(bag.file, str(self.bag_dir))
+
+    def is_moment(self, bag: BagFile) -> bool:
+        """Returns whether a bag is a copy in a saved moment."""
+        return self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")
 
     def look_again(self) -> None:
         """Has everything looked at again."""
@@ -267,37 +250,34 @@ class _OneRobot:
         self._known: dict[str, ShippedBag] = {}
         self._receipts: dict[str, Receipt] | None = None
 
-    def ready(
-        self, tombstones: Collection[Tombstone], alive: Callable[[], object], done: Shipped
-    ) -> Iterator[_Ready]:
+    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_Ready]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
-        robot = self.robot
-        snapshot = robot.memory.index.refresh()
+        snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
-            done.problems.append(f"{robot.name}: {snapshot.problem}")
+            done.problems.append(f"{self.name}: {snapshot.problem}")
             return
         bags = self._settled(snapshot, done)
-        self._look_up(bags)
+        self._look_up(bags, shipper.lake)
         by_file = {shipped.file: shipped for shipped in self._known.values()}
         ids: set[str] = set()
         confirmed: list[ShippedBag] = []
         # A saved moment's copy of a bag counts where the bag itself is gone.
-        for bag in sorted(bags, key=lambda bag: (robot.is_moment(bag), bag.start)):
-            alive()
+        for bag in sorted(bags, key=lambda bag: (self.is_moment(bag), bag.start)):
+            shipper.alive()
             try:
                 seen = self._look(bag)
                 before = self._known.get(seen.bag_id)
-                is_again = before is not None and robot.is_moment(bag)
+                is_again = before is not None and self.is_moment(bag)
                 if seen.bag_id in ids or is_again:
                     continue
-                if self._is_forgotten(bag, seen, tombstones):
+                if self._is_forgotten(bag, seen, shipper.tombstones):
                     done.problems.append(
-                        f"{robot.name}: {bag.file} has messages that were forgotten in the lake; "
+                        f"{self.name}: {bag.file} has messages that were forgotten in the lake; "
                         "it is not shipped: delete it, or the messages, with ros2-memory forget"
                     )
                     continue
                 ids.add(seen.bag_id)
-                shipped = self._described(bag, seen.bag_id, before)
+                shipped = self._described(bag, seen.bag_id, before, shipper.messages)
                 if before is not None and _is_same(before, shipped):
                     self._known[shipped.bag_id] = shipped
                     confirmed.append(shipped)
@@ -305,45 +285,47 @@ class _OneRobot:
                 of_file = by_file.get(shipped.file)
                 if of_file is not None and self._is_cut(of_file, bag):
                     continue
-                rows = rows_of(robot.memory, bag, shipped, self._messages)
+                rows = rows_of(self.memory, bag, shipped, shipper.messages)
             except (BagError, OSError, ValueError) as error:
-                done.problems.append(f"{robot.name}: {error}")
+                done.problems.append(f"{self.name}: {error}")
                 continue
             replaced = {before} if before is not None else set()
-            if of_file is not None and _holds(of_file, shipped):
+            # As where its first messages were deleted by request: what is left lies within it.
+            start, end = shipped.start_ns, shipped.end_ns
+            if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
                 replaced.add(of_file)
             yield _Ready(self, shipped, rows, [*replaced])
-        self._confirm(confirmed, done)
+        self._confirm(confirmed, shipper, done)
         self._drop_gone(bags)
 
-    def shipped(self, batch: Sequence[_Ready], done: Shipped) -> None:
+    def shipped(self, batch: Sequence[_Ready], shipper: Shipper, done: Shipped) -> None:
         """Notes that bags were committed."""
         for ready in batch:
             for old in ready.replaced:
                 self._known.pop(old.bag_id, None)
             self._known[ready.bag.bag_id] = ready.bag
-        self._confirm([ready.bag for ready in batch], done)
+        self._confirm([ready.bag for ready in batch], shipper, done)
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
         """Returns the bags that change no more; reports the others."""
-        robot, now = self.robot, self.robot.memory.clock.now()
+        now = self.memory.clock.now()
         closed = [
             bag
             for bag in snapshot.bags
             if bag.state is BagState.CLOSED
             if not is_carried(bag.path) and not is_thinned(bag.path)
         ]
-        bags = [bag for bag in closed if is_settled(bag, robot.bag_dir, now)]
+        bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         done.waiting += len(closed) - len(bags) + len(open_bags)
         done.problems += [
-            f"{robot.name}: {bag.file} was left open by a crash: ros2-memory recover closes it"
+            f"{self.name}: {bag.file} was left open by a crash: ros2-memory recover closes it"
             for bag in open_bags
         ]
-        done.problems += [f"{robot.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
+        done.problems += [f"{self.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
         return bags
 
-    def _look_up(self, bags: Sequence[BagFile]) -> None:
+    def _look_up(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
         """Asks the lake what it has of the time of new bags.
 
         Raises:
@@ -353,13 +335,13 @@ class _OneRobot:
         if new:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
-            of_time = overlapping(self.robot.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
-            for row in self._lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
+            of_time = overlapping(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
+            for row in lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
                 self._known.setdefault(row["bag_id"], ShippedBag(**row))
 
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer."""
-        names = {bag.file: self.robot.name_of(bag) for bag in bags}
+        names = {bag.file: self.name_of(bag) for bag in bags}
         self._seen = {file: seen for file, seen in self._seen.items() if file in names}
         ids, own = {seen.bag_id for seen in self._seen.values()}, {*names.values()}
         self._known = {
@@ -376,35 +358,36 @@ class _OneRobot:
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
         seen = self._seen.get(bag.file)
         if seen is None or seen.state != state:
-            summary = self.robot.reader.summarize(bag.path)
+            summary = self.reader.summarize(bag.path)
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
-            seen = _Seen(state, bag_id_of(self.robot.name, bag, summary.start))
+            seen = _Seen(state, bag_id_of(self.name, bag, summary.start))
             self._seen[bag.file] = seen
         return seen
 
     def _is_forgotten(self, bag: BagFile, seen: _Seen, tombstones: Collection[Tombstone]) -> bool:
         """Returns whether a bag has a message that was forgotten; it is read for that once."""
         if seen.is_forgotten is None:
-            reader, name = self.robot.memory.reader, self.robot.name
             seen.is_forgotten = any(
-                tombstone.forbids(reader, name, bag, seen.bag_id) for tombstone in tombstones
+                tombstone.forbids(self.memory.reader, self.name, bag, seen.bag_id)
+                for tombstone in tombstones
             )
         return seen.is_forgotten
 
-    def _described(self, bag: BagFile, bag_id: str, before: ShippedBag | None) -> ShippedBag:
+    def _described(
+        self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
+    ) -> ShippedBag:
         """Returns what a bag would be known as."""
-        robot = self.robot
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         return ShippedBag(
-            robot=robot.name,
+            robot=self.name,
             bag_id=bag_id,
             day=day_of(bag.start),
-            file=robot.name_of(bag),
+            file=self.name_of(bag),
             size=bag.size,
             sha256=before.sha256 if before is not None and is_read else sha256_of(bag.path),
             mtime_ns=bag.mtime_ns,
-            made_of=made_of(robot.memory, bag, robot.config, self._messages),
+            made_of=made_of(self.memory, bag, self.config, messages),
             start_ns=bag.start,
             end_ns=bag.end,
         )
@@ -416,33 +399,33 @@ class _OneRobot:
         """
         if before.size == bag.size:
             return False
-        receipt = read_receipts(self.robot.bag_dir).get(before.file)
+        receipt = read_receipts(self.bag_dir).get(before.file)
         return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
-    def _confirm(self, bags: Sequence[ShippedBag], done: Shipped) -> None:
+    def _confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
         """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
-        robot, lake = self.robot, self._lake.lake_id
-        if not has_recorded(robot.bag_dir):
+        lake = shipper.lake.lake_id
+        if not has_recorded(self.bag_dir):
             return
         try:
             if self._receipts is None:
-                self._receipts = read_receipts(robot.bag_dir)
+                self._receipts = read_receipts(self.bag_dir)
             known = self._receipts
             missing = [
-                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, self._clock.now())
+                Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, shipper.clock.now())
                 for bag in bags
                 if not (is_shipped(known, bag.file, bag.size) and known[bag.file].lake == lake)
             ]
             if missing:
-                append_receipts(robot.bag_dir, missing)
+                append_receipts(self.bag_dir, missing)
                 known.update((receipt.bag, receipt) for receipt in missing)
-            self._may_write = True
+            self.may_write = True
         except OSError as error:
-            if self._may_write:
-                log.warning("receipts_not_written", robot=robot.name, reason=str(error))
-            self._may_write = False
+            if self.may_write:
+                log.warning("receipts_not_written", robot=self.name, reason=str(error))
+            self.may_write = False
             done.problems.append(
-                f"{robot.name}: no receipts can be written into {robot.bag_dir} "
+                f"{self.name}: no receipts can be written into {self.bag_dir} "
                 f"({error.strerror or error}): its recorder cannot wait for shipping"
             )
 
@@ -450,11 +433,3 @@ class _OneRobot:
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:
     """Returns whether the rows of a bag would be the same; a copy has another path and mtime."""
     return before == now._replace(mtime_ns=before.mtime_ns, file=before.file)
-
-
-def _holds(old: ShippedBag, new: ShippedBag) -> bool:
-    """Returns whether a bag of the same path is an older state of another one.
-
-    As where its first messages were deleted by request: what is left lies within it.
-    """
-    return old.start_ns <= new.start_ns and new.end_ns <= old.end_ns

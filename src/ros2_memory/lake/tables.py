@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Final, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 import pyarrow as pa
 import yaml
@@ -32,7 +32,6 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-    from datetime import date
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.expressions import BooleanExpression
@@ -164,6 +163,34 @@ Row: TypeAlias = "Mapping[str, object]"
 """Values by column; others are null, but for `time` and `topic_key`, which follow from these."""
 
 
+class ShippedBag(NamedTuple):
+    """The columns of `bags` that identify a bag.
+
+    Attributes:
+        robot: its name.
+        bag_id: see `rows.bag_id_of`.
+        day: (UTC) of its start.
+        file: its path below the bag directory.
+        size: of its file (bytes).
+        sha256: of the bytes of its file, in hexadecimal.
+        mtime_ns: of its file.
+        made_of: see `rows.made_of`.
+        start_ns: log time of its first message.
+        end_ns: of its last one.
+    """
+
+    robot: str
+    bag_id: str
+    day: date
+    file: str
+    size: int
+    sha256: str
+    mtime_ns: Ns
+    made_of: str
+    start_ns: Ns
+    end_ns: Ns
+
+
 def topic_key(topic: str) -> str:
     """Returns a topic without slashes: `/vision/objects` is `vision.objects`."""
     return topic.strip("/").replace("/", ".")
@@ -206,10 +233,12 @@ def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
-    bounds = And(
-        _is(GreaterThanOrEqual, "bag_id", min(ids)), _is(LessThanOrEqual, "bag_id", max(ids))
+    return And(
+        _is(EqualTo, "robot", robot),
+        _is(GreaterThanOrEqual, "bag_id", min(ids)),
+        _is(LessThanOrEqual, "bag_id", max(ids)),
+        _is(In, "bag_id", ids),
     )
-    return And(_is(EqualTo, "robot", robot), bounds, _is(In, "bag_id", ids))
 
 
 def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
@@ -236,14 +265,12 @@ def overlapping(
     return And(of_robot, _is(In, "topic", topics)) if topics else of_robot
 
 
-def open_tables(
-    catalog: IcebergCatalog, names: Iterable[str], namespace: str = NAMESPACE
-) -> dict[str, IcebergTable]:
+def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
     """Returns tables by name; makes those that are missing, and adds columns that are new."""
-    catalog.create_namespace_if_not_exists(namespace)
+    catalog.create_namespace_if_not_exists(NAMESPACE)
     found: dict[str, IcebergTable] = {}
     for name in names:
-        table, identifier = TABLES[name], f"{namespace}.{name}"
+        table, identifier = TABLES[name], f"{NAMESPACE}.{name}"
         try:
             opened = catalog.load_table(identifier)
         except NoSuchTableError:

@@ -1,34 +1,53 @@
-"""Keeps the tables of a lake small: closed days in few files, old versions and their files gone.
+"""Keeps the tables of a lake small, and forgets a time of a robot in them for good.
 
-pyiceberg drops old versions from the metadata of tables, but deletes no file. A list of what lies
-in a store would have files of other programs, too, also those that they are about to commit. So
-only files are deleted that this program recorded when it wrote them: those below a table's own
-location to which no version, branch or tag of the table refers.
+Closed days are put into few files; old versions and their files go. pyiceberg drops old versions
+from the metadata of tables, but deletes no file. A list of what lies in a store would have files of
+other programs, too, also those that they are about to commit. So only files are deleted that this
+program recorded when it wrote them: those below a table's own location to which no version, branch
+or tag of the table refers.
+
+What is forgotten goes with old versions, files, and late copies. Each bag goes as a whole that has
+something of that time, or, where topics are forgotten, something of them: where its file is still
+there without the messages, it is shipped again.
+
+Tombstones lie in the lake's state directory and are kept for ever. Each is written durably before
+anything is deleted, and again as done when all of it is gone.
 """
 
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import astuple, dataclass, field, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
-from pyiceberg.manifest import ManifestEntryStatus
-
+from ros2_memory.bag_dir.json_files import Int64, JsonLog
+from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.files import Partitions
-from ros2_memory.lake.tables import TABLES, day_of, of_robots
+from ros2_memory.lake.rows import id_of_file
+from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
 from ros2_memory.lake.warehouse import WRITTEN
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from datetime import date
+    from pathlib import Path
 
+    from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
+    from ros2_memory.bag_dir.state_files import Forgetting
+    from ros2_memory.core.model import BagFile
     from ros2_memory.lake.warehouse import LakeTables
+    from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
 
+TOMBSTONES_FILE: Final = "tombstones.jsonl"
 _DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 FEW_FILES: Final = 3
 """A day of a robot with more files in a table is put together."""
@@ -68,18 +87,18 @@ def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[
         for day, files in days.items()
         if day < closed and len(files) > FEW_FILES
     )
-    some: dict[str, int] = {}
-    last = closed
-    for day, robot, size in sizes:
-        is_full = sum(some.values()) + size > _MOST_BYTES or len(some) == _MOST_ROBOTS
-        if some and (is_full or day != last):
-            yield last, [*some]
-            some = {}
-        if size <= _MOST_BYTES:
-            some[robot] = size
-        last = day
-    if some:
-        yield last, [*some]
+    for day, of_day in groupby(sizes, itemgetter(0)):
+        robots: list[str] = []
+        total = 0
+        for _, robot, size in of_day:
+            if robots and (total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS):
+                yield day, robots
+                robots, total = [], 0
+            if size <= _MOST_BYTES:
+                robots.append(robot)
+                total += size
+        if robots:
+            yield day, robots
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
@@ -125,16 +144,151 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 def _referenced(table: IcebergTable) -> set[str]:
     """Returns the files that some version, branch or tag of a table refers to."""
-    found = {table.metadata_location}
-    found.update(statistics.statistics_path for statistics in table.metadata.statistics)
-    for snapshot in table.metadata.snapshots:
-        found.add(snapshot.manifest_list)
-        for manifest in snapshot.manifests(table.io):
-            if manifest.manifest_path not in found:
-                found.add(manifest.manifest_path)
-                found.update(
-                    entry.data_file.file_path
-                    for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=False)
-                    if entry.status is not ManifestEntryStatus.DELETED
-                )
+    metadata = table.metadata
+    manifests = {
+        manifest.manifest_path: manifest
+        for snapshot in metadata.snapshots
+        for manifest in snapshot.manifests(table.io)
+    }
+    return {
+        table.metadata_location,
+        *(statistics.statistics_path for statistics in metadata.statistics),
+        *(snapshot.manifest_list for snapshot in metadata.snapshots),
+        *manifests,
+        *(
+            entry.data_file.file_path
+            for manifest in manifests.values()
+            for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=True)
+        ),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Tombstone:
+    """Messages of a robot that were forgotten: those of a window (log times, half-open).
+
+    Where there are `topics`, only theirs; where there are `bags`, all of these alone, by their ids.
+    `done`: all of it is gone; two that differ in that alone are equal.
+    """
+
+    robot: str
+    start: Int64
+    stop: Int64
+    topics: tuple[str, ...] = ()
+    bags: tuple[str, ...] = ()
+    done: bool = field(default=False, compare=False)
+
+    @property
+    def window(self) -> TimeWindow:
+        """The time that is forgotten."""
+        return TimeWindow(self.start, self.stop)
+
+    @classmethod
+    def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
+        """Returns what a robot's bag directory asks for."""
+        ids = [id_of_file(robot, *astuple(bag)) for bag in forgetting.bags]
+        return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
+
+    def forbids(self, reader: BagReader, robot: str, bag: BagFile, bag_id: str) -> bool:
+        """Returns whether a bag has a message that was forgotten.
+
+        Raises:
+            BagError: it cannot be read.
+        """
+        if robot != self.robot:
+            return False
+        if self.bags:
+            return bag_id in self.bags
+        if not self.window.overlaps(bag.start, bag.end):
+            return False
+        topics = {known.topic for known in bag.summary.topics}
+        wanted = topics.intersection(self.topics) if self.topics else topics
+        return any(True for _ in reader.records(bag.path, tuple(wanted), self.window))
+
+
+TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
+
+
+def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> None:
+    """Appends a tombstone durably, or that it is done.
+
+    Raises:
+        LakeError: it cannot be written.
+    """
+    try:
+        TOMBSTONES.append(state_dir, [replace(tombstone, done=done)])
+    except OSError as error:
+        path = state_dir / TOMBSTONES_FILE
+        raise LakeError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
+    """Returns the tombstones, and whether each is done.
+
+    Raises:
+        LakeError: they cannot be read, or a line is damaged: nothing may be shipped then.
+    """
+    found: dict[Tombstone, bool] = {}
+    try:
+        for _, tombstone in TOMBSTONES.all_rows(state_dir):
+            found[tombstone] = tombstone.done or found.get(tombstone, False)
+    except (OSError, ValueError) as error:
+        raise LakeError(
+            f"{state_dir / TOMBSTONES_FILE}: {error}; nothing is shipped until it is repaired, "
+            "since what was forgotten could come back"
+        ) from error
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class Forgotten:
+    """What is gone: how many bags, and files; `kept_by` names tags and branches that keep some."""
+
+    bags: int
+    files: int
+    kept_by: tuple[str, ...] = ()
+
+
+def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
+    """Deletes what a tombstone names, which is written already; killed anywhere, it is done again.
+
+    Raises:
+        LakeError: the lake cannot be read or written.
+    """
+    # `channels` has a row of each bag of which anything is in the lake: it is the first to be
+    # committed, and the last from which is deleted.
+    bags = _bags(lake, "channels", _of(tombstone, "first_ns", "last_ns"))
+    # In `bags` alone: of which no message counts, and what a killed process was about to replace.
+    listed = _bags(lake, "bags", _of(replace(tombstone, topics=()), "start_ns", "end_ns"))
+    if tombstone.topics and listed:
+        ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
+        listed -= _bags(lake, "channels", ids)
+    bags |= listed
+    for name in reversed([*TABLES]):
+        lake.delete(name, of_bags(bags))
+    # The versions before have what was deleted, so they go whatever their age, and the clock says.
+    files = expire(lake, MAX_NS)
+    kept_by = tuple(
+        f"{name}: {ref}"
+        for name in TABLES
+        for metadata in [lake.current(name).metadata]
+        for ref, version in metadata.refs.items()
+        if version.snapshot_id != metadata.current_snapshot_id
+    )
+    append_tombstone(lake.location.state_dir, tombstone, done=True)
+    log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
+    return Forgotten(len(bags), files, kept_by)
+
+
+def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
+    """Returns robot, day and id of the bags that have some rows."""
+    columns = ("robot", "day", "bag_id")
+    rows = lake.rows(name, condition, columns).to_pylist()
+    return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
+
+
+def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+    """Returns the condition on rows of what is forgotten; the columns have their span."""
+    if tombstone.bags:
+        return of_ids(tombstone.robot, tombstone.bags)
+    return overlapping(tombstone.robot, (first, last), tombstone.window, tombstone.topics)

@@ -82,7 +82,6 @@ class LakeLocation:
         uri: of a REST catalogue, or of another database; None for the SQLite file.
         properties: of the catalogue and of the file store, as pyiceberg names them.
         secrets: likewise, and never shown.
-        namespace: of its tables.
     """
 
     warehouse: str
@@ -91,7 +90,6 @@ class LakeLocation:
     uri: str | None = None
     properties: Mapping[str, str] = field(default_factory=dict)
     secrets: Mapping[str, str] = field(default_factory=dict, repr=False)
-    namespace: str = NAMESPACE
 
     @property
     def _is_file(self) -> bool:
@@ -151,7 +149,7 @@ class LakeLocation:
         """
         with self.opened() as catalog:
             with self.translated("opening the lake's tables"):
-                tables = open_tables(catalog, TABLES, self.namespace)
+                tables = open_tables(catalog, TABLES)
             yield LakeTables(self, tables)
 
     def last_commit(self) -> Ns | None:
@@ -163,7 +161,7 @@ class LakeLocation:
         if self._is_file and not (self.state_dir / CATALOGUE_FILE).exists():
             return None
         with self.opened() as catalog, self.translated("looking into the lake"):
-            name = f"{self.namespace}.bags"
+            name = f"{NAMESPACE}.bags"
             if not catalog.table_exists(name):
                 return None
             newest = catalog.load_table(name).current_snapshot()
@@ -202,9 +200,8 @@ class LakeTables:
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
     ) -> pa.Table:
         """Returns the rows of which a condition is true."""
-        table = self.current(name)
         with self.location.translated(f"reading the lake's {name}"):
-            return table.scan(condition, selected_fields=columns).to_arrow()
+            return self._tables[name].refresh().scan(condition, selected_fields=columns).to_arrow()
 
     def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
         """Replaces rows by others, in one transaction."""

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import bootstrap_lake, cli
+from ros2_memory import bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
-from ros2_memory.lake.forgetting import TOMBSTONES_FILE
 from ros2_memory.lake.lease import WarehouseLease, writing_alone
+from ros2_memory.lake.upkeep import TOMBSTONES_FILE
 from tests.support.fleets import seeded, write_robot
 from tests.support.lakes import lake_column
 
@@ -189,7 +189,7 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
 def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        bootstrap_lake, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
+        bootstrap_fleet, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
     )
     assert "pip install '.[lake]'" in ship(2).err
 
@@ -213,7 +213,7 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
     secrets = tmp_path / "secrets.yaml"
     secrets.write_text('s3.secret-access-key: "hunter2hunter2"\n')
     given = f"lake.secrets_file={secrets}"
-    location = bootstrap_lake.lake_location(load_settings(["lake.warehouse=/nowhere", given], {}))
+    location = bootstrap_fleet.lake_location(load_settings(["lake.warehouse=/nowhere", given], {}))
     assert location.secrets == {"s3.secret-access-key": "hunter2hunter2"}
     assert "hunter2" not in repr(location)
     with pytest.raises(LakeError) as failed, location.translated("writing"):

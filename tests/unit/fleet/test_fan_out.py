@@ -15,8 +15,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.fleet.fan_out import FanOut
-from ros2_memory.fleet.robots import Robot
+from ros2_memory.fleet.robots import FanOut, Robot
 from ros2_memory.history.context import Call
 
 if TYPE_CHECKING:

@@ -17,18 +17,19 @@ from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.forgetting import (
+from ros2_memory.lake.packed_messages import unpacked_messages
+from ros2_memory.lake.shipper import Shipped, Shipper
+from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.upkeep import (
     TOMBSTONES_FILE,
     Forgotten,
     Tombstone,
     append_tombstone,
+    compact,
+    expire,
     forget_in_lake,
     read_tombstones,
 )
-from ros2_memory.lake.packed_messages import unpacked_messages
-from ros2_memory.lake.shipper import Shipped, Shipper
-from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.upkeep import compact, expire
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
@@ -78,7 +79,7 @@ def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
             [robot_bags("hall", bag_dir)],
             FixedClock(LATER),
             messages=("/chatter",),
-            tombstones=read_tombstones(where.state_dir),
+            tombstones={*read_tombstones(where.state_dir)},
         ).run()
 
 

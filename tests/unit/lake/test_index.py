@@ -15,7 +15,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
-from ros2_memory.lake.index import MOST_BAGS
+from ros2_memory.lake.memory import MOST_BAGS
 from ros2_memory.lake.tables import day_of
 from tests.support.bags import detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S

@@ -12,7 +12,7 @@ from urllib.request import Request, urlopen
 
 import pytest
 
-from ros2_memory.lake.forgetting import Tombstone, forget_in_lake
+from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
 from tests.support.lakes import LATER, ship_and_ask
 

@@ -119,7 +119,7 @@ def _forget(
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
     from ros2_memory.lake.files import Partitions  # noqa: PLC0415 - as in `ship`
-    from ros2_memory.lake.forgetting import (  # noqa: PLC0415
+    from ros2_memory.lake.upkeep import (  # noqa: PLC0415
         Tombstone,
         append_tombstone,
         forget_in_lake,
@@ -181,8 +181,8 @@ class _Shipping:
     @contextmanager
     def shipper(self) -> "Iterator[Shipper]":
         """Yields what ships, after what was forgotten is gone."""
-        from ros2_memory.lake.forgetting import forget_in_lake, read_tombstones  # noqa: PLC0415
         from ros2_memory.lake.shipper import Shipper  # noqa: PLC0415
+        from ros2_memory.lake.upkeep import forget_in_lake, read_tombstones  # noqa: PLC0415
 
         with self.location.writable() as lake:
             tombstones = read_tombstones(self.location.state_dir)
@@ -194,7 +194,7 @@ class _Shipping:
                 self.robots,
                 WallClock(),
                 messages=self.settings.lake.messages,
-                tombstones=tombstones,
+                tombstones={*tombstones},
                 pause=self._pause,
                 alive=self._alive,
             )

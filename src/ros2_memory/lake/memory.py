@@ -1,0 +1,475 @@
+"""The memory of one robot over its bags in a lake: their index, and what reads their messages."""
+
+from __future__ import annotations
+
+import heapq
+import json
+import threading
+from bisect import bisect_right
+from collections import Counter
+from dataclasses import KW_ONLY, dataclass, field, replace
+from datetime import date, timedelta
+from itertools import chain
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple
+from zlib import crc32
+
+from ros2_memory.bag_dir.layout import COMPRESSED
+from ros2_memory.columns.pack import is_large
+from ros2_memory.columns.scanner import Scanner
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
+from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.history.context import Memory
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
+from ros2_memory.lake.packed_messages import unpacked_messages
+from ros2_memory.lake.tables import ShippedBag, day_of, end_of
+from ros2_memory.storage.base import BagReader, Channel, Closing, Schema
+from ros2_memory.storage.cache import ByteLru, shared
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Iterator, Mapping, Sequence
+
+    import pyarrow as pa
+
+    from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.columns.store import ColumnStore
+    from ros2_memory.core.large_reads import LargeReads
+    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.history.context import QuerySettings
+    from ros2_memory.lake.files import Days, Lake
+    from ros2_memory.retention.inventory import Foreign
+    from ros2_memory.storage.base import Batch, Definition, Record
+
+MOST_BAGS: Final = 45_000
+"""Bags that are looked at together: a month of minutes, or some years of ten a day."""
+_FEWEST_DAYS: Final = 2
+"""Days that are looked at together where a time before the newest ones is asked about."""
+_MOST_WINDOWS: Final = 6
+"""Times before the newest days that stay in memory."""
+_TOGETHER: Final = 64
+"""Bags of a day whose messages are read together."""
+_LOOKS: Final = 4
+"""What is known of the lake serves for all robots for this part of the time that it may be old."""
+_HEAD_BYTES: Final = 200
+_HEADS_BYTES: Final = 8 << 20
+
+_BAGS: Final = (
+    f"SELECT {', '.join(ShippedBag._fields)}, summary, counts FROM bags"  # noqa: S608 - constants
+    " ORDER BY start_ns, end_ns, bag_id"
+)
+_HEADS: Final = (
+    "SELECT bag_id, channel, has_payloads, metadata, type, schema_encoding, schema, topic,"
+    " encoding, latched FROM channels"
+    " WHERE bag_id IN $bags AND bag_id >= $first AND bag_id <= $last ORDER BY bag_id, channel"
+)
+_PACKED: Final = (
+    "SELECT bag_id, channel, packed FROM channels WHERE topic IN $topics"
+    " AND bag_id IN $bags AND bag_id >= $first AND bag_id <= $last"
+)
+
+
+class LakeBag(NamedTuple):
+    """One bag of a lake.
+
+    Attributes:
+        bag_id: its id there.
+        day: the day that its rows are under.
+        file: the bag, by the path that it had on the robot.
+        together: the states by id of the bags of that day that are read together.
+    """
+
+    bag_id: str
+    day: date
+    file: BagFile
+    together: dict[str, int]
+
+
+@dataclass(frozen=True)
+class _Window:
+    """Consecutive days of a robot, and what the lake has of them.
+
+    Attributes:
+        older: the end of the newest day before them, as a log time; None where there is none.
+        made_of: the files whose rows are the bags of each day.
+        timeline: the bags of all.
+        bags: these by their paths.
+    """
+
+    older: Ns | None = None
+    made_of: Days = field(default_factory=dict)
+    timeline: Timeline = field(default_factory=Timeline)
+    bags: Mapping[str, LakeBag] = field(default_factory=dict)
+
+
+def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
+    """Returns the newest days with rows up to one, and the one before them, if there is one.
+
+    They are those of `fewest` days, and more while all have at most `rows` rows.
+    """
+    order = [*days]
+    begin = end = bisect_right(order, until)
+    total = 0
+    while begin:
+        day = order[begin - 1]
+        total += sum(file.rows for file in days[day])
+        if total > rows and day <= order[end - 1] - timedelta(days=fewest):
+            break
+        begin -= 1
+    found = {day: days[day] for day in order[begin:end]}
+    return found, order[begin - 1] if begin else None
+
+
+@dataclass(eq=False, repr=False)
+class LakeIndex:
+    """What a lake has of one robot, as of some seconds ago. Thread-safe.
+
+    It is of the newest days, and of other days where a question is about a time before these. Bags
+    have the paths that they had on the robot. Which messages count at a handover was decided when
+    they were shipped.
+
+    Attributes:
+        lake: the lake.
+        robot: its name there.
+        clock: the wall clock.
+        refresh_s: how old (s) the index may be: at most one commit of a table is made meanwhile.
+        days: how many days are looked at together, at least: the newest; more of few bags.
+        most_bags: so many bags at most, where that is more days.
+        bag_dir: names no directory that there is.
+    """
+
+    lake: Lake
+    robot: str
+    clock: Clock
+    _: KW_ONLY
+    refresh_s: float = 60.0
+    days: int = 31
+    most_bags: int = MOST_BAGS
+    bag_dir: Path = field(init=False)
+    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
+    _windows: dict[date, _Window] = field(default_factory=dict, init=False)
+    _snapshot: Snapshot | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        """Names the directory."""
+        self.bag_dir = Path("/") / self.robot
+
+    @property
+    def published(self) -> Snapshot | None:
+        """The index as it is known now."""
+        return self._snapshot
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns an index that is not older than it may be; what is not shipped yet is not in it.
+
+        Where `reach` is before the newest days, it is of the days up to that time.
+
+        Raises:
+            RefusedError: the lake cannot be read.
+        """
+        known = self._snapshot
+        if known is None or self.clock.now() - known.scanned_at > self.refresh_s * 1e9:
+            known = self.refresh()
+        if reach is None or known.older is None or reach > known.older:
+            return known
+        with self._lock:
+            # With the next day, in which what lies across midnight goes on.
+            window = self._window(day_of(reach) + timedelta(days=1), _FEWEST_DAYS)
+        return replace(known, timeline=window.timeline, older=window.older)
+
+    def refresh(self) -> Snapshot:
+        """Looks into the lake now; what was just seen there for another robot is not old."""
+        with self._lock:
+            self.lake.refresh(self.refresh_s / _LOOKS)
+            window = self._window(date.max, self.days)
+            timeline = window.timeline
+            silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
+            self._snapshot = Snapshot(
+                timeline,
+                silent_topics=frozenset(silent.difference(timeline.topics())),
+                scanned_at=self.clock.now(),
+                older=window.older,
+            )
+            return self._snapshot
+
+    def heartbeat(self) -> Heartbeat | None:
+        """Returns None: what a robot's recorder does now is not in a lake."""
+        return None
+
+    def foreign(self, snapshot: Snapshot) -> Foreign | None:
+        """Returns None: a lake does not know of retention."""
+        del snapshot
+        return None
+
+    def bag(self, path: Path) -> LakeBag:
+        """Returns the bag of a snapshot that has a path there.
+
+        Raises:
+            BagVanishedError: it is not in the lake any more.
+        """
+        for window in self._windows.values():
+            if found := window.bags.get(str(path)):
+                return found
+        raise BagVanishedError(str(path), "it is not in the lake any more")
+
+    def _window(self, until: date, fewest: int) -> _Window:
+        """Returns the newest days up to one; only those are read of which a file is new."""
+        known = self._windows.get(until, _Window())
+        of_robot = self.lake.days("bags", self.robot)
+        made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
+        window = replace(known, older=None if day_before is None else end_of(day_before))
+        if made_of != known.made_of:
+            new = {day: files for day, files in made_of.items() if known.made_of.get(day) != files}
+            same = made_of.keys() - new.keys()
+            bags = {path: bag for path, bag in known.bags.items() if bag.day in same}
+            bags |= self._read(new, known.bags)
+            timeline = known.timeline.changed(
+                _missing(known.bags, bags), _missing(bags, known.bags)
+            )
+            window = _Window(window.older, made_of, timeline, bags)
+        # A new dict: other threads look for the bags of their answers in the old one.
+        windows = {day: one for day, one in self._windows.items() if day != until} | {until: window}
+        dated = [day for day in windows if day != date.max]
+        self._windows = {day: windows[day] for day in (date.max, *dated[-_MOST_WINDOWS:])}
+        return window
+
+    def _read(self, made_of: Days, known: Mapping[str, LakeBag]) -> dict[str, LakeBag]:
+        """Returns the bags of some days by path; those that are known keep path and object."""
+        rows = self.lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
+        owners = {path: bag.bag_id for path, bag in known.items()}
+        schemas: dict[str, SummarySchema] = {}
+        of_day = Counter[date]()
+        groups: dict[tuple[date, int], dict[str, int]] = {}
+        found: dict[str, LakeBag] = {}
+        for row in rows.to_pylist():
+            schema, counts = row.pop("summary"), row.pop("counts")
+            bag = ShippedBag(**row)
+            path = f"{self.bag_dir}/{bag.file.removesuffix(COMPRESSED)}"
+            # Another bag may have it, whose name was used again.
+            if owners.setdefault(path, bag.bag_id) != bag.bag_id:
+                path = f"{path}-{bag.bag_id}"
+            if schema not in schemas:
+                schemas[schema] = SummarySchema.from_json(schema)
+            summary = BagSummary.decoded(schemas[schema], counts)
+            # One as large and as old may have other messages.
+            state = crc32(f"{bag.bag_id} {bag.sha256} {bag.made_of}".encode())
+            span = bag.start_ns, bag.end_ns
+            file = BagFile(path, bag.size, bag.mtime_ns, BagState.CLOSED, summary, *span, state)
+            before = known.get(path)
+            if before is not None and before.file == file:
+                file = before.file  # what was remembered of it stays
+            together = groups.setdefault((bag.day, of_day[bag.day] // _TOGETHER), {})
+            together[bag.bag_id] = state
+            of_day[bag.day] += 1
+            found[path] = LakeBag(bag.bag_id, bag.day, file, together)
+        return found
+
+
+def _missing(bags: Mapping[str, LakeBag], others: Mapping[str, LakeBag]) -> list[BagFile]:
+    """Returns the files of bags that are not, or not the same, among others."""
+    return [
+        bag.file
+        for path, bag in bags.items()
+        if path not in others or others[path].file is not bag.file
+    ]
+
+
+class _Head(NamedTuple):
+    """A channel of a bag: its number there, and whether the lake has its payloads."""
+
+    number: int
+    channel: Channel
+    has_payloads: bool
+
+
+@dataclass(eq=False, repr=False)
+class LakeReader(BagReader):
+    """An adapter of `BagReader`: the bags of one robot in a lake.
+
+    Messages of one time are in the order of their topics. Of images, clouds, scans and the like a
+    lake has the times alone: to read their payloads is refused.
+
+    Attributes:
+        index: its bags.
+        decoder: decodes messages, as it does those of files.
+        large: the turn to hold much of a bag.
+    """
+
+    index: LakeIndex
+    decoder: BagReader
+    large: LargeReads
+    _heads: ByteLru[Sequence[_Head]] = field(
+        default_factory=lambda: ByteLru(_HEADS_BYTES), init=False
+    )
+
+    def reads(self, path: Path) -> bool:
+        """Returns True: all files of the index are of the lake."""
+        del path
+        return True
+
+    def closing(self, path: Path) -> Closing:
+        """Returns that the bag is closed: others are not shipped."""
+        del path
+        return Closing.CLOSED
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns the summary of a bag of the index."""
+        return self.index.bag(path).file.summary
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        """Yields the messages.
+
+        Raises:
+            NotInLakeError: the lake has the times of a topic alone.
+        """
+        step = -1 if newest_first else 1
+        batches = [*self.batches(path, topics, window)][::step]
+        found = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
+        yield from heapq.merge(*found, key=attrgetter("log_time"), reverse=newest_first)
+
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """Yields the messages of a channel at once.
+
+        Raises:
+            NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
+        """
+        here = self.index.bag(path)
+        wanted = [head for head in self._heads_of(here) if head.channel.topic in topics]
+        names = sorted({head.channel.topic for head in wanted})
+        for head in wanted:
+            topic = head.channel.topic
+            if not head.has_payloads and topic not in bare:
+                raise NotInLakeError(
+                    f"the lake has only the times of {topic}, whose messages are large: name it in "
+                    "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's "
+                    "own memory"
+                )
+            data = self._packed_of(here, head.number, names)
+            if data is None:
+                raise BagError(str(path), f"the lake has no messages of {topic} any more")
+            if is_large(data):
+                self.large.acquire()
+            try:
+                batch = unpacked_messages(data, head.channel)
+            except ValueError as error:
+                raise BagError(str(path), f"{topic} in the lake: {error}") from error
+            inside = (batch.log_times >= window.start) & (batch.log_times < window.stop)
+            if inside.any():
+                yield batch if inside.all() else batch.taken(inside)
+
+    def times_alone(self, path: Path) -> Collection[str]:
+        """Returns the topics whose payloads were not shipped: their messages are large."""
+        heads = self._heads_of(self.index.bag(path))
+        return {head.channel.topic for head in heads if not head.has_payloads}
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns the channels of which the bag has messages."""
+        return [head.channel for head in self._heads_of(self.index.bag(path))]
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns why no message of this channel can be decoded; None if its type is known."""
+        return self.decoder.undecodable(channel)
+
+    def decode(self, record: Record) -> object:
+        """Decodes a message as that of a file."""
+        return self.decoder.decode(record)
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of a channel's messages, as of that of a file."""
+        return self.decoder.definition(channel)
+
+    def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
+        known = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
+        if known is not None:
+            return known
+        found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+            more = tuple((key, value) for key, value in json.loads(row["metadata"]))
+            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
+            head = _Head(row["channel"], shared(channel), row["has_payloads"])
+            found[row["bag_id"]].append(head)
+        for bag_id, heads in found.items():
+            size = _HEAD_BYTES * (1 + len(heads))
+            self._heads.put((bag_id, bag.together[bag_id]), heads, size)
+        return found[bag.bag_id]
+
+    def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
+        """Returns the packed messages of a channel; None where they are gone.
+
+        With it those of other `topics` are read, which are asked for next. Who has read one bag
+        and goes on, reads those beside it, too.
+        """
+        messages = self.index.lake.messages
+        known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
+        if known is None:
+            beside = [messages.get((*state, number)) for state in bag.together.items()]
+            bags = [*bag.together] if any(beside) else [bag.bag_id]
+            for row in self._select(_PACKED, bag, bags, topics=topics).to_pylist():
+                key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
+                messages.put(key, row["packed"], len(row["packed"]))
+                if key == (bag.bag_id, bag.file.sidecar_ns, number):
+                    known = row["packed"]
+        return known
+
+    def _select(self, sql: str, bag: LakeBag, bags: list[str], **more: Sequence[str]) -> pa.Table:
+        """Returns the rows of a select over the channels of some bags of a day."""
+        first, last = min(bags), max(bags)
+        lake = self.index.lake
+        of_day = lake.days("channels", self.index.robot).get(bag.day, ())
+        files = [file for file in of_day if file.first <= last and first <= file.last]
+        asked = {"bags": bags, "first": first, "last": last, **more}
+        return lake.select(sql, "channels", files, asked)
+
+
+def lake_memory(
+    index: LakeIndex,
+    clock: Clock,
+    limits: QuerySettings,
+    *,
+    extractor: SchemaExtractor,
+    decoder: BagReader,
+    large: LargeReads,
+    store: ColumnStore | None = None,
+    settings: str = "",
+) -> Memory:
+    """Returns what a bag directory's memory is, but for the index and what reads bags.
+
+    Args:
+        index: the robot's bags in the lake.
+        clock: the wall clock.
+        limits: the settings of queries.
+        extractor: knows the types of messages.
+        decoder: decodes messages.
+        large: the turn to hold much of a bag.
+        store: of the columns of its bags, which are made again from the lake; None for none.
+        settings: what follows from bags depends on, as a text.
+    """
+    return Memory(
+        index,
+        LakeReader(index, decoder, large),
+        extractor,
+        clock,
+        # Nothing is recorded here, and nothing deleted.
+        replace(limits, kept=None, recording="", screened=False),
+        Scanner(store, index.bag_dir, settings, large),
+        large=large,
+    )
