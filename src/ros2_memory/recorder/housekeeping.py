@@ -31,8 +31,9 @@ from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
-from ros2_memory.retention.clear import left_by_repair, remove_emptied, remove_if_empty, size_of
+from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector
+from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import os
 import pwd
-import re
-import stat
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,112 +27,10 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.core import directories
 from ros2_memory.core.directories import identity_at
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.retention.delete import is_journal
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-
-REPAIR_SUFFIX: Final = ".repair"
-_LEFTOVER: Final = re.compile(r"\.(?P<target>.+)\.tmp|\.(?P<bag>.+)" + re.escape(REPAIR_SUFFIX))
-_JOURNALS: Final = ("-wal", "-shm", "-journal")
-_JOURNAL: Final = re.compile(rf".+\.db3({'|'.join(_JOURNALS)})", re.IGNORECASE)
-
-
-def repair_name(name: str) -> str:
-    """Returns the name of a bag file while it is being repaired, which the index ignores."""
-    return f".{name}{REPAIR_SUFFIX}"
-
-
-def left_by_repair(name: str) -> bool:
-    """Whether a file was left by a repair that was interrupted."""
-    left = _LEFTOVER.fullmatch(name)
-    return left is not None and bag_kind(left["bag"] or "") is not None
-
-
-def goes_with_bags(name: str) -> bool:
-    """Whether a file of a recording has no meaning without its bags.
-
-    Those are the recorder's sidecars, and what a crash left of files being written.
-    """
-    left = _LEFTOVER.fullmatch(name)
-    if left is not None:
-        return left["target"] in RECORDING_FILES or left_by_repair(name)
-    return name in RECORDING_FILES or is_journal(name)
-
-
-def is_journal(name: str) -> bool:
-    """Whether a file is one that SQLite writes beside a bag."""
-    return _JOURNAL.fullmatch(name) is not None
-
-
-def remove_bag(root: Path, path: Path, inode: tuple[int, int]) -> int:
-    """Deletes one bag file below the root, and a sqlite bag's journals; returns its size in bytes.
-
-    Args:
-        root: the bag directory.
-        path: the file.
-        inode: the device and inode number that it must have.
-
-    Raises:
-        FileNotFoundError: it is not there any more.
-        OSError: it cannot be deleted, or is not the file that was looked at.
-    """
-    with directories.opened(root, path.parent) as directory:
-        status = os.stat(path.name, dir_fd=directory, follow_symlinks=False)
-        if not stat.S_ISREG(status.st_mode) or (status.st_dev, status.st_ino) != inode:
-            raise OSError(f"{path} is not the file that was looked at")
-        os.unlink(path.name, dir_fd=directory)
-        for suffix in _JOURNALS if path.suffix.lower() == ".db3" else ():
-            with suppress(FileNotFoundError, IsADirectoryError):
-                os.unlink(path.name + suffix, dir_fd=directory)
-        return status.st_size
-
-
-def remove_emptied(root: Path, recording: Path) -> None:
-    """Deletes a recording of which no bag is left.
-
-    A file that is not known by name is kept, and so is the directory then.
-
-    Raises:
-        OSError: a file or the directory cannot be deleted.
-    """
-    if recording == root:
-        return
-    with suppress(FileNotFoundError):
-        with directories.opened(root, recording) as directory:
-            with os.scandir(directory) as listing:
-                entries = list(listing)
-            if any(bag_kind(entry.name) for entry in entries):
-                return
-            sidecars = [entry.name for entry in entries if _is_sidecar(entry)]
-            for name in sidecars:
-                os.unlink(name, dir_fd=directory)
-            if len(entries) > len(sidecars):
-                return
-        with directories.opened(root, recording.parent) as above:
-            os.rmdir(recording.name, dir_fd=above)
-
-
-def beside_bags(recording: Path) -> int:
-    """Returns the bytes that are deleted with a recording's last bag; 0 for what cannot be read."""
-    size = 0
-    with suppress(OSError), os.scandir(recording) as entries:
-        for entry in entries:
-            if _is_sidecar(entry):
-                size += entry.stat(follow_symlinks=False).st_size
-    return size
-
-
-def _is_sidecar(entry: os.DirEntry[str]) -> bool:
-    return goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False)
-
-
-def size_of(path: Path) -> int:
-    """Returns the bytes of a regular file; 0 for anything else, and for what cannot be read."""
-    with suppress(OSError):
-        status = path.lstat()
-        return status.st_size if stat.S_ISREG(status.st_mode) else 0
-    return 0
-
 
 MOST_FAULTS: Final = 100
 

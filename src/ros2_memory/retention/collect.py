@@ -20,7 +20,7 @@ from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.metadata_yaml import bare_name
 from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.retention.clear import remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (

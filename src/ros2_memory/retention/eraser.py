@@ -51,7 +51,7 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.retention.clear import repair_name
+from ros2_memory.retention.delete import repair_name
 from ros2_memory.retention.repair import (
     Identity,
     beside,

@@ -31,7 +31,7 @@ from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.file_state import Classification, FileState
 from ros2_memory.index.segment import Pace, TopicTotals
-from ros2_memory.retention.clear import beside_bags, size_of
+from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention.clear import repair_name
+from ros2_memory.retention.delete import repair_name
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:

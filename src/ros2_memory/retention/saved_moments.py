@@ -45,7 +45,7 @@ from ros2_memory.core import directories
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
-from ros2_memory.retention.clear import size_of
+from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.retention.clear import remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.housekeepers import (

@@ -22,7 +22,7 @@ from ros2_memory.cli.output import print_json, print_line
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
-from ros2_memory.retention.clear import size_of
+from ros2_memory.retention.delete import size_of
 
 _MAX_LINKS_NAMED = 5
 _INSTEAD = "move or mount the bags into the bag directory"

@@ -65,7 +65,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.places.where import parse_where, times_in_region
-from ros2_memory.retention.clear import remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.storage.mcap.writer import McapWriter

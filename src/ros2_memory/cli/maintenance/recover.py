@@ -27,7 +27,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArguments
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, WallClock, unix_from_ns
 from ros2_memory.index.scan import Tree
-from ros2_memory.retention.clear import size_of
+from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.repair import Repairer, open_files
 
 RECENT_NS: Final[Ns] = 30 * NS_PER_S

@@ -31,7 +31,8 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.retention import collect
-from ros2_memory.retention.clear import clear_bags, remove_bag
+from ros2_memory.retention.clear import clear_bags
+from ros2_memory.retention.delete import remove_bag
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
 from ros2_memory.serving.page.span import span_shown
