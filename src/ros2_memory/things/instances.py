@@ -200,9 +200,10 @@ class Estimate:
         return chance_of_missing(self.cells, place, stay.stay, stay.last)
 
     def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
-        """Returns the thing and its stay of which is the first of some spots that is of any.
+        """Returns the thing, and its stay, that has the first of some spots that any thing has.
 
-        `seen` are rows of the `Sights.spots` of another estimate, of some of the same bags.
+        `seen` are rows of `Sights.spots` of another estimate (mm, ns), of some of the same bags.
+        Returns None where no thing has any of them.
         """
         alike = [Spot.N, Spot.X, Spot.Y, Spot.FIRST, Spot.LAST]
         spots = np.ascontiguousarray(self.sights.spots[:, alike])

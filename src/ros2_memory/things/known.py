@@ -85,7 +85,7 @@ class KnownThings:
 def known_things(
     view: View, min_score: float, spellings: Mapping[str, Sequence[str]], window: TimeWindow
 ) -> KnownThings:
-    """Returns the things as they were known at a window's end; of what could not be read says so.
+    """Returns the things known at a window's end. Notes say what could not be read.
 
     Raises:
         QueryTimeoutError: the call's time is over before any bag was read.
