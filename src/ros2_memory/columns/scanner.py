@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.coverage import Covering
+from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, Fragments
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
@@ -236,7 +237,7 @@ class Scanner:
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
         assert self.store is not None  # noqa: S101 - there are no parts without one
-        key = (self.store.offset, topic, path)
+        key = (topic, path)
         known, newest = self._all_zones.get(key) or (Zones.of([], []), 0)
         asked = int(parts.max(initial=0))
         if asked > newest:
@@ -349,4 +350,4 @@ class Scanner:
 
 def _outline_key(head: PartHead) -> FragmentKey:
     # Those of a day are read together: of one topic alone.
-    return FragmentKey(head.first, str(head.topic), (head.number,))
+    return FragmentKey(head.first, str(row_id(head.topic)), (head.number,))

@@ -177,7 +177,7 @@ class ColumnStore(Database):
         super().__init__(paths, sources=sources, waits_for=waits_for)
         self._definition_of = definition_of
         self._definitions = definitions
-        self._topics: tuple[int, dict[int, Topic]] = (0, {})
+        self._topics: dict[int, Topic] = {}
         self._layouts = Layouts()
 
     # Reading
@@ -269,29 +269,25 @@ class ColumnStore(Database):
         """Returns all topics that were ever stored, by their numbers."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
-            offset, known = self._topics
-            if offset != self.offset:  # those of a file that was lost had other numbers
-                known = {}
+            known = {each: topic for each, topic in self._topics.items() if self.is_current(each)}
             rows = connection.execute(
                 "SELECT topic.id, name, topic.encoding, latched, layout, type,"
                 " definition.encoding, text"
                 " FROM topic JOIN definition ON definition.id = definition WHERE topic.id > ?",
-                (max(known, default=0),),
+                (max(known, default=self.offset) - self.offset,),
             )
-            added: dict[int, Topic] = {}
             for number, name, encoding, latched, layout, *schema in rows:
                 channel = Channel(name, encoding, Schema(*schema), bool(latched))
-                added[number] = Topic(channel, Layout.from_json(layout), self._definition_of)
-            self._topics = self.offset, ({**known, **added} if added else known)
-            return self._topics[1]
+                topic = Topic(channel, Layout.from_json(layout), self._definition_of)
+                known[self.offset + number] = topic
+            self._topics = known
+            return known
 
         return self.read(ask, {})
 
     def topic(self, number: int) -> Topic | None:
         """Returns a topic by its number; None where there is none."""
-        offset, known = self._topics
-        found = known.get(number) if offset == self.offset else None
-        return found or self.topics().get(number)
+        return self._topics.get(number) or self.topics().get(number)
 
     def parts(self, topic: str, span: TimeWindow = _ALL_TIME, after: int = 0) -> list[PartHead]:
         """Returns the parts of a topic, of all its types, in the order of their first messages.
@@ -312,7 +308,7 @@ class ColumnStore(Database):
             return [
                 PartHead(
                     self.offset + number,
-                    of_topic,
+                    self.offset + of_topic,
                     first,
                     last,
                     np.array(json.loads(bags), np.int64) + self.offset,
@@ -332,7 +328,7 @@ class ColumnStore(Database):
             rows = connection.execute(
                 "SELECT part, least, greatest, nulls, words FROM zone"
                 " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
-                (topic, path, max(after - self.offset, 0)),
+                (topic - self.offset, path, max(after - self.offset, 0)),
             ).fetchall()
             parts = [self.offset + part for part, *_ in rows]
             return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
@@ -346,7 +342,7 @@ class ColumnStore(Database):
             rows = connection.execute(
                 "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
                 " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
-                (topic, path, json.dumps([part - self.offset for part in parts])),
+                (topic - self.offset, path, self._ids(parts)),
             )
             return {
                 part + self.offset: Packed(codec, count, error, zone_of(*zone), b"")
@@ -376,7 +372,7 @@ class ColumnStore(Database):
             row = connection.execute(
                 "SELECT data FROM fragment"
                 " WHERE kind = ? AND settings = ? AND start_ns = ? AND parts = ?",
-                (kind, key.settings, key.start, self._parts_of(key)),
+                (kind, key.settings, key.start, self._ids(key.parts)),
             ).fetchone()
             return None if row is None else bytes(row[0])
 
@@ -405,8 +401,8 @@ class ColumnStore(Database):
         """Returns the rows of a query; `none` where the file cannot be read."""
         return self.read(lambda connection: connection.execute(query, given).fetchall(), none)
 
-    def _parts_of(self, key: FragmentKey) -> str:
-        return json.dumps([part - self.offset for part in key.parts])
+    def _ids(self, parts: Iterable[int]) -> str:
+        return json.dumps([part - self.offset for part in parts])
 
     # Writing
 
@@ -420,7 +416,7 @@ class ColumnStore(Database):
             for key, data in made:
                 if not all(map(self.is_current, key.parts)):
                     continue
-                parts = self._parts_of(key)
+                parts = self._ids(key.parts)
                 cursor = connection.execute(
                     "INSERT OR IGNORE INTO fragment (kind, settings, start_ns, parts, data)"
                     " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="

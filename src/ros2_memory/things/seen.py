@@ -445,10 +445,14 @@ class _Parts(NamedTuple):
     def of(
         cls, view: View, topics: Sequence[str], window: TimeWindow, bags: Sequence[BagFile]
     ) -> _Parts | None:
-        """Returns the parts of some topics, and which bags are in parts; None without a store."""
+        """Returns the parts of some topics, and which bags are in parts.
+
+        None without a store, and where it failed meanwhile.
+        """
         scanner = view.memory.columns
         if scanner.store is None:
             return None
+        failures = scanner.store.failures
         # Before the parts: what is merged meanwhile is in none of those that are known.
         unmerged = scanner.store.unmerged()
         coverage = scanner.coverage(view.timeline)
@@ -467,6 +471,8 @@ class _Parts(NamedTuple):
             for head in scanner.parts(topic, window, coverage)
             if head.is_whole
         ]
+        if scanner.store.failures != failures:
+            return None
         heads.sort(key=lambda head: head.first)
         firsts = np.array([head.first for head in heads], np.int64)
         lasts = np.array([head.last for head in heads], np.int64)

@@ -16,13 +16,14 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
 from tests.support.bags import odom, text, write_mcap
-from tests.support.column_worlds import EVERYTHING, World, check_rows
+from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
 
 if TYPE_CHECKING:
     from ros2_memory.columns.store import PartHead
+    from ros2_memory.columns.zones import PartZones
 
 S = 10**9
 T0 = 1_700_000_000 * S
@@ -111,6 +112,25 @@ def test_parts_that_another_process_makes_meanwhile_hide_no_row(
     monkeypatch.setattr(world.store, "parts", after_a_merge)
     assert check_rows(world, "/odom") == 40
     assert world.store.unmerged() == frozenset()
+
+
+def test_a_file_that_is_replaced_while_a_scan_is_read_hides_no_row(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "hello")])
+    write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + S, 0.0, 0.0)])
+    world = World.of(tmp_path)
+    first, second = world.memory.index.snapshot().timeline.bags
+    world.fill_alone([first])
+
+    def may_say(parts: PartZones) -> bool:
+        return "data" in parts.topic.layout.slots
+
+    opened = open_scan(View(world.memory, Call()), "/chatter", EVERYTHING, may_match=may_say)
+    store_file(tmp_path).unlink()
+    world.store.look_after()
+    world.fill_alone([second])  # its topic has the id that the other one had
+    with pytest.raises(GoneError):
+        [*opened.rows()]
+    assert check_rows(world, "/chatter") == check_rows(world, "/odom") == 1
 
 
 @pytest.mark.parametrize("name", ["parts", "topics", "part_data", "state", "bags"])

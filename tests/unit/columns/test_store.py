@@ -37,7 +37,7 @@ from tests.support.bags import (
 from tests.support.column_worlds import World, check_all, store_file, times
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.pack import Packed
@@ -225,6 +225,53 @@ def test_a_file_that_is_lost_while_it_is_used_is_made_anew(tmp_path: Path) -> No
     store_file(tmp_path).unlink()
     world.store.look_after()
     assert check_all(world) == 4 * 24
+    assert world.fill() == 4
+    assert check_all(world) == 4 * 24
+
+
+def replace_log(path: Path) -> None:
+    """What another program does that takes the file for a new one."""
+    log = path.with_name(f"{path.name}-wal")
+    log.unlink()
+    log.touch()
+
+
+def delete_file(path: Path) -> None:
+    path.unlink()
+
+
+@pytest.mark.parametrize("fault", [replace_log, delete_file])
+def test_what_is_read_while_the_files_are_replaced_does_not_count(
+    tmp_path: Path, fault: Callable[[Path], None]
+) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    failures = world.store.failures
+
+    def read(connection: sqlite3.Connection) -> int:
+        fault(store_file(tmp_path))
+        return int(connection.execute("SELECT count(*) FROM part").fetchone()[0])
+
+    assert world.store.read(read, -1) == -1
+    assert world.store.failures > failures
+    assert world.stored() == set()
+    assert check_all(world) == 4 * 24
+
+
+@pytest.mark.parametrize("fault", [replace_log, delete_file])
+def test_nothing_is_written_to_files_that_were_replaced(
+    tmp_path: Path, fault: Callable[[Path], None]
+) -> None:
+    write_bags(tmp_path)
+    world = World.of(tmp_path)
+    world.fill()
+    fault(store_file(tmp_path))
+
+    def write(_: sqlite3.Connection) -> None:
+        pytest.fail("it wrote to files that another program may use")
+
+    assert not world.store.write(write)
     assert world.fill() == 4
     assert check_all(world) == 4 * 24
 
