@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import heapq
 import math
-from itertools import count
+from itertools import count, pairwise
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ros2_memory.core.model import Quaternion, Transform, Vector3
 
 Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+_Farthest: TypeAlias = "tuple[NDArray[np.intp], NDArray[np.intp], Numbers, NDArray[np.intp]]"
+"""Where intervals start and end; what is farthest in each: its squared deviation, and its index."""
 N = TypeVar("N", float, "NDArray[np.float64]")
 
 GIMBAL_LOCK_SINE: Final = 1 - 1e-14
@@ -29,6 +33,9 @@ _PARALLEL_COSINE: Final = 1 - 1e-10
 
 _MOST_LOPSIDED: Final = 64
 """How often, on average, a point may be looked at before intervals are halved instead."""
+
+_TOGETHER: Final = 1 << 14
+"""Of so many points deviations are computed at once: they stay in the processor's cache."""
 
 _BACKWARDS_WEIGHT: Final = 0.5**2
 """The weight, for squared deviations, of moving back along a segment."""
@@ -165,7 +172,10 @@ def simplified(
     Returns:
         The indices of the kept points, ascending, and the largest deviation (m) of another one.
     """
-    columns, found, error = points.T.copy(), [kept], 0.0
+    # What is the same everywhere, as z mostly is, is off by nothing.
+    columns = points.T[(points != points[0]).any(axis=0)].copy()
+    found, error = [kept], 0.0
+    looked_at: list[_Farthest] = []
     starts, ends = kept[:-1], kept[1:]
     for depth in count():
         inner = ends - starts > 1
@@ -173,6 +183,7 @@ def simplified(
         if not starts.size:
             break
         most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
+        looked_at.append((starts, ends, most, where))
         splits = most > tolerance_m * tolerance_m
         error = max(error, float(most[~splits].max(initial=0.0)))
         starts, ends, where = starts[splits], ends[splits], where[splits]
@@ -181,7 +192,13 @@ def simplified(
         found.append(where)
         if sum(map(len, found)) > at_most:
             return _worst_first(
-                columns, clock, kept, tolerance_m=tolerance_m, at_most=at_most, of_time=of_time
+                columns,
+                clock,
+                kept,
+                looked_at,
+                tolerance_m=tolerance_m,
+                at_most=at_most,
+                of_time=of_time,
             )
         starts, ends = np.append(starts, where), np.append(where, ends)
         order = np.argsort(starts)
@@ -193,25 +210,35 @@ def _worst_first(
     columns: NDArray[np.float64],
     clock: Numbers,
     kept: NDArray[np.intp],
+    looked_at: Sequence[_Farthest],
     *,
     tolerance_m: float,
     at_most: int,
     of_time: float,
 ) -> tuple[NDArray[np.intp], float]:
-    """Does what `simplified` does, the worst interval first: of a few points these are the best."""
+    """Does what `simplified` does, the worst interval first: of a few points these are the best.
+
+    `looked_at` is what is known of some intervals.
+    """
     found = kept.tolist()
     worst: list[tuple[float, int, int, int]] = []
+    known = {
+        (start, end): (-most, where)
+        for one in looked_at
+        for start, end, most, where in zip(*(each.tolist() for each in one), strict=True)
+    }
 
-    def look(starts: NDArray[np.intp], ends: NDArray[np.intp]) -> None:
-        inner = ends - starts > 1
-        starts, ends = starts[inner], ends[inner]
-        if starts.size:
-            most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
-            intervals = (-most).tolist(), where.tolist(), starts.tolist(), ends.tolist()
-            for item in zip(*intervals, strict=True):
-                heapq.heappush(worst, item)
+    def farthest(start: int, end: int) -> tuple[float, int]:
+        most, where = _farthest_of_each(columns, clock, np.array([start]), np.array([end]), of_time)
+        return -float(most[0]), int(where[0])
 
-    look(kept[:-1], kept[1:])
+    def look(*edges: int) -> None:
+        for start, end in pairwise(edges):
+            if end - start > 1:
+                off, where = known.get((start, end)) or farthest(start, end)
+                heapq.heappush(worst, (off, where, start, end))
+
+    look(*found)
     scans_left = _MOST_LOPSIDED * len(clock)
     while worst and -worst[0][0] > tolerance_m * tolerance_m and len(found) < at_most:
         _, split, start, end = heapq.heappop(worst)
@@ -219,7 +246,7 @@ def _worst_first(
         if scans_left < 0:
             split = (start + end) // 2
         found.append(split)
-        look(np.array([start, split]), np.array([split, end]))
+        look(start, split, end)
     error = math.sqrt(-worst[0][0]) if worst else 0.0
     return np.sort(np.array(found, np.intp)), error
 
@@ -238,31 +265,43 @@ def _farthest_of_each(
     Returns:
         The squared deviation (m2) of each, and its index.
     """
-    inside = ends - starts - 1
-    begins = np.cumsum(inside) - inside
-    of = np.repeat(np.arange(len(starts)), inside)
-    at = np.arange(len(of)) - begins[of] + starts[of] + 1
     chords = columns[:, ends] - columns[:, starts]
     squared = (chords * chords).sum(axis=0)
     # A chord that is too short to divide by is a point, as that of a closed loop.
     scale = np.divide(1.0, squared, out=np.zeros(len(squared)), where=squared > _SHORTEST_SQUARED)
-    # `columns[:, at]` would be in the order of `at` in memory, which is slow to add up.
-    chord = chords.take(of, axis=1)
-    here = columns.take(at, axis=1) - columns.take(starts, axis=1).take(of, axis=1)
-    along = ((here * chord).sum(axis=0) * scale[of]).clip(0.0, 1.0)
-    off = ((here - along * chord) ** 2).sum(axis=0)
-    # How far along the points before are, of each interval alone: those of a later interval are
-    # greater by 2 than all before.
-    back = np.maximum.accumulate(along + 2.0 * of) - 2.0 * of - along
-    np.maximum(off, back * back * squared[of] * _BACKWARDS_WEIGHT, out=off)
     lasted = clock[ends] - clock[starts]
-    rate = np.divide(1.0, lasted, out=np.zeros(len(lasted)), where=lasted > 0)[of]
-    on_time = (clock[at] - clock[starts][of]) * rate
-    late = ((here - on_time * chord) ** 2).sum(axis=0) * of_time**2
-    np.maximum(off, np.where(rate > 0, late, 0.0), out=off)
-    most = np.maximum.reduceat(off, begins)
-    farthest = np.flatnonzero(off == most[of])
-    where = np.empty(len(starts), np.intp)
-    # The first of several that are as far: written last.
-    where[of[farthest[::-1]]] = at[farthest[::-1]]
+    rate = np.divide(1.0, lasted, out=np.zeros(len(lasted)), where=lasted > 0)
+    stops = np.cumsum(ends - starts - 1)
+    begins = stops - (ends - starts - 1)
+    most, where = np.zeros(len(starts)), starts + 1
+    reached = 0.0
+    for low in range(0, int(stops[-1]), _TOGETHER):
+        high = min(low + _TOGETHER, int(stops[-1]))
+        first, end = np.searchsorted(begins, (low + 1, high)) - (1, 0)
+        edges = np.append(begins[first:end], high).clip(low)
+        of = np.repeat(np.arange(first, end), np.diff(edges))
+        at = np.arange(low, high) + (starts + 1 - begins)[of]
+        # `columns[:, at]` would be in the order of `at` in memory, which is slow to add up.
+        chord = chords.take(of, axis=1)
+        here = columns.take(at, axis=1) - columns.take(starts[of], axis=1)
+        along = ((here * chord).sum(axis=0) * scale[of]).clip(0.0, 1.0)
+        off = ((here - along * chord) ** 2).sum(axis=0)
+        # How far along the points before are, of each interval alone: those of a later interval
+        # are greater by 2 than all before.
+        farthest = along + 2.0 * of
+        if begins[first] < low:
+            farthest[0] = max(farthest[0], reached)
+        np.maximum.accumulate(farthest, out=farthest)
+        reached = farthest[-1]
+        back = farthest - 2.0 * of - along
+        np.maximum(off, back * back * squared[of] * _BACKWARDS_WEIGHT, out=off)
+        on_time = (clock[at] - clock[starts[of]]) * rate[of]
+        late = ((here - on_time * chord) ** 2).sum(axis=0) * of_time**2
+        np.maximum(off, np.where(rate[of] > 0, late, 0.0), out=off)
+        greatest = np.maximum.reduceat(off, edges[:-1] - low)
+        is_greater = greatest > most[first:end]
+        most[first:end][is_greater] = greatest[is_greater]
+        # The first of several that are as far: written last.
+        found = np.flatnonzero((off == most[of]) & is_greater[of - first])[::-1]
+        where[of[found]] = at[found]
     return most, where

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation, Slerp  # type: ignore[import-untyped]
 
+from ros2_memory.core import geometry
 from ros2_memory.core.geometry import (
     distance,
     multiply,
@@ -232,6 +233,18 @@ def test_simplifying_keeps_both_ends_and_the_order(path: list[Vector3], toleranc
     kept = simplify(path, tolerance_m)
     assert kept == sorted(set(kept))
     assert (kept[0], kept[-1]) == (0, len(path) - 1)
+
+
+@given(any_paths, st.integers(2, 20), st.floats(0.0, 5.0), st.integers(1, 20))
+@example([(x, 0.0, 0.0) for x in (0.0, 4.0, 8.0, 7.0, 6.0, 5.0, 6.0, 7.0, 12.0)], 20, 0.6, 3)
+def test_how_many_points_are_looked_at_together_changes_no_drawing(
+    path: list[Vector3], at_most: int, tolerance_m: float, together: int
+) -> None:
+    seconds = [float(n) for n in range(len(path))]
+    whole = drawn(path, tolerance_m, at_most, seconds)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(geometry, "_TOGETHER", together)
+        assert drawn(path, tolerance_m, at_most, seconds) == whole
 
 
 @given(any_paths, st.integers(2, 20))

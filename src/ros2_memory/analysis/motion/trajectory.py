@@ -286,17 +286,20 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     """Joins slices in order, of which there is one at least; see `path_slice`."""
     slices = [*_together(slices, fastest_mps)]
     motion = Motion(fastest_mps)
-    lines: list[Line] = []
+    jumped: list[bool] = []
+    added: list[float] = []
     for some in slices:
-        jumped = motion.join(some.totals)
+        jumped.append(motion.join(some.totals))
         # What joining adds to the slice's own length is driven up to its first vertex.
-        metres = some.line.metres + (motion.totals.distance_m - some.totals.distance_m)
-        jumps = some.line.jumps.copy()
-        jumps[:1] |= jumped
-        lines.append(replace(some.line, metres=metres, jumps=jumps))
-    line = stacked(lines)
+        added.append(motion.totals.distance_m - some.totals.distance_m)
+    line = stacked([some.line for some in slices])
+    vertices = np.array([len(some.line) for some in slices])
+    firsts = (np.cumsum(vertices) - vertices)[vertices > 0]
+    jumps = line.jumps.copy()
+    jumps[firsts] |= np.array(jumped)[vertices > 0]
+    metres = line.metres + np.repeat(added, vertices)
     # Where two places turn out to be one, joining takes some metres back.
-    metres = np.maximum.accumulate(np.minimum(line.metres, motion.totals.distance_m))
+    metres = np.maximum.accumulate(np.minimum(metres, motion.totals.distance_m))
     twists = [some.twist for some in slices if some.twist is not None]
     return PathSlice(
         slices[0].first,
@@ -307,7 +310,7 @@ def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
         max(some.step_mps for some in slices),
         max(twists, default=None),
         tuple(dict.fromkeys(frame for some in slices for frame in some.frames)),
-        replace(line, metres=metres),
+        replace(line, metres=metres, jumps=jumps),
         max(some.error_m for some in slices),
     )
 
