@@ -4,28 +4,23 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-from ros2_memory.analysis.motion.standstills import (
-    BLOCK_NS,
-    PER_METRE,
-    Blocks,
-    Stands,
-    joined_blocks,
-)
+from ros2_memory.analysis.motion.standstills import PackedBlocks, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.core.arrays import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from typing import Never
 
-    from ros2_memory.columns.fragments import Array
     from ros2_memory.core.model import Vector3
 
 
@@ -116,36 +111,16 @@ def _vector(numbers: Vector3) -> Vector3:
 
 
 def _stands_fragment(stands: Stands) -> Fragment:
-    blocks = stands.blocks
-    begins = blocks.numbers * BLOCK_NS
-    arrays: dict[str, Array] = {
-        "numbers": blocks.numbers,
-        "firsts": (blocks.firsts - begins).astype(np.uint32),
-        "lasts": (blocks.lasts - begins).astype(np.uint32),
-        "noises": blocks.noises.astype(np.float32),
-        "lows": np.rint(blocks.lows * PER_METRE).astype(np.int64),
-        "highs": np.rint(blocks.highs * PER_METRE).astype(np.int64),
-        "starts": blocks.starts,
-        "ends": blocks.ends,
-    }
+    arrays = {each.name: getattr(stands.packed, each.name) for each in fields(stands.packed)}
     return Fragment(json.dumps([stands.drops, stands.last]), arrays)
 
 
 def _stands_of(fragment: Fragment) -> Stands:
     drops, last = json.loads(fragment.head)
-    numbers = fragment.integers("numbers")
-    begins = numbers * BLOCK_NS
-    blocks = Blocks(
-        numbers,
-        begins + fragment.integers("firsts"),
-        begins + fragment.integers("lasts"),
-        fragment.floats("noises").astype(np.float64),
-        fragment.vectors("lows") / PER_METRE,
-        fragment.vectors("highs") / PER_METRE,
-        fragment.integers("starts"),
-        fragment.integers("ends"),
-    )
-    return Stands(blocks, tuple(SpeedDrop(*drop) for drop in drops), last)
+    arrays = {each.name: fragment.arrays[each.name] for each in fields(PackedBlocks)}
+    # By name: each array has one type.
+    packed = PackedBlocks(**cast("dict[str, Never]", arrays))
+    return Stands(packed, tuple(SpeedDrop(*drop) for drop in drops), last)
 
 
 PATHS: Final = Kind("path", _path_fragment, _path_of)
@@ -153,9 +128,9 @@ PATHS: Final = Kind("path", _path_fragment, _path_of)
 
 
 def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
-    blocks = joined_blocks([stands.blocks for stands in found])
     drops = tuple(drop for stands in found for drop in stands.drops)
-    return [Stands(blocks, drops, max(stands.last for stands in found))]
+    packed = stacked([stands.packed for stands in found])
+    return [Stands(packed, drops, max(stands.last for stands in found))]
 
 
 STANDS: Final = Kind("stands", _stands_fragment, _stands_of, _joined_stands)

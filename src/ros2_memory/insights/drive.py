@@ -14,7 +14,6 @@ from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
-    NO_BLOCKS,
     SHORTEST_NS,
     joined_blocks,
     stands_of,
@@ -145,7 +144,7 @@ def _standstills_in(
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     stands = [one for _, one in _stands(view, topic, window.widened(CONTEXT_NS))][::-1]
-    found = standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)]))
+    found = standstills_of(joined_blocks([each.packed for each in stands]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(

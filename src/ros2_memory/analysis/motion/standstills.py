@@ -28,7 +28,7 @@ first differences; those of second order have six times the variance of the nois
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 
     Ints: TypeAlias = NDArray[np.int64]
     Marks: TypeAlias = NDArray[np.bool_]
+    Corners: TypeAlias = NDArray[np.int32] | NDArray[np.int64]
 
 SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
@@ -158,28 +159,81 @@ _NOWHERE: Final = np.empty((0, 3))
 NO_BLOCKS: Final = Blocks(_NONE, _NONE, _NONE, np.empty(0), _NOWHERE, _NOWHERE, _NONE, _NONE)
 
 
-def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
-    """Returns the blocks of stretches of time that follow each other, of which there is one."""
-    return stacked(parts)
+@dataclass(frozen=True, slots=True, eq=False)
+class PackedBlocks:
+    """`Blocks` in fewer bytes, as they are stored and remembered: a week has 300,000.
+
+    `firsts` and `lasts` count from where their block begins, corners in 1 / `PER_METRE`.
+    """
+
+    numbers: Ints
+    firsts: NDArray[np.uint32]
+    lasts: NDArray[np.uint32]
+    noises: NDArray[np.float32]
+    lows: Corners
+    highs: Corners
+    starts: Ints
+    ends: Ints
+
+    @classmethod
+    def of(cls, blocks: Blocks) -> PackedBlocks:
+        """Returns blocks in this form."""
+        begins = blocks.numbers * BLOCK_NS
+        return cls(
+            blocks.numbers,
+            (blocks.firsts - begins).astype(np.uint32),
+            (blocks.lasts - begins).astype(np.uint32),
+            blocks.noises.astype(np.float32),
+            _in_units(blocks.lows),
+            _in_units(blocks.highs),
+            blocks.starts,
+            blocks.ends,
+        )
+
+    def unpacked(self) -> Blocks:
+        """Returns the blocks."""
+        begins = self.numbers * BLOCK_NS
+        return Blocks(
+            self.numbers,
+            begins + self.firsts,
+            begins + self.lasts,
+            self.noises.astype(np.float64),
+            self.lows / PER_METRE,
+            self.highs / PER_METRE,
+            self.starts,
+            self.ends,
+        )
+
+    @property
+    def memory_bytes(self) -> int:
+        """How much memory the arrays take."""
+        return sum(getattr(self, each.name).nbytes for each in fields(self))
+
+
+def _in_units(corners: Vectors) -> Corners:
+    units = np.rint(corners * PER_METRE).astype(np.int64)
+    # Within 214 km of the origin, which a position in UTM is not.
+    is_small = bool((np.abs(units) < 2**31).all())
+    return units.astype(np.int32) if is_small else units
 
 
 class Stands(NamedTuple):
     """What shows where the robot stood in a stretch of time.
 
     Attributes:
-        blocks: see there.
+        packed: its blocks.
         drops: sudden losses of speed; standstills may follow.
         last: log time (ns) of the last pose at a place; `MIN_NS` without one.
     """
 
-    blocks: Blocks
+    packed: PackedBlocks
     drops: tuple[SpeedDrop, ...]
     last: Ns
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 1000 + 96 * len(self.blocks) + 200 * len(self.drops)
+        return 2000 + self.packed.memory_bytes + 200 * len(self.drops)
 
 
 def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
@@ -187,7 +241,7 @@ def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
     inside = poses.between(start, stop)
     places = inside.times[are_places(inside.positions)]
     return Stands(
-        blocks_of(poses, start, stop),
+        PackedBlocks.of(blocks_of(poses, start, stop)),
         tuple(each for each in speed_drops(poses) if start <= each.time < stop),
         int(places[-1]) if places.size else MIN_NS,
     )
@@ -359,6 +413,11 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
     found[known] = np.sqrt(middles / 6 / 0.6)
     return found
+
+
+def joined_blocks(parts: Sequence[PackedBlocks]) -> Blocks:
+    """Returns the blocks of stretches of time that follow each other, maybe none."""
+    return stacked([PackedBlocks.of(NO_BLOCKS), *parts]).unpacked()
 
 
 def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:

@@ -11,7 +11,6 @@ import numpy as np
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     BLOCK_NS,
-    NO_BLOCKS,
     joined_blocks,
     stands_of,
     standstills_of,
@@ -68,4 +67,4 @@ def stood_in(
         for number in np.unique(poses.times // length).tolist()
     ]
     drops = [drop for stand in stands for drop in stand.drops]
-    return standstills_of(joined_blocks([NO_BLOCKS, *(each.blocks for each in stands)])), drops
+    return standstills_of(joined_blocks([each.packed for each in stands])), drops
