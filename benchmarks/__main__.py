@@ -14,13 +14,12 @@ from typing import TYPE_CHECKING, Final, cast
 
 from benchmarks import plain, recorder, report, timing, worlds
 from benchmarks.bags import Topic
-from benchmarks.questions import questions
+from benchmarks.questions import Question, questions
 from benchmarks.report import Line, milliseconds
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from benchmarks.questions import Question
     from benchmarks.timing import Asked, Ran
     from ros2_memory.core.model import JsonValue
 

@@ -26,14 +26,13 @@ from benchmarks.worlds import STRANGERS
 from ros2_memory.bootstrap import NEW_OBJECTS, build_dispatcher, build_memory
 from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.options import EXIT_NEGATIVE
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.logging_setup import configure_logging
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from benchmarks.questions import Question
-    from ros2_memory.config import Settings
     from ros2_memory.core.model import JsonValue
     from ros2_memory.serving.dispatch import Dispatcher
 

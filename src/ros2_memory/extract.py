@@ -23,9 +23,11 @@ from ros2_memory.core.model import (
     Geodetic,
     JsonValue,
     Pose,
+    Quaternion,
     StampedTransform,
     Transform,
     Twist,
+    Vector3,
 )
 from ros2_memory.core.text import listed
 from ros2_memory.messages.conversions import (
@@ -57,7 +59,6 @@ from ros2_memory.messages.to_json import MAX_SQUEEZE, ExactJson, ReplyJson
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
 
-    from ros2_memory.core.model import Quaternion, Vector3
     from ros2_memory.core.timebase import Ns
 
 MAX_SHOWN_CHARS: Final = 20_000

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Trajectory
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import Pose, Sample, TimeWindow
+from ros2_memory.core.model import BagFile, JsonValue, Pose, Sample, TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -35,7 +35,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
-from ros2_memory.history.context import READING_S
+from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import (
     by_remark,
@@ -48,6 +48,7 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.driven_path import (
+    Body,
     driven_path,
     newest_of_body,
     resolve_path_topic,
@@ -86,7 +87,7 @@ from ros2_memory.history.view import (
     open_span,
     open_view,
 )
-from ros2_memory.index.clock_faults import FUTURE_NS
+from ros2_memory.index.clock_faults import FUTURE_NS, ClockFault
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.fields import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
@@ -105,13 +106,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.motion.trajectory import Trajectory
-    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import Extracted
-    from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.driven_path import Body
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
 A = TypeVar("A", results.Match, results.ValueWhen)

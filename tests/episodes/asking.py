@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from tests.episodes.questions import (
     AFTER,
@@ -16,13 +16,11 @@ from tests.episodes.questions import (
     LONG,
     OFTEN,
     USING,
+    Question,
     date_of,
     unix,
 )
 from tests.episodes.world import ACTION, TASK, day_start
-
-if TYPE_CHECKING:
-    from tests.episodes.questions import Question
 
 _MOST: Final = 100
 

@@ -7,7 +7,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING
 
-from tests.faults.running import load, serving
+from tests.faults.running import Running, load, serving
 from tests.faults.test_store_faults import assert_sound
 from tests.faults.world import write_bag, write_bags
 from tests.support.column_worlds import store_file
@@ -16,7 +16,6 @@ from tests.support.processes import until
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.faults.running import Running
 
 COUNT = 12
 

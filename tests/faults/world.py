@@ -14,8 +14,8 @@ from ros2_memory.bootstrap import build_backfill, build_memory
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import EpisodicError
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call
+from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ros2_memory.columns.store import ColumnStore
-    from ros2_memory.core.timebase import Clock
-    from ros2_memory.history.context import Memory
     from ros2_memory.serving.backfill import Backfill
 
 T0_S = 1_700_000_000

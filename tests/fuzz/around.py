@@ -10,14 +10,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from tests.fuzz.good import goods
+from tests.fuzz.good import Good, goods
 from tests.fuzz.mutant import Mutant, Trap, mutant_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
 
-    from tests.fuzz.good import Good
 
 _METADATA: Final = """rosbag2_bagfile_information:
   version: 5

@@ -14,11 +14,12 @@ import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.fuzz.good import BASE_S, goods
+from tests.fuzz.good import BASE_S, Good, goods
 from tests.fuzz.mutant import Mutant, mutant_file, mutant_of
 from tests.fuzz.records import (
     MAGIC,
     RECORD,
+    Piece,
     channel,
     chunk_of,
     header,
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from random import Random
 
-    from tests.fuzz.good import Good
-    from tests.fuzz.records import Piece
 
 _BASE: Final = BASE_S * NS_PER_S
 _MB: Final = 1 << 20

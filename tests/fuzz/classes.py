@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from tests.fuzz import around, bombs, bytewise, content, definitions, indexes, tables
-from tests.fuzz.good import goods, mcaps, sqlites
+from tests.fuzz.good import Good, goods, mcaps, sqlites
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from tests.fuzz.good import Good
     from tests.fuzz.mutant import Mutant, Mutation
 
 

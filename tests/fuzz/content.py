@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
-from tests.fuzz.good import BASE_S, mcaps, run_of, sqlites
+from tests.fuzz.good import BASE_S, Good, mcaps, run_of, sqlites
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import (
     Piece,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from random import Random
 
-    from tests.fuzz.good import Good
 
 _BASE: Final = BASE_S * NS_PER_S
 _PAGE: Final = 4096

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.timebase import NS_PER_S
 from tests.fuzz.content import db3_with
-from tests.fuzz.good import BASE_S
+from tests.fuzz.good import BASE_S, Good
 from tests.fuzz.mutant import Mutant, mutant_of
 from tests.fuzz.records import channel, header, message, schema, without_summary
 from tests.support.bags import Msg
@@ -14,7 +14,6 @@ from tests.support.bags import Msg
 if TYPE_CHECKING:
     from random import Random
 
-    from tests.fuzz.good import Good
 
 _BASE: Final = BASE_S * NS_PER_S
 _BAR: Final = "=" * 80

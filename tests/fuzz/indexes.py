@@ -14,14 +14,13 @@ from typing import TYPE_CHECKING, Final
 from mcap.opcode import Opcode
 
 from tests.fuzz.mutant import Mutant, mutant_of
-from tests.fuzz.records import as_it_was, pieces, with_summary_sealed
+from tests.fuzz.records import Piece, as_it_was, pieces, with_summary_sealed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from random import Random
 
     from tests.fuzz.good import Good
-    from tests.fuzz.records import Piece
 
 _PAIR: Final = 16
 _INDEX_PAGES: Final = (2, 10)

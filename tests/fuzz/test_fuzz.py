@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from tests.fuzz.campaign import Child, campaign
+from tests.fuzz.campaign import Child, Tally, campaign
 from tests.fuzz.classes import CLASSES, Job
 from tests.fuzz.good import goods, sqlites
 from tests.fuzz.holding import hold, truth_of
@@ -22,7 +22,6 @@ from tests.fuzz.trial import World
 from tests.support.examples import LONG
 
 if TYPE_CHECKING:
-    from tests.fuzz.campaign import Tally
     from tests.fuzz.oracle import Readable
 
 SEED: Final = 1

@@ -19,24 +19,21 @@ from ros2_memory import cli
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.cli.maintenance.recover import recover_files
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
 from tests.fuzz.asking import OF_GOOD, ask, comparable, of_mutant
-from tests.fuzz.good import neighbours
+from tests.fuzz.good import Good, neighbours
 from tests.fuzz.holding import hold, truth_of
-from tests.fuzz.mutant import LONG_AGO_S
+from tests.fuzz.mutant import LONG_AGO_S, Mutant
 from tests.fuzz.traps import sprung
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, MutableMapping
 
-    from ros2_memory.config import Settings
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.mcp_server import EpisodicServer
     from tests.fuzz.classes import Job
-    from tests.fuzz.good import Good
-    from tests.fuzz.mutant import Mutant
     from tests.fuzz.oracle import Readable
 
 MOST_S: Final = 10.0

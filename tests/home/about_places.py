@@ -9,16 +9,14 @@ import numpy as np
 
 from tests.home import messages, replies
 from tests.home.flat import HALL, ROOMS, room_at
-from tests.home.judging import Number, Series, Time, Words
-from tests.home.questions import Question, ToolCall, ask, in_words
+from tests.home.judging import Answer, Expected, Number, Series, Time, Words
+from tests.home.questions import Asked, Question, ToolCall, ask, in_words
 from tests.home.things import DAY
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import JsonValue
-    from tests.home.judging import Answer, Expected
-    from tests.home.questions import Asked
     from tests.home.replies import Row
     from tests.home.truth import Span
 

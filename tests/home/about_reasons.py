@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from tests.home import replies
 from tests.home.days import CLOCK_STEP_S
-from tests.home.judging import Number, Time, Words, YesNo
-from tests.home.questions import Question, ask, in_words
+from tests.home.judging import Answer, Number, Time, Words, YesNo
+from tests.home.questions import Asked, Question, ask, in_words
 from tests.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from tests.home.judging import Answer
-    from tests.home.questions import Asked
     from tests.home.replies import Row
     from tests.home.truth import Standstill
 

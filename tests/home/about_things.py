@@ -10,19 +10,16 @@ from tests.home import replies
 from tests.home.camera import PERSON
 from tests.home.flat import FRONT_DOOR
 from tests.home.instances import point_of
-from tests.home.judging import Names, Number, Order, Time, Words, YesNo
-from tests.home.questions import Question, ask
-from tests.home.things import NEVER_SEEN
+from tests.home.judging import Answer, Expected, Names, Number, Order, Time, Words, YesNo
+from tests.home.questions import Asked, Question, ask
+from tests.home.things import NEVER_SEEN, Place
 from tests.home.world import VISION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from tests.home.judging import Answer, Expected
-    from tests.home.questions import Asked
     from tests.home.replies import Row
-    from tests.home.things import Place
     from tests.home.truth import PlaceOfThing, ThingTruth
 
 _WITHIN_M: Final = 0.4

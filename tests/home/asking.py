@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.maintenance.index import fill_store
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.logging_setup import configure_logging
 from tests.home import replies
 from tests.home.judging import wrong_fields
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.config import Settings
     from ros2_memory.serving.mcp_server import EpisodicServer
     from tests.home.questions import Question
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from tests.home.flat import clear_lines
-from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS
+from tests.home.things import LABELS, NEAR_NAMES, NONSENSE, PLURALS, Thing
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from tests.home.paths import Pose
     from tests.home.people import Person
-    from tests.home.things import Thing
 
 CAMERA: Final = (0.15, 0.0, 0.40)
 """The camera's position (m) in `base_link`; it looks straight ahead."""

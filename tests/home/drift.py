@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from tests.home.days import SLIP_M
+from tests.home.days import SLIP_M, Life, Scale
 from tests.home.paths import Pose
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from benchmarks.motion import Floats
     from numpy.typing import NDArray
 
-    from tests.home.days import Life, Scale
 
 _STEP_S: Final = 1.0
 _DRIFT_M: Final = 0.006

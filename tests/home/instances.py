@@ -17,7 +17,7 @@ import numpy as np
 from tests.home import replies
 from tests.home.camera import in_view
 from tests.home.paths import Pose
-from tests.home.world import VISION
+from tests.home.world import VISION, World
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from tests.home.replies import Row
     from tests.home.things import Place
     from tests.home.truth import PlaceOfThing, ThingTruth, Truth
-    from tests.home.world import World
 
 _SAME_M: Final = 0.7
 """A place that is reported so near to a true one is that one: half of the way to another."""

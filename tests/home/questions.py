@@ -13,18 +13,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from tests.home.days import CLOCK_STEP_S
+from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.judging import Answer, Expected, Time
 from tests.home.replies import Row
 from tests.home.things import DAY
-from tests.home.truth import truth_of
-from tests.home.world import START_S, world_of
+from tests.home.truth import PlaceOfThing, ThingTruth, Truth, truth_of
+from tests.home.world import START_S, World, world_of
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
-    from tests.home.days import Scale
-    from tests.home.truth import PlaceOfThing, ThingTruth, Truth
-    from tests.home.world import World
 
 KINDS: Final = ("spatial", "temporal", "counting", "change", "routine", "why", "reliability")
 Reader: TypeAlias = Callable[[Sequence[Row]], Answer]

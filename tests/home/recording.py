@@ -29,14 +29,13 @@ from tests.home.messages import (
 )
 from tests.home.things import LABELS
 from tests.home.truth import places
-from tests.home.world import world_of
+from tests.home.world import Recording, World, world_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
     from tests.home.days import Scale
-    from tests.home.world import Recording, World
 
 _CHUNK_BYTES: Final = 16 * 1024
 _LEFT: Final = 0.6

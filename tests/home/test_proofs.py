@@ -8,12 +8,11 @@ import pytest
 
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.tools.spec_tools import build_tools
-from tests.support.program import exits
+from tests.support.program import Program, exits
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.support.program import Program
 
 __all__ = ["exits"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
@@ -13,10 +12,7 @@ from rosbags.rosbag2 import Reader
 
 from tests.home.days import Scale
 from tests.home.recording import write_world
-from tests.home.world import world_of
-
-if TYPE_CHECKING:
-    from tests.home.world import World
+from tests.home.world import World, world_of
 
 pytestmark = pytest.mark.xdist_group("home")
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import numpy as np
 
 from tests.home import flat
-from tests.home.days import CLOCK_STEP_S
-from tests.home.things import DAY
-from tests.home.world import START_S, world_of
+from tests.home.days import CLOCK_STEP_S, Scale
+from tests.home.things import DAY, Place, Thing
+from tests.home.world import START_S, World, world_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,9 +26,6 @@ if TYPE_CHECKING:
     from benchmarks.motion import Floats
 
     from ros2_memory.core.model import JsonValue
-    from tests.home.days import Scale
-    from tests.home.things import Place, Thing
-    from tests.home.world import World
 
 Span: TypeAlias = tuple[float, float]
 VIEW_GAP_S: Final = 5.0

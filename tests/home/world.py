@@ -11,7 +11,7 @@ import numpy as np
 
 from tests.home import camera, days, drift, things
 from tests.home.paths import Pose
-from tests.home.people import people
+from tests.home.people import Person, people
 
 if TYPE_CHECKING:
     from benchmarks.motion import Floats
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from tests.home.camera import Sights
     from tests.home.days import Life, Scale
     from tests.home.drift import Drift
-    from tests.home.people import Person
     from tests.home.things import Thing
 
 START_S: Final = 1_772_409_600

@@ -12,7 +12,7 @@ from mcp.types import TextResourceContents
 
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.config import load_settings
-from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI
+from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, EpisodicServer
 from tests.integration.browser import Browser, browsing, needs_chromium
 from tests.integration.chat_host import ChatHost, chat_host
 from tests.integration.test_page import ATTACK, painted, write_history
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.serving.mcp_server import EpisodicServer
 
 pytestmark = needs_chromium
 

@@ -15,12 +15,11 @@ import threading
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory import cli
-from ros2_memory.bag_dir.moment_file import PendingRequest, stored_moments_in
+from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import identity_of
 from tests.support.bags import odom, write_mcap
@@ -28,9 +27,6 @@ from tests.support.examples import LONG
 from tests.support.housekeepers import size_of
 from tests.support.memories import ROOT
 from tests.support.processes import until
-
-if TYPE_CHECKING:
-    from ros2_memory.bag_dir.moment_file import Outcome
 
 S = 10**9
 ROUNDS = 24 if LONG else 8

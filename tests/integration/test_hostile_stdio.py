@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import threading
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from tests.soak.clients import hostile_bodies, opening
 from tests.soak.wire import call
@@ -16,7 +16,6 @@ from tests.support.robot_run import T0_S, write_run
 
 if TYPE_CHECKING:
     from pathlib import Path
-    from typing import IO
 
 GARBAGE = (b"", b"\x00", b"\xff\xff", b'"x"', b"[]", b"7", b"{", b"[" * 100_000)
 LAST = 99

@@ -21,14 +21,21 @@ from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG
-from tests.support.live_recorder import NS_PER_S, bag_files, machine, number_of, publishing
+from tests.support.live_recorder import (
+    NS_PER_S,
+    LiveRecorder,
+    Machine,
+    bag_files,
+    machine,
+    number_of,
+    publishing,
+)
 from tests.support.ros_processes import ros_environment, wait_for
 from tests.timing import each_in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tests.support.live_recorder import LiveRecorder, Machine
     from tests.support.real_recorder import RealRecorder
 
 LOAD_S: Final = 3600 if LONG else 8

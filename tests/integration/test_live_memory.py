@@ -21,6 +21,7 @@ from tests.support.live_recorder import (
     RECORDED_TOPICS,
     Answer,
     LiveRecorder,
+    Machine,
     answering,
     answers,
     await_answerable,
@@ -43,7 +44,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.integration.test_server_process import Served
-    from tests.support.live_recorder import Machine
 
 HZ: Final = 50.0
 AGO_S: Final = 10

@@ -17,7 +17,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import pytest
 
 from tests.support.examples import LONG
-from tests.support.live_recorder import NS_PER_S, await_moment, bag_files, machine, ticks
+from tests.support.live_recorder import (
+    NS_PER_S,
+    LiveRecorder,
+    await_moment,
+    bag_files,
+    machine,
+    ticks,
+)
 from tests.support.ros_processes import (
     RECORDERS,
     installation,
@@ -28,7 +35,6 @@ from tests.support.ros_processes import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.support.live_recorder import LiveRecorder
 
 ROTATIONS: Final = 100 if LONG else 3
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "13"))

@@ -14,7 +14,7 @@ import pytest
 from ros2_memory.bag_dir.heartbeat import write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from tests.integration.browser import ENTER, RIGHT, TAB, Browser, browsing, needs_chromium
-from tests.integration.test_server_process import serving
+from tests.integration.test_server_process import Served, serving
 from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.documented_history import heartbeat
 from tests.support.processes import until
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from tests.integration.test_server_process import Served
 
 pytestmark = needs_chromium
 

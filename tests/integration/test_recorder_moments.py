@@ -12,14 +12,12 @@ import pytest
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from tests.integration.test_recorder_daemon import Site, at_a_site, sited
-from tests.integration.test_server_process import serving
+from tests.integration.test_server_process import Served, serving
 from tests.support.live_recorder import answer
 from tests.support.processes import until
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from tests.integration.test_server_process import Served
 
 
 @pytest.fixture

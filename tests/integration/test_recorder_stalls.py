@@ -20,6 +20,7 @@ from ros2_memory.bag_dir.state_files import read_losses
 from tests.support.examples import LONG
 from tests.support.live_recorder import (
     NS_PER_S,
+    LiveRecorder,
     Machine,
     answer,
     answering,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from tests.integration.test_server_process import Served
-    from tests.support.live_recorder import LiveRecorder
     from tests.support.real_recorder import RealRecorder
 
 STALLS: Final = 3

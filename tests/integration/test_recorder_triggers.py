@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
-from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import Machine, bag_files, machine
 from tests.support.processes import until
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.bag_dir.moment_file import StoredMoment
     from tests.support.real_recorder import RealRecorder
 
 SPLIT_S: Final = 2

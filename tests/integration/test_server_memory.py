@@ -5,20 +5,17 @@ from __future__ import annotations
 import asyncio
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 from mcap.writer import CompressionType
 from mcp import Client
 from mcp.client.sse import sse_client
 
-from tests.soak.server import serving
+from tests.soak.server import Served, serving
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S, until
-
-if TYPE_CHECKING:
-    from tests.soak.server import Served
 
 MB: Final = 1 << 20
 PROMISED_MB: Final = 512

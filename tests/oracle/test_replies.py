@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from tests.oracle.replies.asking import Call
-from tests.oracle.replies.comparison import KNOWN_WRONG, Comparison, differing
+from tests.oracle.replies.comparison import KNOWN_WRONG, Comparison, KnownWrong, differing
 from tests.oracle.replies.fixture import Record, path_of
 from tests.oracle.replies.recording import compare, sample
 from tests.oracle.replies.robot_day import Rates, write_robot_day
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from tests.oracle.replies.comparison import KnownWrong
 
 pytestmark = pytest.mark.xdist_group("heavy")
 

@@ -5,13 +5,9 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
-from typing import TYPE_CHECKING
 
-from tests.ros2_double.arguments import DISTROS, RefusedError, options
+from tests.ros2_double.arguments import DISTROS, Options, RefusedError, options
 from tests.ros2_double.signals import Signals
-
-if TYPE_CHECKING:
-    from tests.ros2_double.arguments import Options
 
 
 def main(argv: list[str]) -> int:

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING, Final
 import zstandard
 
 from tests.ros2_double.definitions import full_text
-from tests.ros2_double.mcap_file import DISK_FULL, McapFile
+from tests.ros2_double.mcap_file import DISK_FULL, Layout, McapFile
 from tests.ros2_double.metadata import Info, Span, Topic, metadata_text, whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from tests.ros2_double.mcap_file import Layout
 
 _FLUSHING: Final = "Writing remaining messages from cache to the bag. It may take a while"
 

@@ -11,13 +11,11 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 from tests.soak.rounds import soaked
-from tests.soak.server import serving
+from tests.soak.server import Held, serving
 from tests.support.robot_run import write_run
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from tests.soak.server import Held
 
 
 def main(argv: Sequence[str] | None = None) -> int:

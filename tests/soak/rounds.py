@@ -9,14 +9,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 from tests.soak import clients
-from tests.soak.server import Held
+from tests.soak.server import Held, Served
 from tests.support.processes import PATIENCE_S
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from tests.soak.clients import Habit
-    from tests.soak.server import Served
 
 SHORT: Final[tuple[Habit, ...]] = (
     clients.all_tools,

@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-from ros2_memory.core.timebase import Clock
-
-if TYPE_CHECKING:
-    from ros2_memory.core.timebase import Ns
+from ros2_memory.core.timebase import Clock, Ns
 
 
 @dataclass(frozen=True, slots=True)

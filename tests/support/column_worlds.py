@@ -15,8 +15,8 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.serving.backfill import make_fragments
@@ -29,9 +29,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Clock
-    from ros2_memory.history.context import Memory
 
 EVERYTHING = TimeWindow.everything()
 

@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
 from ros2_memory.storage.base import BagReader, Channel, Closing, Record, Schema
-from tests.support.bags import typestore
+from tests.support.bags import Msg, typestore
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
-    from tests.support.bags import Msg
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import DELETED_FILE, LIST_FILE, MOMENT_FILE, OWN_FOLDER
 from ros2_memory.bag_dir.moment_file import (
+    Outcome,
     PendingRequest,
     SavedMoment,
     SaveRequest,
@@ -22,7 +23,7 @@ from ros2_memory.bag_dir.moment_file import (
 )
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.core.directories import identity_of
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -35,8 +36,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
-    from ros2_memory.bag_dir.moment_file import Outcome
-    from ros2_memory.core.timebase import Clock
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening
 

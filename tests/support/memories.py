@@ -34,9 +34,7 @@ from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
-    from ros2_memory.history.context import Memory
     from ros2_memory.storage.base import BagReader
 
 LAST_WRITTEN = 1_800_000_000 * NS_PER_S

@@ -19,6 +19,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.demo import judges, published_topics, robot
 from ros2_memory.demo.judges import (
+    CallContext,
     at,
     items,
     near,
@@ -29,15 +30,13 @@ from ros2_memory.demo.judges import (
     text,
 )
 from ros2_memory.demo.messages import description
-from ros2_memory.demo.published_topics import STREAMS
+from ros2_memory.demo.published_topics import STREAMS, Message, Stream
 from ros2_memory.demo.robot import THINGS, Planar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.judges import CallContext
-    from ros2_memory.demo.published_topics import Message, Stream
 
 Replies: TypeAlias = "Sequence[JsonValue]"
 Arguments: TypeAlias = "Mapping[str, JsonValue]"

@@ -20,6 +20,9 @@ from tests.support.planner_judges import (
     SAID,
     SEEN,
     STARTED_S,
+    Arguments,
+    Judge,
+    Replies,
     between_stops,
     came_into_view,
     charge_when_seen,
@@ -54,7 +57,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.demo.robot import Planar
-    from tests.support.planner_judges import Arguments, Judge, Replies
 
 
 @dataclass(frozen=True, slots=True)

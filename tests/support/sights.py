@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import TABLES, Seen, Sights, sights_of
+from ros2_memory.analysis.sights import TABLES, Ints, Seen, Sights, sights_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.columns.table import Texts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.model import Vector3
     from ros2_memory.core.timebase import Ns
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Collection, MutableMapping
+from collections.abc import Callable, Collection, MutableMapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,17 +24,14 @@ from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception.reception import Reception
-from ros2_memory.recorder.sessions import Orders
+from ros2_memory.recorder.sessions import Orders, Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, boolean, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, write_mcap
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.sessions import Required
-    from tests.support.bags import Msg
 
 T0 = 1_795_150_800 * NS_PER_S
 PERIOD = NS_PER_S // 4

@@ -12,9 +12,9 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, read_handover, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import utc_stamp
-from ros2_memory.bag_dir.moment_file import stored_moments_in
+from ros2_memory.bag_dir.moment_file import StoredMoment, stored_moments_in
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state_files import TRIGGERS
+from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord
 from ros2_memory.core.directories import identity_of
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, MutableMapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.moment_file import StoredMoment
-    from ros2_memory.bag_dir.state_files import RuleRecord
 
 S = 10**9
 T0 = 1_790_000_000 * S

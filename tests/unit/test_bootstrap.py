@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from mcp import Client
@@ -14,15 +13,12 @@ from ros2_memory.bootstrap import (
     build_server,
     reading_of,
 )
-from ros2_memory.config import load_message_schemas, load_settings
+from ros2_memory.config import Settings, load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.robot_run import ANSWERED, ask, ask_everything, write_run
-
-if TYPE_CHECKING:
-    from ros2_memory.config import Settings
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:

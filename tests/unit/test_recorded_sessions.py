@@ -8,14 +8,14 @@ from __future__ import annotations
 import json
 import math
 import random
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.bags import typestore
 from tests.support.closed_form import (
@@ -33,9 +33,6 @@ from tests.support.closed_form import (
 )
 from tests.support.memories import memory_of
 from tests.support.shared_bags import RECORDED, needs_recorded
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 WRITTEN = "written"
 """In place of a session: the one that the test writes."""

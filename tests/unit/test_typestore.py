@@ -19,12 +19,19 @@ from ros2_memory.typestore import (
     MessageType,
     Typestores,
 )
-from tests.support.bags import VISION_DEFINITIONS, definition, detections, odom, text, typestore
+from tests.support.bags import (
+    VISION_DEFINITIONS,
+    Msg,
+    definition,
+    detections,
+    odom,
+    text,
+    typestore,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from tests.support.bags import Msg
 
 RULE = "=" * 80
 CDR = b"\x00\x01\x00\x00"

@@ -14,13 +14,12 @@ import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, visible_in
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from ros2_memory.analysis.facts import Ints, Stated, Word
-    from ros2_memory.core.timebase import Ns
 
 MAX_PER_BAG: Final = 64
 """Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""

@@ -30,7 +30,7 @@ from bisect import bisect_left
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
 import structlog
 from pydantic import AfterValidator, Field, StrictBool
@@ -65,7 +65,6 @@ if TYPE_CHECKING:
         Mapping,
         Sequence,
     )
-    from typing import TypeAlias
 
     CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
     """Returns what `ros2 bag record` embedded in a bag file; None where that is unreadable.

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.core.spans import COPY_HORIZON_NS
-from ros2_memory.storage.base import RELATCHED_NS
+from ros2_memory.storage.base import RELATCHED_NS, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import IntArray
 
 
 class Identities(NamedTuple):

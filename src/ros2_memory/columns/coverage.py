@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.store import relative
-from ros2_memory.core.model import BagState
+from ros2_memory.columns.store import ColumnStore, State, StoredBag, relative
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.store import ColumnStore, State, StoredBag
-    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray

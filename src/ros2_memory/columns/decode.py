@@ -16,21 +16,26 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 import numpy as np
 
 from ros2_memory.columns.objects import level_of
-from ros2_memory.columns.plan import UnplannedError, plan_of
+from ros2_memory.columns.plan import Plan, UnplannedError, plan_of
 from ros2_memory.columns.table import Table, joined, order_of
-from ros2_memory.columns.walk import NotWalkedError, walked
+from ros2_memory.columns.walk import Level, NotWalkedError, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BATCH_BYTES, Batch
+from ros2_memory.storage.base import (
+    BATCH_BYTES,
+    BagReader,
+    Batch,
+    Channel,
+    Definition,
+    IntArray,
+    Schema,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.plan import Plan
-    from ros2_memory.columns.walk import Level
-    from ros2_memory.storage.base import BagReader, Channel, Definition, IntArray, Schema
 
 T = TypeVar("T")
 

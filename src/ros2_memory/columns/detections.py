@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.scores import hypotheses, is_object, or_else, scored
+from ros2_memory.columns.scores import Scored, hypotheses, is_object, or_else, scored
 from ros2_memory.columns.shown import (
     ByType,
     Group,
@@ -21,29 +21,26 @@ from ros2_memory.columns.shown import (
     Listing,
     Message,
     Narrowed,
+    Node,
     Nothing,
     UnknownShapeError,
     children,
     placed,
 )
-from ros2_memory.columns.table import Texts, joined_texts
+from ros2_memory.columns.table import Table, Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
 from ros2_memory.columns.walk import within
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
-from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, detections_of
+from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, Detection, detections_of
 from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.scores import Scored
-    from ros2_memory.columns.shown import Node
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats, Ints, Level, Mask
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.messages.detections import Detection
 
 Point: TypeAlias = tuple[Leaf, Leaf, Leaf]
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"

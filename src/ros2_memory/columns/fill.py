@@ -14,15 +14,15 @@ import numpy as np
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.decode import BagRows, decoded, decoded_together, pieces
-from ros2_memory.columns.store import LONG_NS, BagKey
+from ros2_memory.columns.decode import BagRows, Piece, decoded, decoded_together, pieces
+from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore
 from ros2_memory.columns.writing import PART_NS, DecodedBags, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import in_time
 
@@ -30,12 +30,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.decode import Piece
     from ros2_memory.columns.scanner import Scanner
-    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import BagReader, Channel
 

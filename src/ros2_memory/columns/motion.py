@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import fields, replace
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Final, Never, cast
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from ros2_memory.core.arrays import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from typing import Never
 
     from ros2_memory.core.model import Vector3
 

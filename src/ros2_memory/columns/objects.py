@@ -7,16 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.columns.plan import Array, Number, NumberSequence, Run, Text, Time
-from ros2_memory.columns.table import MAX_RANGED_BYTES, Elements, Texts
+from ros2_memory.columns.plan import Array, Number, NumberSequence, Plan, Run, Sequence, Text, Time
+from ros2_memory.columns.table import MAX_RANGED_BYTES, Elements, Numbers, Texts
 from ros2_memory.columns.walk import Level, add_ranges, add_sequence
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Values
-
-    from ros2_memory.columns.plan import Plan, Sequence
-    from ros2_memory.columns.table import Numbers
 
 
 def level_of(plan: Plan, messages: Values[object]) -> Level:

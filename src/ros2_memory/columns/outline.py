@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 import numpy as np
 
 from ros2_memory.columns.fragments import Fragment, Kind
-from ros2_memory.columns.table import IN_PART, SPACES, Texts, letters_of
+from ros2_memory.columns.table import IN_PART, SPACES, Numbers, Table, Texts, letters_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.table import Numbers, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 

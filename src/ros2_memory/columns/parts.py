@@ -18,16 +18,14 @@ import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.stored import StoredTable, lazy_columns
-from ros2_memory.columns.table import Zone, joined
+from ros2_memory.columns.stored import Remembered, StoredTable, Topic, lazy_columns
+from ros2_memory.columns.table import Column, Table, Zone, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.columns.layout import Layout
     from ros2_memory.columns.outline import Outline
-    from ros2_memory.columns.stored import Remembered, Topic
-    from ros2_memory.columns.table import Column, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 

@@ -12,22 +12,26 @@ import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.shown import UnknownShapeError
-from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
+from ros2_memory.columns.table import Table, Texts
 from ros2_memory.core.arrays import row_maxima, row_sums
-from ros2_memory.extract import FRAME, HEADINGS, POSE_FRAMES, UNMAPPED, PlanarPose
-from ros2_memory.messages.conversions import Route
-from ros2_memory.storage.base import SEQUENCE, Definition
+from ros2_memory.extract import (
+    FRAME,
+    HEADINGS,
+    POSE_FRAMES,
+    UNMAPPED,
+    Plan,
+    PlanarPose,
+    PointPose,
+    SchemaExtractor,
+)
+from ros2_memory.messages.conversions import Route, Segments
+from ros2_memory.storage.base import SEQUENCE, Definition, IntArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.steps import Step
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats
-    from ros2_memory.extract import Plan, PointPose, SchemaExtractor
-    from ros2_memory.messages.conversions import Segments
-    from ros2_memory.storage.base import IntArray
 
     Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 

@@ -20,11 +20,11 @@ from ros2_memory.columns.copies import Identities, copies_among, joined_identiti
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, overlaps_any
+from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.segment import in_time
-from ros2_memory.storage.base import RELATCHED_NS
+from ros2_memory.storage.base import RELATCHED_NS, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -36,10 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import IntArray
 
 Decode: TypeAlias = "Callable[[BagFile, str, bool], Iterable[Table]]"
 """Decodes a topic of a bag, with hashes of payloads where the last argument is true."""

@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING, Final, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.coverage import Covering
+from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
-from ros2_memory.columns.fragments import FragmentKey, Fragments
+from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME, part_table
-from ros2_memory.columns.table import Zone, column_bytes
+from ros2_memory.columns.table import Column, Table, Zone, column_bytes
 from ros2_memory.columns.units import GoneError, PartUnit
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
@@ -30,13 +30,9 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
-    from ros2_memory.columns.coverage import Coverage
-    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.store import ColumnStore, PartHead
-    from ros2_memory.columns.table import Column, Table
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
-    from ros2_memory.core.model import BagFile, StampedTransform
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray
 

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlia
 
 import numpy as np
 
-from ros2_memory.columns.table import MAX_NUMBERS
+from ros2_memory.columns.table import MAX_NUMBERS, Table
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values
-from ros2_memory.extract import POINTS
+from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
@@ -29,10 +29,8 @@ from ros2_memory.storage.base import SEQUENCE, Definition
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Ints, Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.extract import SchemaExtractor
 
 T = TypeVar("T")
 

@@ -22,6 +22,7 @@ from ros2_memory.analysis.sights import (
     TABLES,
     Fix,
     Hit,
+    Ints,
     Look,
     Sights,
     Spot,
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
-
-    from ros2_memory.analysis.sights import Ints
 
     Bytes = NDArray[np.uint8]
 

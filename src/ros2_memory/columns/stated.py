@@ -23,6 +23,7 @@ from ros2_memory.analysis.facts import (
     NOTHING,
     STATUS,
     VELOCITIES,
+    Fact,
     Facts,
     Stated,
     Word,
@@ -33,12 +34,14 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import found_in, sources_in, texts_of
+from ros2_memory.columns.detections import Source, found_in, sources_in, texts_of
 from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import (
     ByType,
     Listing,
     Narrowed,
+    Node,
+    Shape,
     Spot,
     UnknownShapeError,
     children,
@@ -51,9 +54,6 @@ from ros2_memory.columns.walk import within
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.facts import Fact
-    from ros2_memory.columns.detections import Source
-    from ros2_memory.columns.shown import Node, Shape
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Ints
     from ros2_memory.core.model import JsonValue

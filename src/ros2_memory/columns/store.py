@@ -44,7 +44,7 @@ from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import Ns
-from ros2_memory.storage.base import Channel, Schema
+from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
     import sqlite3
@@ -53,7 +53,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.fragments import FragmentKey
     from ros2_memory.columns.table import Table
-    from ros2_memory.storage.base import Definition, IntArray
 
 FILE: Final = "columns.sqlite"
 CATALOGUE: Final = "catalogue.sqlite"

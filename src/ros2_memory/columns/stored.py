@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.table import Elements, Table, joined_column, joined_zone
+from ros2_memory.columns.table import Column, Elements, Table, Zone, joined_column, joined_zone
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Hashable, Iterator, Sequence
-
     from ros2_memory.columns.layout import Layout
     from ros2_memory.columns.outline import Outline
     from ros2_memory.columns.pack import Packed
-    from ros2_memory.columns.table import Column, Zone
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
 V = TypeVar("V")

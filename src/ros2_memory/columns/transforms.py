@@ -9,16 +9,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Edge, unit_quaternions
+from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
 from ros2_memory.columns.fragments import Fragment, Kind
-from ros2_memory.columns.steps import METRES, QUATERNION
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.steps import METRES, QUATERNION, Step
+from ros2_memory.columns.table import Elements, Table, Texts
 from ros2_memory.core.model import StampedTransform, Transform
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.frames import Edges, Floats
-    from ros2_memory.columns.steps import Step
-    from ros2_memory.columns.table import Elements, Table
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 

@@ -16,16 +16,26 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import POSITION_KEYS, Beyond, Contains, Equals, NearPosition
+from ros2_memory.analysis.conditions import (
+    POSITION_KEYS,
+    Beyond,
+    Condition,
+    Contains,
+    Equals,
+    NearPosition,
+)
 from ros2_memory.columns.scores import may_be_json, without_low
 from ros2_memory.columns.shown import (
     MAX_LEAVES,
     ByType,
     Group,
     Kept,
+    Limits,
     Listing,
     Message,
+    Node,
     Nothing,
+    Shape,
     Spot,
     UnknownShapeError,
     at_field,
@@ -36,19 +46,15 @@ from ros2_memory.columns.shown import (
     placed,
     unknown,
 )
-from ros2_memory.columns.table import MAX_NUMBERS, as_float
+from ros2_memory.columns.table import MAX_NUMBERS, Table, Zone, as_float
 from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values, zone_of
-from ros2_memory.columns.zones import PartZones
+from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.messages.detections import MAX_DEPTH, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.columns.shown import Limits, Node, Shape
-    from ros2_memory.columns.table import Table, Zone
     from ros2_memory.columns.values import Mask, Numeric
-    from ros2_memory.columns.zones import Zones
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.stored import parts_of
-from ros2_memory.columns.table import MAX_NUMBERS, Texts, Zone
+from ros2_memory.columns.table import MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
@@ -23,8 +23,6 @@ from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-
-    from ros2_memory.columns.table import Column, Elements, Table
 
     Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
     # Of any dtype: that of floats has the operations that all of them have.

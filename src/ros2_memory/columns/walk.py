@@ -11,20 +11,22 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.plan import Array, NumberSequence, Run, Sequence, Text, Time
-from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES, Elements, Texts
+from ros2_memory.columns.plan import Array, NumberSequence, Plan, Run, Sequence, Text, Time
+from ros2_memory.columns.table import (
+    MAX_NUMBERS,
+    MAX_RANGED_BYTES,
+    Column,
+    Elements,
+    Numbers,
+    Texts,
+)
 from ros2_memory.core.arrays import gathered
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.storage.base import SEQUENCE
-
-if TYPE_CHECKING:
-    from ros2_memory.columns.plan import Plan
-    from ros2_memory.columns.table import Column, Numbers
-    from ros2_memory.storage.base import Batch, IntArray
+from ros2_memory.storage.base import SEQUENCE, Batch, IntArray
 
 _FEW_ROWS: Final = 24
 """With fewer rows on average, the elements of sequences are sooner passed one by one than nth by

@@ -9,11 +9,10 @@ import numpy as np
 
 from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import Shape, UnknownShapeError, children
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.table import Table
     from ros2_memory.extract import SchemaExtractor
 
 

@@ -10,17 +10,22 @@ import numpy as np
 
 from ros2_memory.columns.decode import BagRows
 from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import ALWAYS, DROPPED, ZONE_ALONE, pack_rows, packed_part
-from ros2_memory.columns.table import Zone
+from ros2_memory.columns.parts import (
+    ALWAYS,
+    DROPPED,
+    ZONE_ALONE,
+    PackedPart,
+    pack_rows,
+    packed_part,
+)
+from ros2_memory.columns.table import Table, Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     import sqlite3
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from ros2_memory.columns.parts import PackedPart
     from ros2_memory.columns.store import BagKey
-    from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.storage.base import IntArray, Schema
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.table import as_float, may_be_in
+from ros2_memory.columns.table import Zone, as_float, may_be_in
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.stored import Topic
-    from ros2_memory.columns.table import Zone
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
     Floats = NDArray[np.float64]

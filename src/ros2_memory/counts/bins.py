@@ -9,10 +9,16 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.core.spans import Spans, without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.counts.place_bins import place_bins
-from ros2_memory.counts.time_bins import first_of_days, time_bins, usual_time
+from ros2_memory.counts.time_bins import (
+    TimeBins,
+    TrueIntervals,
+    first_of_days,
+    time_bins,
+    usual_time,
+)
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import (
     note_edges,
@@ -23,19 +29,15 @@ from ros2_memory.history.coverage import (
     unix_text,
 )
 from ros2_memory.history.no_data import no_data_between
-from ros2_memory.results import Bins
+from ros2_memory.results import BinColumn, Bins, Usual
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import ArrayLike, NDArray
 
-    from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.time_bins import TimeBins, TrueIntervals
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
-    from ros2_memory.results import BinColumn, Usual
 
 By: TypeAlias = Literal["day", "hour", "weekday", "place"]
 Values: TypeAlias = "Sequence[float | None]"

@@ -21,9 +21,9 @@ from ros2_memory.columns.numbers import FieldNumbers, column_of, numbers
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
-from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.scan import decoded_rows, messages_of, scan
 
@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.outline import Totals
-    from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Definition, IntArray

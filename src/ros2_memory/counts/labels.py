@@ -13,32 +13,35 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.conditions import Contains, Equals
-from ros2_memory.analysis.intervals import IntervalPart, joined, united, visible_in
+from ros2_memory.analysis.conditions import Condition, Contains, Equals
+from ros2_memory.analysis.intervals import (
+    IntervalPart,
+    IntervalTable,
+    VisibleInterval,
+    joined,
+    united,
+    visible_in,
+)
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.spans import united as united_spans
 from ros2_memory.core.text import listed, named
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
-from ros2_memory.history.detections import DetectionRows, joined_detected
+from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.no_data import matching_topics, seconds
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.scan import blocks, scan
-from ros2_memory.results import Bins
+from ros2_memory.results import BinColumn, Bins
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.intervals import IntervalTable, VisibleInterval
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Deadline, Ns
-    from ros2_memory.history.detections import Detected
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
-    from ros2_memory.results import BinColumn
 
 BY_LABEL: Final = "label"
 ANY_LABEL: Final = ""

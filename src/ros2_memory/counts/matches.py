@@ -16,38 +16,31 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
-from ros2_memory.analysis.conditions import Contains, Equals
+from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import IntervalPart, joined, united
-from ros2_memory.analysis.topic_events import joined_events
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
+from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import listed
-from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.counts.bins import BinnedWindow, By
 from ros2_memory.counts.labels import ANY_LABEL, BY_LABEL, count_labels
 from ros2_memory.counts.time_bins import TrueIntervals
 from ros2_memory.counts.values import count_values
-from ros2_memory.history.context import READING_S
+from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import reached
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
-from ros2_memory.places.where import Scope, parse_where
+from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.analysis.intervals import IntervalTable
-    from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents
     from ros2_memory.core.model import JsonValue, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.bins import By
-    from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
-    from ros2_memory.places.where import Where, WhileCondition
     from ros2_memory.results import Bins
 
 _TRUTHS = {"true": True, "false": False}

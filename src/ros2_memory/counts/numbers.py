@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
+from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
+from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
 from ros2_memory.counts.values import count_values
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import open_span
+from ros2_memory.history.view import TimeRange, View, open_span
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
-    from typing import TypeAlias
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.errors import UndecodableError
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import TimeRange, View
     from ros2_memory.results import BinColumn, Bins
 
     Times: TypeAlias = NDArray[np.int64]

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ros2_memory.counts.bins import BinnedWindow
+from ros2_memory.counts.bins import BinnedWindow, By
 from ros2_memory.history.driven_path import resolve_path_topic, way_in
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.history.view import open_span
+from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.where import parse_where, times_in_region
 
@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import Line
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import TimeRange
     from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import Bins
 

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.counts.time_bins import TimeBins
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import placed_times, places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
-from ros2_memory.places.where import places_setting
+from ros2_memory.places.where import Where, places_setting
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,9 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
-    from ros2_memory.places.where import Where
 
 ELSEWHERE: Final = "(elsewhere)"
 UNKNOWN: Final = "(unknown)"

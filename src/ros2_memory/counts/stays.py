@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow
+from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times, places_in
-from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.robot_tracks import Inside, robot_inside
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
 
@@ -23,9 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.counts.bins import By
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import Bins
 
 

@@ -10,7 +10,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import Quoted, counted, shortened
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
-from ros2_memory.history.held_values import HeldValues
+from ros2_memory.history.held_values import Held, HeldValues
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import note_robots
 from ros2_memory.results import Bins
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.held_values import Held
     from ros2_memory.history.view import View
 
 _MOST_VALUES: Final = 100

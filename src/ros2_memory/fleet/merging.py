@@ -15,10 +15,10 @@ from heapq import merge
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.core.errors import BagError, QueryTimeoutError
-from ros2_memory.core.reply import with_notes
+from ros2_memory.core.errors import BagError, EpisodicError, QueryTimeoutError
+from ros2_memory.core.reply import JsonObject, Merging, with_notes
 from ros2_memory.core.text import listed, still_quoted
-from ros2_memory.core.timebase import iso_local, unix_rounded_up
+from ros2_memory.core.timebase import Ns, iso_local, unix_rounded_up
 from ros2_memory.results import (
     AnswerWithNotes,
     Before,
@@ -36,10 +36,7 @@ from ros2_memory.tools.reply_size import to_json_text
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from ros2_memory.core.errors import EpisodicError
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.reply import JsonObject, Merging
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.fleet.robots import FromLake
 
 _MOST_NAMED: Final = 8

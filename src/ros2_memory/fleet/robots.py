@@ -23,15 +23,13 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import abbreviate, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock
-from ros2_memory.history.context import Stages
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
+from ros2_memory.history.context import Call, Memory, Stages
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Call, Memory
 
 T = TypeVar("T")
 

@@ -41,17 +41,15 @@ from ros2_memory.fleet.merging import (
     reason_of,
     shipped_to,
 )
-from ros2_memory.fleet.robots import AT_ONCE, FanOut, Robot, StoppedClock, names_of
-from ros2_memory.results import Match, OfFleet, OfRobot, Sightings
+from ros2_memory.fleet.robots import AT_ONCE, FanOut, Fleet, FromLake, Robot, StoppedClock, names_of
+from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.fleet.robots import Fleet, FromLake
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import OneAnswer
     from ros2_memory.tools.declaration import Question, Tool
 
 ROBOT: Final = "robot"

@@ -16,19 +16,16 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline
-from ros2_memory.history.context import Note, Notes, short_name
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
+from ros2_memory.history.context import Call, Memory, Note, Notes, short_name
 from ros2_memory.history.duplicates import StoredMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Call, Memory
     from ros2_memory.storage.base import Channel, Record
 
 _DEADLINE_CHECK_INTERVAL: Final = 256

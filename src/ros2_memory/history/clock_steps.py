@@ -20,15 +20,15 @@ from ros2_memory.analysis.clock_steps import (
     step_over,
 )
 from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
-from ros2_memory.analysis.motion.trajectory import mean_speed
-from ros2_memory.analysis.poses import NO_POSES, joined_poses
+from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
+from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
 )
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.poses import pose_rows
@@ -41,10 +41,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
-    from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.holes import Pause
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
@@ -14,14 +14,19 @@ from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.memo import Key, Memo
-from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, ms_from_ns, unix_from_ns
-from ros2_memory.index.listed_splits import absent_splits, listing_from_json, listing_to_json
+from ros2_memory.core.text import Reason, match_topics
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Clock, Deadline, Ns, ms_from_ns, unix_from_ns
+from ros2_memory.index.listed_splits import (
+    Absent,
+    Listings,
+    absent_splits,
+    listing_from_json,
+    listing_to_json,
+)
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from ros2_memory.analysis.frames import ClockOfTransforms
@@ -29,11 +34,8 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
-    from ros2_memory.core.text import Reason
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.index.listed_splits import Absent, Listings
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.inventory import Foreign
     from ros2_memory.retention.policy import RetentionLimits

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.spans import Spans, united
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.messages.to_json import evenly
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.scan import Scan
-    from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import TopicColumn

@@ -36,8 +36,8 @@ from ros2_memory.core.bag_summary import (
     MESSAGES_MISSING,
     READ_WITHOUT_INDEXES,
 )
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import overlaps_any, united, without
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.spans import Spans, overlaps_any, united, without
 from ros2_memory.core.text import MAX_NAMED, counted, listed, shortened
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -46,6 +46,7 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     NS_PER_US,
     START_SLACK_NS,
+    Ns,
     unix_from_ns,
     unix_rounded_up,
 )
@@ -57,9 +58,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, SetAside
-    from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot

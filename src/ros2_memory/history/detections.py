@@ -7,24 +7,27 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import AGREEMENT_NS
-from ros2_memory.columns.detections import DetectionColumns, detections_by, joined_detections
+from ros2_memory.columns.detections import (
+    DetectionColumns,
+    Detections,
+    detections_by,
+    joined_detections,
+)
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.arrays import merged_times
 from ros2_memory.history.scan import messages_of
 from ros2_memory.messages.conversions import nanoseconds
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.columns.detections import Detections
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
-    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import IntArray
 
 

@@ -13,11 +13,13 @@ import numpy as np
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import (
     SLICE_NS,
+    PathSlice,
+    Trajectory,
     joined_slices,
     path_slice,
 )
 from ros2_memory.analysis.poses import Poses, joined_poses
-from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.fragments import FragmentKey, Kind, Sized
 from ros2_memory.columns.motion import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -55,8 +57,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
-    from ros2_memory.columns.fragments import Kind, Sized
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.columns.table import joined_texts
+from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.columns.words import words_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.scan import blocks, scan
@@ -25,9 +25,7 @@ from ros2_memory.history.scan import blocks, scan
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.columns.table import Texts
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 

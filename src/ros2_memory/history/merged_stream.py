@@ -16,9 +16,9 @@ from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
-from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.duplicates import (
     BagSpan,
     Copy,
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.bag_access import BagAccess
     from ros2_memory.index.segment import Segment
 

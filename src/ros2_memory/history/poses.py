@@ -14,7 +14,7 @@ from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, Pose, TimeWindow
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
     blocks,
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.fragments import Sized
-    from ros2_memory.core.model import BagFile, Pose
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import Beside
     from ros2_memory.history.view import View

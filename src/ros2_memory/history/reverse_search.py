@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 import numpy as np
 
 from ros2_memory.analysis.conditions import (
+    Condition,
     Equals,
     NearPosition,
     is_unknown_below,
@@ -27,7 +28,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import Note
@@ -41,11 +42,9 @@ from ros2_memory.messages.levels import level_number, unknown_name_hint
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray, Schema

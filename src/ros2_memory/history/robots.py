@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, has_own_name, is_kept_apart
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, united
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import copy_key
+from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
 from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View
@@ -36,10 +36,7 @@ from ros2_memory.index.split_order import split_of
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import BagSpan, StoredMessage
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""

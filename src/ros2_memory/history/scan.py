@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, TypedDict, TypeVar
+from typing import TYPE_CHECKING, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
-from ros2_memory.columns.fragments import Joined, joining
+from ros2_memory.columns.fragments import FragmentKey, Joined, Kind, Sized, joining
 from ros2_memory.columns.scan import Asked, Scan, Stretch
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
-    from typing import Unpack
 
-    from ros2_memory.columns.fragments import FragmentKey, Kind, Sized
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View

@@ -20,7 +20,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.memo import Key
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.retention.latched_carry import origin_of
 
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import FrameEdge, StampedTransform
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
+    Edges,
     Frames,
     TfClock,
     connected_with,
@@ -42,7 +43,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.geometry import alike
-from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
+from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow, Transform
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -68,20 +69,17 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.history.sessions import Sessions
+from ros2_memory.history.sessions import Session, Sessions
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.frames import Edges
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.model import Transform
     from ros2_memory.history.duplicates import BagSpan, StoredMessage
-    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
 _HALF_WIDTHS: Final[tuple[Ns, ...]] = (500 * NS_PER_MS, 2_000 * NS_PER_MS, TF_CACHE_NS)

@@ -16,7 +16,7 @@ import numpy as np
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.memo import Key, Memo
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -37,7 +37,6 @@ from ros2_memory.history.scan import open_scan, scan
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Sessions

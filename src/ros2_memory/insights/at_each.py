@@ -18,19 +18,17 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
-from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt
+from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt, OneAnswer
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.results import OneAnswer
     from ros2_memory.retention.inventory import Foreign
 
 P = ParamSpec("P")

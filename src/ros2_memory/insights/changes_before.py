@@ -25,14 +25,14 @@ from ros2_memory.analysis.facts import (
     has_changes,
     has_events,
 )
-from ros2_memory.analysis.topic_events import joined_events
+from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.history.view import ns_argument, open_view
+from ros2_memory.history.view import View, ns_argument, open_view
 from ros2_memory.insights.goals import GOAL_WORDS, action_of
 from ros2_memory.insights.topic_events import (
     events_in,
@@ -47,11 +47,7 @@ from ros2_memory.results import Before, PastChange
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.topic_events import Change, Report, TopicEvents
-    from ros2_memory.core.model import Pose
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
 
 LENGTH_NS: Final = 10 * NS_PER_S
 """How long before an event a change counts."""

@@ -11,21 +11,26 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import has_errors
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import places_at
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
 from ros2_memory.history.driven_path import length_notes, resolve_path_topic
-from ros2_memory.history.view import clamped, open_view
-from ros2_memory.insights.drive import drive_in
+from ros2_memory.history.view import View, clamped, open_view
+from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.recap import found_events
 from ros2_memory.insights.silences import silences_in
-from ros2_memory.places.pose_frames import changing_origin, is_one_run, known_placement
+from ros2_memory.places.pose_frames import (
+    MapPlacement,
+    changing_origin,
+    is_one_run,
+    known_placement,
+)
 from ros2_memory.places.region_visits import places_in, track_in
 from ros2_memory.places.robot_tracks import robot_inside
-from ros2_memory.places.two_paths import farthest_apart, placed_standstills, stood_at
-from ros2_memory.places.where import parse_where, places_asked, times_inside
+from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
+from ros2_memory.places.where import Where, parse_where, places_asked, times_inside
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things, note_other_frames
@@ -35,14 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.regions import Place
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
-    from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.pose_frames import MapPlacement
-    from ros2_memory.places.two_paths import FarPoint
-    from ros2_memory.places.where import Where
 
 _SHARE: Final = 0.1
 _LEAST: Final = {"distance_m": 0.5, "max_speed": 0.1, "stood_s": 10.0, "standstills": 0.5}

@@ -9,17 +9,19 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import Elapsed
-from ros2_memory.analysis.motion.speed_drops import SLOT_NS
+from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
     SHORTEST_NS,
+    Stands,
+    Standstill,
     joined_blocks,
     stands_of,
     standstills_of,
 )
-from ros2_memory.analysis.motion.trajectory import SLICE_NS
+from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, Trajectory
 from ros2_memory.columns.motion import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
@@ -28,11 +30,13 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
+    Ns,
     ns_from_unix,
     unix_from_ns,
 )
 from ros2_memory.history.clock_steps import across_steps, elapsed_in
 from ros2_memory.history.driven_path import (
+    PoseSlice,
     driven_path,
     resolve_path_topic,
     slices_by_poses,
@@ -45,11 +49,6 @@ from ros2_memory.insights.silences import unrecorded_length
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-    from ros2_memory.analysis.motion.standstills import Stands, Standstill
-    from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.driven_path import PoseSlice
     from ros2_memory.history.view import View
 
 _BRAKING_NS: Final[Ns] = 4 * NS_PER_S

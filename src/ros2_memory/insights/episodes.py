@@ -17,11 +17,11 @@ from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, unix_text
-from ros2_memory.history.held_values import HeldValues, is_text
+from ros2_memory.history.held_values import Held, HeldValues, is_text
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import ReverseSearch, out_of_time
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import View, open_span
+from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.places.pose_frames import recording_at, robot_at
 from ros2_memory.results import Changes, Episode, Spell
 
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.held_values import Held
-    from ros2_memory.history.view import TimeRange
     from ros2_memory.places.where import Scope
 
 _LOOKED_AT: Final = 50

@@ -8,19 +8,17 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers, TooManyError
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.view import open_view
+from ros2_memory.history.view import View, open_view
 from ros2_memory.results import Extremes, TypeFields
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import View
 
 MAX_FIELDS: Final = 100
 MAX_MESSAGES: Final = 4_000

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.facts import GOAL, GOALS
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.insights.topic_events import events_in, events_of_messages, note_limits
 
 if TYPE_CHECKING:
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 

@@ -14,13 +14,13 @@ from heapq import nsmallest
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import united
-from ros2_memory.analysis.motion.standstills import SHORTEST_NS
-from ros2_memory.analysis.topic_events import joined_events
+from ros2_memory.analysis.intervals import IntervalTable, united
+from ros2_memory.analysis.motion.standstills import SHORTEST_NS, Standstill
+from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import Quoted, counted, listed, repeating
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     deleted_length,
@@ -31,7 +31,7 @@ from ros2_memory.history.coverage import (
 )
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.history.no_data import seconds
-from ros2_memory.history.view import open_span
+from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,
     ChangesBefore,
@@ -39,31 +39,22 @@ from ros2_memory.insights.changes_before import (
     changes_in,
     is_routine,
 )
-from ros2_memory.insights.drive import drive_in
+from ros2_memory.insights.drive import Drive, drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
-from ros2_memory.places.pose_frames import robot_places
+from ros2_memory.places.pose_frames import RobotPlaces, robot_places
 from ros2_memory.places.where import parse_where, times_in_region
-from ros2_memory.results import Before, Event, Recap
+from ros2_memory.results import Before, Event, PastChange, Recap
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.analysis.intervals import IntervalTable
-    from ros2_memory.analysis.motion.standstills import Standstill
-    from ros2_memory.analysis.topic_events import Change, Report, TopicEvents
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import TimeRange, View
-    from ros2_memory.insights.drive import Drive
-    from ros2_memory.places.pose_frames import RobotPlaces
     from ros2_memory.places.robot_tracks import Inside
-    from ros2_memory.results import PastChange
 
 MOST_EVENTS: Final = 25
 

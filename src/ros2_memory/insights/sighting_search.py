@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.columns.shown import nowhere
+from ros2_memory.columns.shown import Kept, nowhere
 from ros2_memory.columns.stored import StoredTable, joined_stored
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.arrays import rows_of, stacked
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.shown import Kept
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View

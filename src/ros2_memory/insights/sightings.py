@@ -13,14 +13,14 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
-from ros2_memory.analysis.conditions import NearPosition, matched_texts
+from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import Pose, TimeWindow
+from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import (
     MIN_NS,
@@ -37,7 +37,7 @@ from ros2_memory.history.reverse_search import (
 )
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
-from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
 from ros2_memory.insights.episodes import (
     SaidMeanwhile,
     episode_times,
@@ -45,27 +45,20 @@ from ros2_memory.insights.episodes import (
     says_episodes,
     with_robot,
 )
-from ros2_memory.insights.goals import goals_asked
-from ros2_memory.insights.sighting_search import find_runs
+from ros2_memory.insights.goals import GoalRun, goals_asked
+from ros2_memory.insights.sighting_search import Run, find_runs
 from ros2_memory.insights.silences import describe_silences
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
-from ros2_memory.places.where import Scope
+from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.view import View
-    from ros2_memory.insights.goals import GoalRun
-    from ros2_memory.insights.sighting_search import Run
-    from ros2_memory.messages.detections import Detection
-    from ros2_memory.places.where import WhileCondition
 
 _Row = TypeVar("_Row", Sighting, Episode)
 _MOST_TRIED: Final = 5

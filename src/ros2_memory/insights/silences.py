@@ -10,7 +10,13 @@ from ros2_memory.analysis.silences import Silence
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, listed
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, START_SLACK_NS, local_text
+from ros2_memory.core.timebase import (
+    AT_OR_BEFORE_SLACK_NS,
+    NS_PER_S,
+    START_SLACK_NS,
+    Ns,
+    local_text,
+)
 from ros2_memory.history.coverage import cut_spans, recording_gaps, unix_text
 from ros2_memory.index.holes import SHORTEST_GAP_NS
 
@@ -20,7 +26,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.trajectory import PathSlice
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot

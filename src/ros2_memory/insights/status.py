@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.bag_dir.heartbeat import RecorderState
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.state_files import describe_leaving
-from ros2_memory.core.model import BagState, SetAside, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.clock_steps import clock_steps
@@ -31,8 +31,6 @@ from ros2_memory.retention.inventory import state_bytes_in
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.model import BagFile
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
 

@@ -7,8 +7,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.facts import joined_stated, state_of, stated_by
-from ros2_memory.analysis.topic_events import TopicEvents, events_of, joined_events
+from ros2_memory.analysis.facts import Stated, joined_stated, state_of, stated_by
+from ros2_memory.analysis.topic_events import (
+    Change,
+    KnownState,
+    TopicEvents,
+    events_of,
+    joined_events,
+)
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import FragmentKey
@@ -22,8 +28,6 @@ from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.facts import Stated
-    from ros2_memory.analysis.topic_events import Change, KnownState
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns

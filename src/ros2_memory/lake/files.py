@@ -10,31 +10,28 @@ import math
 import threading
 import time
 from collections import defaultdict
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from pyiceberg.exceptions import NoSuchTableError
-from pyiceberg.manifest import ManifestContent
+from pyiceberg.manifest import ManifestContent, ManifestFile
 from pyiceberg.transforms import IdentityTransform
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.lake.engines.base import DataFiles
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
-    from pyiceberg.manifest import ManifestFile
     from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.lake.engines.base import LakeEngine, Parameters
 
 _EPOCH: Final = date(1970, 1, 1)
 _LAST: Final = "\U0010ffff"

@@ -23,14 +23,13 @@ from pyiceberg.io import load_file_io
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError
-from ros2_memory.core.timebase import NS_PER_S, iso_local
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.lake.tables import NAMESPACE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.lake.warehouse import LakeLocation
 
 LEASE_FILE: Final = "writer.lock"

@@ -20,13 +20,13 @@ from ros2_memory.columns.pack import is_large
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
-from ros2_memory.core.model import BagFile, BagState
-from ros2_memory.history.context import Memory
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of
-from ros2_memory.storage.base import BagReader, Channel, Closing, Schema
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
 from ros2_memory.storage.cache import ByteLru, shared
 
 if TYPE_CHECKING:
@@ -37,13 +37,10 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.large_reads import LargeReads
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.context import QuerySettings
     from ros2_memory.lake.files import Days, Lake
     from ros2_memory.retention.inventory import Foreign
-    from ros2_memory.storage.base import Batch, Definition, Record
 
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""

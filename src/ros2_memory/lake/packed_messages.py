@@ -22,12 +22,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes
-from ros2_memory.storage.base import Batch, Channel
+from ros2_memory.storage.base import Batch, Channel, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.storage.base import IntArray
 
 _FORMAT: Final = 1
 _HEAD: Final = struct.Struct("<BBI")

@@ -20,23 +20,29 @@ import numpy as np
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.frames import static_at
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, cut, empty_track, place_at
+from ros2_memory.analysis.motion.robot_track import (
+    TOLERANCE_M,
+    RobotTrack,
+    cut,
+    empty_track,
+    place_at,
+)
 from ros2_memory.analysis.motion.standstills import stands_of, standstills_of
 from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.analysis.topic_events import MAX_PER_BAG
+from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEvents
 from ros2_memory.columns.decode import BULKY_TYPES
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
-from ros2_memory.history.context import Call
+from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.packed_messages import packed_messages
-from ros2_memory.lake.tables import ROWS_VERSION, TABLES
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.lake.tables import ROWS_VERSION, TABLES, Row, ShippedBag
+from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.things.labels import Labels
@@ -46,13 +52,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.analysis.topic_events import TopicEvents
-    from ros2_memory.core.model import BagFile, JsonValue
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.context import Memory
-    from ros2_memory.lake.tables import Row, ShippedBag
-    from ros2_memory.messages.detections import Detection
     from ros2_memory.storage.base import Batch, Channel, Record
 
 _MOST_OF_MESSAGE: Final = 512

@@ -29,21 +29,18 @@ from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.store import relative
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
+from ros2_memory.lake.tables import TABLES, Row, ShippedBag, day_of, of_bags, overlapping
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.history.context import Memory
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.lake.tables import Row
     from ros2_memory.lake.warehouse import LakeTables
     from ros2_memory.storage.base import BagReader
 

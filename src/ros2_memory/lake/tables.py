@@ -14,6 +14,7 @@ from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.expressions import (
     AlwaysFalse,
     And,
+    BooleanExpression,
     EqualTo,
     GreaterThanOrEqual,
     In,
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
-    from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.core.model import TimeWindow

@@ -25,12 +25,12 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.files import Partitions
 from ros2_memory.lake.rows import id_of_file
 from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
-from ros2_memory.lake.warehouse import WRITTEN
+from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.bag_dir.state_files import Forgetting
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.lake.warehouse import LakeTables
     from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)

@@ -24,7 +24,7 @@ from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
-from ros2_memory.core.timebase import NS_PER_MS, WallClock
+from ros2_memory.core.timebase import NS_PER_MS, Ns, WallClock
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 if TYPE_CHECKING:
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.core.timebase import Ns
 
 CATALOGUE_FILE: Final = "catalogue.sqlite"
 WRITTEN_FILE: Final = "written.jsonl"

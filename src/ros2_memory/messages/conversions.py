@@ -11,7 +11,7 @@ import dataclasses
 import keyword
 import math
 import re
-from collections.abc import Sized
+from collections.abc import Callable, Mapping, Sequence, Sized
 from enum import Enum, auto
 from functools import lru_cache
 from operator import attrgetter
@@ -23,8 +23,6 @@ from ros2_memory.core import geometry
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
-
     from ros2_memory.core.model import Quaternion, Vector3
 
 Array: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"

@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
+from ros2_memory.core.timebase import Ns, unix_from_ns, unix_rounded_up
 from ros2_memory.messages.conversions import (
     ABSENT,
+    Array,
     Degrees,
+    FieldTable,
     Metric,
     ValueKind,
     euler,
@@ -33,8 +35,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.messages.conversions import Array, FieldTable
 
 T = TypeVar("T")
 

@@ -12,12 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.trajectory import (
-    MAX_WAYPOINTS,
-    Waypoint,
-    drawn,
-    mean_speed,
-)
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Line, Waypoint, drawn, mean_speed
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
@@ -25,7 +20,7 @@ from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorde
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.history.view import open_span
+from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import placed_waypoints
 from ros2_memory.places.where import parse_where, times_in_region
@@ -34,10 +29,8 @@ from ros2_memory.results import DrivenInside
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.motion.trajectory import Line
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.view import TimeRange
     from ros2_memory.places.robot_tracks import Inside
 
 _SPEED_NS: Final[Ns] = NS_PER_S

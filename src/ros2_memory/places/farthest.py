@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import cut, jumps
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.driven_path import resolve_path_topic
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.frames import Floats, Times
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.view import View
 
 _ARGUMENT: Final = "farthest_from"

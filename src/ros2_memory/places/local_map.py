@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import empty_track, track_of
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, track_of
+from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.history.counting import pick
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.model import Geodetic
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View

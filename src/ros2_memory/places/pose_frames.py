@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.frames import HOLD_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import empty_track, place_at
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, place_at
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View

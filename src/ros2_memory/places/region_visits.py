@@ -14,17 +14,23 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS
-from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS
+from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS, RobotTrack
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle
-from ros2_memory.core.spans import without
+from ros2_memory.core.regions import Circle, Place, Region
+from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.pose_frames import map_placement, note_runs
-from ros2_memory.places.robot_tracks import RobotTracks, robot_inside, times_inside
+from ros2_memory.places.pose_frames import MapPlacement, map_placement, note_runs
+from ros2_memory.places.robot_tracks import (
+    Inside,
+    JoinedTrack,
+    RobotTracks,
+    robot_inside,
+    times_inside,
+)
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
@@ -32,12 +38,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.frames import Floats, Times
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.regions import Place, Region
-    from ros2_memory.core.spans import Spans
     from ros2_memory.history.view import View
-    from ros2_memory.places.pose_frames import MapPlacement
-    from ros2_memory.places.robot_tracks import Inside, JoinedTrack
     from ros2_memory.places.where import Where
 
 

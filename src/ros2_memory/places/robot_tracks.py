@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS, static_in
+from ros2_memory.analysis.frames import TF_CACHE_NS, Edges, Floats, Frames, Mask, Times, static_in
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
@@ -26,21 +26,21 @@ from ros2_memory.analysis.motion.robot_track import (
     track_by,
     track_part,
 )
-from ros2_memory.analysis.poses import headings
+from ros2_memory.analysis.poses import Poses, headings
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.tracks import TRACKS
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Parts, Steps, parts_inside
+from ros2_memory.core.regions import Parts, Region, Steps, parts_inside
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
-from ros2_memory.history.driven_path import body_by_transforms, note_left_out, pose_frame
+from ros2_memory.history.driven_path import Body, body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
 from ros2_memory.history.transforms import (
@@ -57,13 +57,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.frames import Edges, Floats, Frames, Mask, Times
-    from ros2_memory.analysis.poses import Poses
     from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.errors import UndecodableError
-    from ros2_memory.core.regions import Region
-    from ros2_memory.history.driven_path import Body
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 

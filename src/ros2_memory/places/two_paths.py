@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import jumps
+from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.frames import Floats, Times
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Region
     from ros2_memory.core.timebase import Ns

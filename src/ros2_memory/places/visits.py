@@ -17,9 +17,9 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
@@ -29,7 +29,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import (
     WHEREABOUTS,
@@ -47,10 +47,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import Call, Memory, QuerySettings
-    from ros2_memory.history.view import View
 
 _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""

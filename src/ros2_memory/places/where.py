@@ -17,9 +17,9 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle
-from ros2_memory.core.spans import united, without
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
+from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
@@ -28,21 +28,16 @@ from ros2_memory.history.held_values import holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
-from ros2_memory.places.pose_frames import map_placement
+from ros2_memory.places.pose_frames import MapPlacement, map_placement
 from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, track_in
-from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.robot_tracks import Inside, robot_inside
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
-    from ros2_memory.core.model import JsonValue
-    from ros2_memory.core.regions import Region
-    from ros2_memory.core.spans import Spans
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
-    from ros2_memory.places.pose_frames import MapPlacement
-    from ros2_memory.places.robot_tracks import Inside
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""

@@ -29,6 +29,7 @@ from ros2_memory.bootstrap import (
 )
 from ros2_memory.config import (
     NullRecorderNode,
+    Settings,
     exit_on_config_error,
     files_in_use,
     load_explained,
@@ -53,7 +54,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.config import Settings
     from ros2_memory.recorder.base import Housekeeper, Recorder
     from ros2_memory.storage.base import BagReader
 

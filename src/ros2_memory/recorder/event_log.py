@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from ros2_memory.recorder.process.output import LineKind
+from ros2_memory.recorder.process.output import Line, LineKind
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.recorder.process.output import Line
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 

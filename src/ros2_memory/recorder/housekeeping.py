@@ -22,34 +22,30 @@ from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Loss, append_losses
+from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, append_losses
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
-from ros2_memory.core.timebase import NS_PER_S, ms_from_ns, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
-from ros2_memory.retention.collect import Collected, GarbageCollector
+from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
 from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
-from ros2_memory.retention.repair import Repairer, open_files
+from ros2_memory.retention.repair import Repaired, Repairer, open_files
 from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state_files import Interruption
-    from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.collect import Outliving
     from ros2_memory.retention.policy import RetentionLimits
-    from ros2_memory.retention.repair import Repaired
     from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.core.model import BagState
-from ros2_memory.core.timebase import ms_from_ns, ns_from_unix
-from ros2_memory.index.bag_table import BagTable
+from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.timebase import Clock, Ns, ms_from_ns, ns_from_unix
+from ros2_memory.index.bag_table import BagTable, TableChange
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.retention.collect import Collected
-from ros2_memory.retention.inventory import ForeignBags
+from ros2_memory.retention.collect import Collected, GarbageCollector
+from ros2_memory.retention.inventory import Foreign, ForeignBags
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
@@ -34,12 +34,6 @@ if TYPE_CHECKING:
 
     from structlog.typing import FilteringBoundLogger
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.index.bag_table import TableChange
-    from ros2_memory.retention.collect import GarbageCollector
-    from ros2_memory.retention.inventory import Foreign
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["IndexManager", "Snapshot"]

@@ -17,8 +17,8 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.recorder.process.command import MESSAGES_LOST
-from ros2_memory.recorder.process.output import LineKind, parse_line
-from ros2_memory.storage.base import Closing
+from ros2_memory.recorder.process.output import Line, LineKind, parse_line
+from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.process.child import Child
-    from ros2_memory.recorder.process.output import Line
-    from ros2_memory.storage.base import BagReader
 
 MAX_DISTINCT: Final = 200
 """How many warnings that differ in more than their numbers are reported for one recording."""

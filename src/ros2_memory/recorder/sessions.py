@@ -22,10 +22,10 @@ from ros2_memory.recorder.handover.transfer import (
     Step,
 )
 from ros2_memory.recorder.handover.union import settle_handover
-from ros2_memory.recorder.policies import describe_death
-from ros2_memory.recorder.process.child import end_all
+from ros2_memory.recorder.policies import ClockReading, describe_death
+from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.output import LineKind
-from ros2_memory.recorder.session import RecordingSession, SessionState, Splits
+from ros2_memory.recorder.session import RecordingSession, SessionState, SplitChanges, Splits
 from ros2_memory.retention.clear import remove_if_empty
 
 if TYPE_CHECKING:
@@ -36,11 +36,8 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.policies import ClockReading
-    from ros2_memory.recorder.process.child import Child
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
-    from ros2_memory.recorder.session import SplitChanges
     from ros2_memory.storage.base import BagReader
 
 

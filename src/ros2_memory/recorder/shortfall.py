@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.recorder.policies import OWN_TOPICS, WAITING_S
+from ros2_memory.recorder.policies import OWN_TOPICS, WAITING_S, ClockReading
 from ros2_memory.recorder.process.topics import TopicSelection
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
     from ros2_memory.recorder.event_log import EventLog
-    from ros2_memory.recorder.policies import ClockReading
     from ros2_memory.recorder.session import RecordingSession
     from ros2_memory.recorder.sessions import Orders, RecordingSessions
 

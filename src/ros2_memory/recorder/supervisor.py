@@ -24,7 +24,7 @@ from ros2_memory.recorder.policies import (
     SilenceWatch,
     set_back,
 )
-from ros2_memory.recorder.sessions import SETTLE_S, RecordingSessions
+from ros2_memory.recorder.sessions import SETTLE_S, Orders, RecordingSessions
 from ros2_memory.recorder.shortfall import TopicWatch
 from ros2_memory.retention.disk import HomeDisk, device_of, free_bytes
 
@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
     from ros2_memory.recorder.base import Housekeeper
-    from ros2_memory.recorder.sessions import Orders
 
 HEARTBEAT_S: Final = 5.0
 """How often `recorder.json` is written."""

@@ -23,23 +23,20 @@ import structlog
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, METADATA_FILE, SHIPPED_FILE
 from ros2_memory.bag_dir.metadata_yaml import bare_name, recounted
-from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, read_receipts
+from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import ms_from_ns
+from ros2_memory.core.timebase import Ns, ms_from_ns
 from ros2_memory.retention.disk import free_bytes
-from ros2_memory.retention.policy import older_than
+from ros2_memory.retention.policy import RetentionLimits, RetentionStock, older_than
 from ros2_memory.retention.repair import left_in, rewritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state_files import Receipt
     from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.policy import RetentionLimits, RetentionStock
     from ros2_memory.storage.base import BagReader, BagWriter
 
 SLICE_S: Final = 1.0

@@ -20,7 +20,7 @@ import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.pauses import noteworthy
+from ros2_memory.core.pauses import Pauses, noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.pauses import Pauses
 
 T = TypeVar("T")
 IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"

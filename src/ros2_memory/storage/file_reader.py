@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from abc import abstractmethod
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -14,25 +14,21 @@ from rosbags.serde.utils import SIZEMAP
 
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
-from ros2_memory.storage.base import BagReader, batched
-from ros2_memory.storage.errors import UnreadableError, raise_if_lost, reading
+from ros2_memory.storage.base import BagReader, Batch, Channel, Definition, Record, batched
+from ros2_memory.storage.errors import LostError, UnreadableError, raise_if_lost, reading
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
-from ros2_memory.typestore import Typestores
+from ros2_memory.typestore import MessageType, Typestores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Batch, Channel, Definition, Record
-    from ros2_memory.storage.errors import LostError
     from ros2_memory.storage.sqlite_bag import SqliteBags
-    from ros2_memory.typestore import MessageType
 
 _HEADER_BYTES: Final = 4
 # A float128 is not aligned to its own size.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.large_reads import LargeReads
@@ -12,7 +12,6 @@ from ros2_memory.storage.mcap.bag_file import McapBags
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from contextlib import AbstractContextManager
     from pathlib import Path
 
     from ros2_memory.storage.base import Closing

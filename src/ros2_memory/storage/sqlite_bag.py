@@ -20,12 +20,12 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import starmap, zip_longest
 from operator import eq
-from typing import TYPE_CHECKING, Final
+from typing import IO, TYPE_CHECKING, Final
 
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
     ROS2_PROFILE,
     Channel,
@@ -43,10 +43,11 @@ from ros2_memory.storage.errors import (
     MAX_NAMES_CHARS,
     MAX_TEXTS_BYTES,
     ContradictionError,
+    LostError,
     SizeLimit,
     UnreadableError,
 )
-from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
+from ros2_memory.storage.file_io import EMPTY_FILE, FileKey, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.zstd_bag import uncompressed_payload
 from ros2_memory.typestore import full_name
@@ -54,12 +55,8 @@ from ros2_memory.typestore import full_name
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
-    from typing import IO
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.errors import LostError
-    from ros2_memory.storage.file_io import FileKey
 
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20

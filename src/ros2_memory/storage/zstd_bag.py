@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 import zstandard
 
 from ros2_memory.core.large_reads import LARGE_BYTES
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import Channel, Closing
 from ros2_memory.storage.errors import (
     MAX_COMPRESSION_RATIO,
+    SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
     too_large,
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.storage.base import Channel
-    from ros2_memory.storage.errors import SizeLimit
 
 # As large as a block, so that the data before a damaged block is not lost with it.
 _PIECE: Final = zstandard.DECOMPRESSION_RECOMMENDED_OUTPUT_SIZE

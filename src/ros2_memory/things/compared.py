@@ -17,20 +17,17 @@ from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.sights import Spot
-from ros2_memory.core.regions import places_at
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.regions import Place, places_at
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
-from ros2_memory.things.instances import most_at_once
+from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
 from ros2_memory.things.presence import missed_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.regions import Place
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.places.where import Where
-    from ros2_memory.things.instances import Instance, Mover, PlacedStay
     from ros2_memory.things.known import KnownThings
 
 _SAME_MOVER_M: Final = 1.0

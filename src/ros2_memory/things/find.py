@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Score, Spot
+from ros2_memory.analysis.sights import SCORE_BINS, Ints, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.regions import Circle, places_at
+from ros2_memory.core.regions import Circle, Place, places_at
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import being_written, describe_held
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.places.where import parse_where, places_asked
+from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, ThingStay, UsualPlace
-from ros2_memory.things.instances import most_at_once
+from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
@@ -30,13 +30,8 @@ from ros2_memory.things.unseen import Asked, notes_on
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.analysis.sights import Ints
     from ros2_memory.core.model import JsonValue, TimeWindow
-    from ros2_memory.core.regions import Place
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.context import Call, Memory, QuerySettings
-    from ros2_memory.places.where import Where
-    from ros2_memory.things.instances import Instance, Mover, PlacedStay
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3

@@ -15,15 +15,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Hit, Score, Spot, Unplaced
+from ros2_memory.analysis.sights import SCORE_BINS, Hit, Ints, Score, Sights, Spot, Unplaced
 from ros2_memory.core.arrays import distinct_rows
-from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.things.labels import moves_by_itself
+from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.localisation import poorly_localised
 from ros2_memory.things.moves import Sightings, stays_in
 from ros2_memory.things.places import GATE_MM, places_of
 from ros2_memory.things.presence import (
     Cells,
+    Evidence,
+    FieldOfView,
     Stay,
     chance_of_missing,
     evidence_at,
@@ -38,11 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.things.labels import Labels
-    from ros2_memory.things.presence import Evidence, FieldOfView
 
     Floats = NDArray[np.float64]
     Flags = NDArray[np.bool_]

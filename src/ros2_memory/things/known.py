@@ -16,21 +16,19 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.columns.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.things.instances import Estimate, estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import SIGHTS_NS, Watching
+from ros2_memory.things.seen import SIGHTS_NS, Stretch, Watching
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
-    from ros2_memory.things.seen import Stretch
 
 _MOST_SPOTS: Final = 150_000
 """Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""

@@ -10,13 +10,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import AHEAD_MM, Fix, Look, Spot
+from ros2_memory.analysis.sights import AHEAD_MM, Fix, Ints, Look, Sights, Spot
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from ros2_memory.analysis.sights import Ints, Sights
 
     Flags = NDArray[np.bool_]
 

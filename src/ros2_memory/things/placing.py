@@ -8,34 +8,29 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Frames
+from ros2_memory.analysis.frames import Frames, Rotations
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
-from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, fixes_of, sights_of
+from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, Sights, fixes_of, sights_of
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
-from ros2_memory.history.detections import DetectionRows, joined_detected
+from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.transforms import frames_over, sessions_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.frames import Rotations
-    from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.units import Rows
-    from ros2_memory.history.detections import Detected
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Look
+from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Ints, Look, Sights
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.core.timebase import Ns
 
     Floats = NDArray[np.float64]

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.counts.time_bins import local_offset
+from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.counts.time_bins import Offset, local_offset
 from ros2_memory.results import UsualPlace
 
 if TYPE_CHECKING:
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from ros2_memory.analysis.sights import Ints
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.counts.time_bins import Offset
 
     Floats = NDArray[np.float64]
 

@@ -21,7 +21,7 @@ from ros2_memory.analysis.sights import SLICE_NS
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
 from ros2_memory.columns.sights import packed
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import remembered, scan
 from ros2_memory.history.transforms import sessions_of, static_transforms
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.units import Rows
-    from ros2_memory.core.model import BagFile
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 

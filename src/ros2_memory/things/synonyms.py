@@ -12,17 +12,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Beside, Spot
-from ros2_memory.things.labels import last_word, moves_by_itself
+from ros2_memory.analysis.sights import Beside, Ints, Sights, Spot
+from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 from ros2_memory.things.moves import visits_of
 from ros2_memory.things.places import places_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.analysis.sights import Ints, Sights
     from ros2_memory.storage.base import Mask
-    from ros2_memory.things.labels import Labels
 
 _FEWEST: Final = 3
 """A label that took fewer turns is a mistake."""

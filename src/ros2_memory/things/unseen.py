@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Spot, Unplaced
+from ros2_memory.analysis.sights import Ints, Spot, Unplaced
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.insights.silences import describe_silences
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.sights import Ints
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.things.known import KnownThings
 

@@ -18,15 +18,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
-from ros2_memory.core.spans import lies_inside, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.spans import Spans, lies_inside, united, without
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.spans import Spans
-    from ros2_memory.core.timebase import Ns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

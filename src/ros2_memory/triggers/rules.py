@@ -22,13 +22,12 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.state_files import RunRecord
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.timebase import Ns
 
 
 GLOB_MARKS: Final = "*?["

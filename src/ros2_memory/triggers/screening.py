@@ -34,11 +34,12 @@ from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import (
     SCREENED,
     ConditionInterval,
+    Excluded,
     FileStep,
     RecordingScreen,
     ScreenState,
 )
-from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
 from ros2_memory.core.errors import (
     BagError,
     BagUnreachableError,
@@ -51,9 +52,10 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.repair import left_in, rewritten
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
+    ExclusionRule,
     RecordingConditions,
     add_excluded,
     add_message,
@@ -65,11 +67,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state_files import Excluded
-    from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.storage.base import BagReader, BagWriter, Record
-    from ros2_memory.triggers.exclusion import ExclusionRule
 
 MOST_AT_ONCE: Final = 16
 """So many splits are released in one step, which is then written down."""

@@ -10,21 +10,18 @@ import hashlib
 import heapq
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.conditions import refusal_for
+from ros2_memory.analysis.conditions import Condition, refusal_for
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.layout import named_start
-from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord
+from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.bag_dir.state_files import TriggerState
-    from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.storage.base import BagReader, Record
     from ros2_memory.triggers.rules import Firing, Rule

@@ -25,23 +25,19 @@ from ros2_memory.bag_dir.state_files import (
     RuleRecord,
     TriggerState,
 )
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, ns_from_unix
-from ros2_memory.triggers.rules import GLOB_MARKS, Firing
-from ros2_memory.triggers.search import chains_to_search
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
+from ros2_memory.triggers.rules import GLOB_MARKS, Firing, Rule
+from ros2_memory.triggers.search import SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.core.model import BagFile
-    from ros2_memory.core.timebase import Clock
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.saved_moments import MomentKeeper
-    from ros2_memory.triggers.rules import Rule
-    from ros2_memory.triggers.search import SplitSearch
 
 LOOK_S: Final = 2.0
 """How long one look searches: meanwhile nothing is deleted, and no other moment is saved."""

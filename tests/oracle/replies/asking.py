@@ -34,9 +34,9 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.state_files import TriggerState
 from ros2_memory.bootstrap import build_backfill, build_dispatcher, build_memory, rules_of
 from ros2_memory.cli.maintenance.index import fill_store
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.triggers.search import SplitSearch, chains_to_search
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.config import Settings
-    from ros2_memory.core.model import BagFile
 
 NOW_NS: Final = 1_900_000_000 * NS_PER_S
 """The wall clock of every call: later than all worlds but for the clocks that are wrong."""

@@ -10,12 +10,11 @@ import json
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
-from tests.oracle.replies.asking import Call
+from tests.oracle.replies.asking import Asked, Call
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from tests.oracle.replies.asking import Asked
 
 ROUND: Final = 6
 _POSES: Final = ("Odometry", "PoseStamped", "PoseWithCovarianceStamped", "NavSatFix", "Pose")

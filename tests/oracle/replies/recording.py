@@ -13,12 +13,11 @@ from tests.oracle.replies.asking import Asked, Call, still_time
 from tests.oracle.replies.calls import Calls, Facts
 from tests.oracle.replies.comparison import Comparison
 from tests.oracle.replies.fixture import Record, Replied
-from tests.oracle.replies.worlds import WORLDS
+from tests.oracle.replies.worlds import WORLDS, ReplyWorld
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
 
-    from tests.oracle.replies.worlds import ReplyWorld
 
 _SAMPLE_SEED: Final = "sample 1"
 _SLOW: Final = frozenset({"plot plot", "parquet export", "cli info", "cli forget"})

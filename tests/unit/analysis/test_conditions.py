@@ -14,6 +14,7 @@ from ros2_memory.analysis.conditions import (
     Contains,
     Equals,
     NearPosition,
+    Scalar,
     at_field,
     parse_condition,
     positions,
@@ -22,7 +23,6 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from tests.support.strategies import json_values, scalars
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.conditions import Scalar
     from ros2_memory.core.model import JsonValue
 
 SCENE: JsonValue = {

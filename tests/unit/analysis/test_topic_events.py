@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
@@ -14,6 +13,7 @@ from ros2_memory.analysis.facts import (
     LABEL,
     REPORT,
     STATUS,
+    Fact,
     State,
     Word,
     joined_stated,
@@ -25,9 +25,6 @@ from ros2_memory.analysis.topic_events import events_of as events_of_stated
 from ros2_memory.columns.events import EVENTS
 from ros2_memory.columns.fragments import Fragment
 from ros2_memory.core.timebase import NS_PER_S
-
-if TYPE_CHECKING:
-    from ros2_memory.analysis.facts import Fact
 
 Messages = list[tuple[int, State]]
 

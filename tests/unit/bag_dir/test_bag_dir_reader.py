@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -17,16 +16,13 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.support.fakes import FakeReader
 from tests.support.memories import memory_of
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9

@@ -28,7 +28,7 @@ from ros2_memory.bootstrap import build_backfill, build_memory, build_repairer, 
 from ros2_memory.cli.maintenance.recover import recover_files
 from ros2_memory.columns.database import open_file
 from ros2_memory.columns.forget import delete_catalogue
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, RecorderError
 from ros2_memory.core.model import TimeWindow
@@ -49,7 +49,6 @@ from tests.support.housekeepers import keeper_of
 from tests.support.robot_run import ANSWERED, T0, T0_S, write_run
 
 if TYPE_CHECKING:
-    from ros2_memory.config import Settings
     from ros2_memory.serving.mcp_server import EpisodicServer
 
 SECRET = "/outside/secret"  # noqa: S105  the name of a topic

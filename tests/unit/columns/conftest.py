@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.columns import decode
-from ros2_memory.columns.walk import NotWalkedError, walked
+from ros2_memory.columns.walk import Level, NotWalkedError, walked
 
 if TYPE_CHECKING:
     from ros2_memory.columns.plan import Plan
-    from ros2_memory.columns.walk import Level
     from ros2_memory.storage.base import Batch
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.columns.decode import decoded, decoded_together, pieces
-from ros2_memory.columns.table import joined
+from ros2_memory.columns.table import Table, joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from tests.support.leaves import Comparison
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer
 
-    from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import BagReader, Record
     from tests.unit.columns.drawn_types import DrawnTypes
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
@@ -27,19 +27,17 @@ from ros2_memory.columns.objects import level_of
 from ros2_memory.columns.plan import plan_of
 from ros2_memory.columns.table import Column, Elements, Table, Texts, Zone, joined
 from ros2_memory.columns.walk import NotWalkedError, walked
-from ros2_memory.storage.base import Channel, Record, Schema, batched
+from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
     from random import Random
 
     from hypothesis.strategies import DrawFn
     from rosbags.typesys.store import Typestore
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.storage.base import Batch
 
 VISION_MSGS: Final = {
     "vision_msgs/msg/ObjectHypothesis": "string class_id\nfloat64 score\n",

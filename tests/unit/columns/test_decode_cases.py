@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.columns import decode
 from ros2_memory.columns.decode import decoded, pieces
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Table, Texts
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap import bulk
@@ -50,7 +50,6 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer
 
-    from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import Channel
 
 EVERYTHING: Final = TimeWindow.everything()

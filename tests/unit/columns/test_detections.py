@@ -9,23 +9,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.columns.detections import DetectionColumns, detections_by
+from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
 from ros2_memory.columns.pack import pack, unpack
 from ros2_memory.columns.steps import MOST_RELATIVE, step_of
-from ros2_memory.columns.table import Texts
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.columns.table import Table, Texts
+from ros2_memory.messages.detections import Detection, detections_of
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
-from tests.unit.columns.drawn_tables import drawn_of, drawn_tables, rounded, store, stored
+from tests.unit.columns.drawn_tables import Drawn, drawn_of, drawn_tables, rounded, store, stored
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.columns.detections import Detections
-    from ros2_memory.columns.table import Table
-    from ros2_memory.messages.detections import Detection
-    from tests.unit.columns.drawn_tables import Drawn
 
 EXTRACTOR = shipped_extractor()
 SETTLED = (

@@ -14,7 +14,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import fill
-from ros2_memory.columns.decode import decoded, pieces
+from ros2_memory.columns.decode import Piece, decoded, pieces
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer
 
-    from ros2_memory.columns.decode import Piece
     from ros2_memory.columns.table import Table
     from ros2_memory.storage.base import BagReader, Channel
 

@@ -21,7 +21,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.fields import extremes_of
 from tests.support.bags import Msg, odom, text, write_mcap
@@ -31,7 +31,6 @@ from tests.support.examples import examples
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.history.context import Memory
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S

@@ -13,8 +13,8 @@ from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import decompressed, folded, unpack
 from ros2_memory.columns.parts import packed_part, part_table
-from ros2_memory.columns.stored import Topic
-from ros2_memory.columns.table import Elements, Table, Texts, joined
+from ros2_memory.columns.stored import StoredTable, Topic
+from ros2_memory.columns.table import Column, Elements, Table, Texts, joined
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.cache import ByteLru
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.columns.stored import StoredTable
-    from ros2_memory.columns.table import Column
 
 START = 1_768_176_000_000_000_000
 CHANNEL = Channel("/objects", "cdr", Schema("demo_msgs/msg/Objects"))

@@ -13,11 +13,10 @@ from hypothesis import given, settings
 from ros2_memory.columns.poses import NoPoseError, PoseColumns
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
-from tests.unit.columns.drawn_tables import drawn_of, drawn_tables, message, stored
+from tests.unit.columns.drawn_tables import Drawn, drawn_of, drawn_tables, message, stored
 
 if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
-    from tests.unit.columns.drawn_tables import Drawn
 
 EXTRACTOR = shipped_extractor()
 POSED = (

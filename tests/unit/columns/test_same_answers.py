@@ -18,7 +18,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap, recap_or_before
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from ros2_memory.history.context import Memory
 
 Question = tuple[str, "Callable[[Memory, Call], object]"]
 

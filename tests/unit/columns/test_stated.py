@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.facts import LABEL, state_of, stated_by
+from ros2_memory.analysis.facts import LABEL, Facts, State, Word, state_of, stated_by
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
-from tests.unit.columns.drawn_tables import drawn_tables, stored
+from tests.unit.columns.drawn_tables import Drawn, drawn_tables, stored
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.facts import Facts, State, Word
     from ros2_memory.columns.table import Table
-    from tests.unit.columns.drawn_tables import Drawn
 
 EXTRACTOR = shipped_extractor()
 T0 = 1_784_000_000 * NS_PER_S

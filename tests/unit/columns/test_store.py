@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from ros2_memory.columns.decode import BagRows
-from ros2_memory.columns.pack import FORMAT, decompressed
+from ros2_memory.columns.pack import FORMAT, Packed, decompressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
-from ros2_memory.columns.table import Table
+from ros2_memory.columns.table import Column, Table
 from ros2_memory.columns.units import GoneError
 from ros2_memory.columns.writing import DecodedBags, ReadBag
 from ros2_memory.storage.base import Channel, Schema
@@ -40,8 +40,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.pack import Packed
-    from ros2_memory.columns.table import Column
 
 S = 10**9
 T0 = 1_700_000_400 * S

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
-from ros2_memory.columns.table import Texts
+from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.truth import ColumnCondition
 from tests.support.bags import make, stamp
 from tests.support.examples import LONG, examples
@@ -29,7 +29,6 @@ from tests.unit.columns.drawn_tables import (
 
 if TYPE_CHECKING:
     from ros2_memory.columns.shown import Kept
-    from ros2_memory.columns.table import Table
     from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()

@@ -18,11 +18,11 @@ from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.history import driven_path
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.counting import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import boolean, detections, odom, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.examples import examples
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
@@ -31,9 +31,7 @@ from tests.support.random_histories import write_history
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Bins
-    from tests.support.bags import Msg
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

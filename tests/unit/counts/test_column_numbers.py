@@ -22,14 +22,13 @@ from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.stays import count_visits
 from ros2_memory.history.bag_access import BagAccess
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from tests.support.bags import McapLayout, Msg, battery, odom, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Bins
 
 S = 10**9

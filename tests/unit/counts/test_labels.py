@@ -6,7 +6,7 @@ from itertools import pairwise
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -15,10 +15,7 @@ from hypothesis import strategies as st
 from tests.support.bags import detections, text, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
-from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, asked_of, bounds, draw, write
-
-if TYPE_CHECKING:
-    from tests.support.rooms import World
+from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
 
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 

@@ -7,22 +7,19 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
 from tests.support.examples import examples
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
 EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -14,15 +13,14 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.counts.time_bins import (
     MOST_BINS,
     MOST_DAYS,
+    ClockBin,
+    Offset,
     TimeBins,
     first_of_days,
     time_bins,
     usual_time,
 )
 from ros2_memory.results import Usual
-
-if TYPE_CHECKING:
-    from ros2_memory.counts.time_bins import ClockBin, Offset
 
 S = 10**9
 H = 3600

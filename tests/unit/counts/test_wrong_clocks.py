@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of
@@ -14,7 +14,6 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 TRUE = 1_784_030_400

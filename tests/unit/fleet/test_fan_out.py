@@ -16,12 +16,10 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import FanOut, Robot
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-
-    from ros2_memory.history.context import Memory
 
 
 def robots(count: int) -> list[Robot]:

@@ -18,7 +18,7 @@ import pytest
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S, reply_of, seeded, tools_of, write_robot
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.demo.judges import CallContext
-    from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Tool
 
 WELL = "flat"

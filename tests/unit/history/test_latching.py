@@ -13,7 +13,7 @@ from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, Latching, QuerySettings
+from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.insights.status import memory_status
@@ -38,7 +38,6 @@ from tests.support.memories import each_way, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 MS = 10**6

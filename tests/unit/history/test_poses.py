@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from ros2_memory.analysis.poses import joined_poses
+from ros2_memory.analysis.poses import Poses, joined_poses
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import pose_rows, poses_of
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, make, odom, quaternion, text, write_mcap
@@ -25,8 +25,6 @@ from tests.unit.history.cut_histories import cut, draw_recordings, fill_some, wr
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.analysis.poses import Poses
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 T0 = 1_700_000_000 * S

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.counting import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index import timeline
@@ -27,7 +27,6 @@ from tests.support.memories import asked, memory_of, with_store
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 TOPIC = "/rosout"

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.storage.mcap_reader import McapReader
@@ -17,9 +17,7 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
-    from typing import Any
 
-    from ros2_memory.history.context import Memory
     from ros2_memory.storage.base import Batch
 
 S = 10**9

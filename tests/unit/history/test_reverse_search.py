@@ -12,7 +12,7 @@ import pytest
 from ros2_memory import queries
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.replies import Replies
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Match
 
 T0_S = 1_700_000_000

@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
 from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
@@ -20,7 +20,6 @@ from tests.support.memories import asked, memory_of, with_store
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 T0 = 1_700_000_000 * NS_PER_S
 

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pytest
 
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, each_way, memory_of, replied
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 Now = Literal["wall", "latest"]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.history.context import QuerySettings
+from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import boolean, detections, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of, with_store
@@ -14,7 +14,6 @@ from tests.support.memories import asked, memory_of, with_store
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 T0_S = 1_795_161_600

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.model import BagState, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.timebase import Ns
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from ros2_memory.storage.mcap_reader import McapReader
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.storage.base import BagReader
 
 S = 10**9

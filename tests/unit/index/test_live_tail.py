@@ -26,7 +26,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.dispatch import Dispatcher
@@ -42,7 +42,6 @@ from tests.support.memories import memory_of, with_store
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from ros2_memory.history.context import Memory
     from ros2_memory.tools.declaration import Tool
 
 S = 10**9

@@ -7,7 +7,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -21,7 +20,7 @@ from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.queries import trajectory_summary
@@ -48,9 +47,6 @@ from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.moving_map import write_moving_map
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.moment_file import (
     PendingRequest,
     SavedMoment,
     SaveRequest,
+    StoredMoment,
     make_moment_folder,
     write_saved_moment,
 )
@@ -42,7 +43,6 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.bag_dir.moment_file import StoredMoment
 
 S = 10**9
 T0 = 1_790_000_000 * S

@@ -10,16 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.sightings import find_matches
-from tests.support.bags import detections, write_mcap
+from tests.support.bags import Msg, detections, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Sightings
-    from tests.support.bags import Msg
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

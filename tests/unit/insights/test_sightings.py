@@ -23,7 +23,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import Deadline, unix_from_ns
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
@@ -53,7 +53,6 @@ from tests.support.shared_bags import needs_recorded
 if TYPE_CHECKING:
     from mcap.writer import Writer
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.state_files import (
     ScreenState,
     append_losses,
 )
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.status import memory_status
 from ros2_memory.queries import topic_range
@@ -34,7 +34,6 @@ from tests.support.memories import asked, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 DAY = 86_400 * S

@@ -8,7 +8,6 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,19 +15,15 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Place, Rectangle
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
-from tests.support.moving_map import BEGIN, S, write_moving_map
+from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
 from tests.support.random_histories import write_history
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
-    from tests.support.moving_map import MovingMap
 
 LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)

@@ -7,7 +7,7 @@ import random
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ros2_memory import queries
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
@@ -25,9 +25,6 @@ from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),

@@ -12,9 +12,9 @@ import pytest
 
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import write_mcap
 from tests.support.memories import memory_of, with_store
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
-    from ros2_memory.places.robot_tracks import JoinedTrack
     from ros2_memory.storage.base import Batch
 
 MINUTES = 25

@@ -7,7 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, NoDataError
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.visits import visits
@@ -26,9 +26,6 @@ from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 CUPS = "/vision/scene/scene_objects"
 PLACES = (

@@ -18,11 +18,10 @@ from hypothesis import strategies as st
 from ros2_memory.core.regions import Place, Rectangle
 from tests.support.examples import examples
 from tests.support.memories import asked
-from tests.support.rooms import BEGIN, ROOMS, SEEN, asked_of, bounds, draw, runs_of, write
+from tests.support.rooms import BEGIN, ROOMS, SEEN, World, asked_of, bounds, draw, runs_of, write
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
-    from tests.support.rooms import World
 
 SECONDS = 400
 HELLO = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}

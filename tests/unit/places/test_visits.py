@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import pytest
 from hypothesis import HealthCheck, assume, example, given, settings
@@ -26,7 +26,7 @@ from ros2_memory.core.timebase import Deadline
 from ros2_memory.demo import robot as demo_robot
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
@@ -37,9 +37,6 @@ from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 BEGIN = 1_784_000_000 * S

@@ -13,7 +13,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.core.model import BagState
+from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import Clock
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
@@ -21,7 +21,6 @@ from tests.support.plain_text_bags import PlainReader, close, grow, plain
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from ros2_memory.core.model import BagFile, SetAside
 
 S = 10**9
 NOW = 1_800_000_000 * S

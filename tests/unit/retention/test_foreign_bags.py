@@ -18,7 +18,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import claim
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.status import memory_status
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
@@ -49,7 +49,6 @@ from tests.support.memories import memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 Capture = pytest.CaptureFixture[str]
 S = 10**9

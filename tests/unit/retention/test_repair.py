@@ -10,7 +10,7 @@ from ros2_memory.bag_dir.layout import has_own_name, recording_name
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.retention.repair import Repairer, open_files
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import Closing, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -21,7 +21,6 @@ from tests.support.shared_bags import RECORDED, needs_recorded
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.storage.base import Record
 
 S = 10**9
 T0 = 1_790_000_000 * S

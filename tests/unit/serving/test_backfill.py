@@ -29,7 +29,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -41,7 +41,6 @@ from tests.support.memories import memory_of
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.history.context import Memory
 
 T0 = 1_700_000_000 * NS_PER_S
 

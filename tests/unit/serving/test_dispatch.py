@@ -10,7 +10,7 @@ import anyio
 import pytest
 import structlog
 from mcp import Client
-from mcp.types import TextContent
+from mcp.types import CallToolResult, TextContent
 from structlog.testing import LogCapture
 
 from ros2_memory import results
@@ -23,7 +23,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import Sample
-from ros2_memory.history.context import Memory
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.dispatch import (
     BLOCKING_AT_ONCE,
     QUICK_AT_ONCE,
@@ -37,9 +37,6 @@ from ros2_memory.tools.replies import Replies, Reply
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
 
-    from mcp.types import CallToolResult
-
-    from ros2_memory.history.context import Call
     from ros2_memory.results import Answer
 
 NOBODY = cast("Memory", None)

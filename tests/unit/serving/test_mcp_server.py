@@ -26,10 +26,10 @@ from ros2_memory.bag_dir.moment_file import (
 )
 from ros2_memory.bootstrap import build_memory, build_server
 from ros2_memory.columns.fill import Progress
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import Storing
+from ros2_memory.serving.mcp_server import EpisodicServer, Storing
 from ros2_memory.tools.spec_tools import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from ros2_memory.config import Settings
-    from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.tools.declaration import Tool
 
 T0 = 1_795_161_600 * NS_PER_S

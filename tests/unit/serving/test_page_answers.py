@@ -29,7 +29,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.telemetry import Answered
 from ros2_memory.core.timebase import NS_PER_S, Deadline
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.transforms import transform_at
 from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
@@ -63,7 +63,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.history.context import Memory
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S

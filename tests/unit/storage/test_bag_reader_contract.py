@@ -21,7 +21,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Record, Schema
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
 from tests.support.examples import examples
 from tests.support.reader_cases import ALL, FILES, Shelf
@@ -29,7 +29,6 @@ from tests.support.reader_cases import ALL, FILES, Shelf
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable
 
-    from ros2_memory.storage.base import BagReader, Batch
 
 on_every_shelf = pytest.mark.parametrize("shelf", ALL, ids=str)
 on_every_file = pytest.mark.parametrize("shelf", FILES, ids=str)

@@ -1,16 +1,11 @@
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
 
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import definition, odom, text
-
-if TYPE_CHECKING:
-    from tests.support.bags import Msg
+from tests.support.bags import Msg, definition, odom, text
 
 
 def record_of(message: Msg, schema: Schema | None = None) -> Record:

@@ -17,7 +17,7 @@ from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Match
     from ros2_memory.storage.base import BagReader
 

@@ -7,20 +7,17 @@ import math
 import shutil
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import pytest
 
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, needs_real
-
-if TYPE_CHECKING:
-    from ros2_memory.history.context import Memory
 
 pytestmark = needs_real
 

@@ -14,7 +14,7 @@ import pytest
 
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import BagReader, Closing, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.shared_bags import BAGS, REAL, RECORDED, needs_real, needs_recorded
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.storage.base import BagReader, Record
 
 EVERYTHING = TimeWindow.everything()
 NO_BAG = {"Dockerfile.mcap"}

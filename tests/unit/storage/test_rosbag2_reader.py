@@ -17,7 +17,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import Closing, Record
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
     McapLayout,
@@ -33,7 +33,6 @@ from tests.support.bags import (
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.storage.base import Record
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"

@@ -10,7 +10,7 @@ from mcap.writer import CompressionType
 
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import Closing, Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
@@ -18,7 +18,6 @@ from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.storage.base import Record
 
 EVERYTHING = TimeWindow.everything()
 

@@ -25,7 +25,7 @@ from ros2_memory.results import (
 )
 from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import log_entry
+from tests.support.bags import Msg, log_entry
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, replied, with_store
 from tests.unit.things.test_find import (
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from tests.support.bags import Msg
 
 S = 10**9
 MUG = ("mug", 3.0, 0.5)

@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.instances import Estimate, estimate, most_at_once
+from ros2_memory.things.instances import Estimate, Instance, estimate, most_at_once
 from ros2_memory.things.labels import Labels
 from tests.support.sights import (
     Message,
@@ -21,13 +21,19 @@ from tests.support.sights import (
     sights_of_messages,
     whole,
 )
-from tests.unit.things.simulated_things import BAG_S, BEGIN_S, OUT, Simulation, simulate, visible
+from tests.unit.things.simulated_things import (
+    BAG_S,
+    BEGIN_S,
+    OUT,
+    Simulation,
+    Thing,
+    simulate,
+    visible,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.things.instances import Instance
-    from tests.unit.things.simulated_things import Thing
 
 pytestmark = pytest.mark.xdist_group("instances")
 """The homes are made once, for all tests of this file."""

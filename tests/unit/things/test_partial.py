@@ -13,7 +13,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
     from pathlib import Path
 
-    from ros2_memory.history.context import Memory
 
 T = TypeVar("T")
 

@@ -12,7 +12,7 @@ import pytest
 
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.sights import joined
-from ros2_memory.history.context import Call
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.things import placing
 from ros2_memory.things.find import find_things
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.sights import Sights
-    from ros2_memory.history.context import Memory
     from ros2_memory.results import Thing
     from tests.support.bags import Msg
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import anyio
 import pytest
@@ -13,15 +13,12 @@ from hypothesis import HealthCheck, given, settings
 
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.declaration import Signature
-from ros2_memory.tools.replies import Replies
+from ros2_memory.tools.replies import Replies, Reply
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.examples import examples
 from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
 from tests.support.memories import memory_of
 from tests.support.robot_run import ANSWERED, write_run
-
-if TYPE_CHECKING:
-    from ros2_memory.tools.replies import Reply
 
 LONGEST_REPLY = 24_000
 LONGEST_DETAIL = 2_000

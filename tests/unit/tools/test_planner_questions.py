@@ -14,19 +14,17 @@ from mcp.types import TextContent
 
 from ros2_memory.bootstrap import build_server, query_settings_of
 from ros2_memory.config import load_settings
-from ros2_memory.demo.judges import WrongAnswerError
+from ros2_memory.demo.judges import CallContext, WrongAnswerError
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of, with_store
 from tests.support.planner_questions import QUESTIONS, Planned
-from tests.support.planner_world import recorded
+from tests.support.planner_world import World, recorded
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.demo.judges import CallContext
-    from tests.support.planner_world import World
 
 BY_WORDS = {question.words: question for question in QUESTIONS}
 MOST_CALLS_FOR_FORTY = 45

@@ -15,7 +15,7 @@ from mcap.opcode import Opcode
 from ros2_memory import queries
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Memory
 
 S = 10**9
 T0_S = 1_784_000_000

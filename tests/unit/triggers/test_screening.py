@@ -18,7 +18,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.screened_bags import (
     LATCHED,
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.triggers.exclusion import ExclusionRule
-    from tests.support.bags import Msg
 
 VOLATILE = McapLayout(latched=frozenset())
 

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.motion.path_length import FEWEST, SPEED_STEPS, End, measured
+from ros2_memory.analysis.motion.path_length import (
+    FEWEST,
+    SPEED_STEPS,
+    End,
+    Marks,
+    Numbers,
+    Rows,
+    measured,
+)
 from ros2_memory.core.arrays import row_sums
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
@@ -23,7 +31,6 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.analysis.motion.path_length import Marks, Numbers, Rows
     from ros2_memory.core.model import Vector3
 
 ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS

@@ -12,17 +12,14 @@ that jumps for a moment, show no drop.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.poses import headings
+from ros2_memory.analysis.poses import Poses, headings
 from ros2_memory.core.timebase import NS_PER_S, Ns
-
-if TYPE_CHECKING:
-    from ros2_memory.analysis.poses import Poses
 
 SLOT_NS: Final[Ns] = NS_PER_S // 2
 MOVING_MPS: Final = 0.15

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import duckdb
 import pyarrow as pa
@@ -11,10 +11,7 @@ from pyiceberg.io.pyarrow import PyArrowFileIO
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.lake.engines.base import LakeEngine
-
-if TYPE_CHECKING:
-    from ros2_memory.lake.engines.base import DataFiles, Parameters
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",

@@ -43,14 +43,13 @@ from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import BagReader, Closing, Record
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.storage.base import BagReader, Record
 
 JITTER_NS: Final[Ns] = 100 * NS_PER_MS
 """Two recorders differ by less than this in when they received one message."""

@@ -36,7 +36,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
@@ -55,7 +55,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.columns.table import Table
-    from ros2_memory.core.model import BagFile
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader, BagWriter, Record

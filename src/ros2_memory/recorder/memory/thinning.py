@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeGuard
 import numpy as np
 
 from ros2_memory.analysis.intervals import THINNED_NS
-from ros2_memory.columns.steps import step_of
-from ros2_memory.columns.table import Elements, Texts
+from ros2_memory.columns.steps import Step, step_of
+from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.text import NAMES_IN_MESSAGES
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.messages.detections import detections_of
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.detections import DetectionColumns, Detections
-    from ros2_memory.columns.steps import Step
-    from ros2_memory.columns.table import Column, Numbers, Table
     from ros2_memory.storage.base import Definition, IntArray
 
     Name = tuple[str, int]

@@ -16,7 +16,7 @@ import structlog
 import yaml
 
 from ros2_memory.bag_dir.layout import has_own_name
-from ros2_memory.bag_dir.state_files import append_losses
+from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import counted, listed
 from ros2_memory.recorder.reception.measure import (
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.bag_dir.state_files import Loss
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
 

@@ -22,10 +22,10 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header
 
-from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES
+from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES, BagSummary
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
     Batch,
     Channel,
@@ -83,15 +83,11 @@ from ros2_memory.storage.mcap.records import (
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
-from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed, uncompressed_payload
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
-
-    from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.zstd_bag import Uncompressed
 
 
 _LARGE_BYTES: Final = 8 << 20

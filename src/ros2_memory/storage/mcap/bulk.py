@@ -19,26 +19,18 @@ from ros2_memory.core.arrays import gathered
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import BATCH_BYTES, Batch
-from ros2_memory.storage.errors import MAX_CHUNK_MESSAGES, UnreadableError
-from ros2_memory.storage.mcap.chunk import (
-    NOT_THERE,
-    chunk_head,
-    decompressed_chunk,
-)
+from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask
+from ros2_memory.storage.errors import MAX_CHUNK_MESSAGES, SizeLimit, UnreadableError
+from ros2_memory.storage.mcap.chunk import NOT_THERE, Column, chunk_head, decompressed_chunk
 from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
-from ros2_memory.storage.zstd_bag import FRAME_MAGIC
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow
-    from ros2_memory.storage.base import Channel, IntArray, Mask
-    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.chunk import Column
     from ros2_memory.storage.mcap.index import Chunk
-    from ros2_memory.storage.zstd_bag import Uncompressed
 
 MAX_GROUP_CHUNKS: Final = 4096
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"

@@ -25,6 +25,7 @@ from ros2_memory.storage.errors import (
     MAX_CHUNKS,
     MAX_COMPRESSION_RATIO,
     MESSAGE_BYTES,
+    SizeLimit,
     UnreadableError,
     as_unreadable,
     max_decompressed_bytes,
@@ -35,15 +36,14 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE,
     MESSAGE_FIELDS,
     RECORD,
+    FileRecord,
 )
 from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.records import FileRecord
 
 Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 

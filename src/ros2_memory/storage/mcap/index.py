@@ -20,10 +20,16 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.bag_summary import MESSAGES_MISSING, OUT_OF_ORDER_NS, WRONG_STATISTICS
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, pauses_among
-from ros2_memory.core.timebase import MAX_NS, unix_from_ns
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
+from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.storage.cache import unshared_bytes
-from ros2_memory.storage.errors import MAX_CHUNKS, MAX_SECTION_BYTES, UnreadableError, reason_of
+from ros2_memory.storage.errors import (
+    MAX_CHUNKS,
+    MAX_SECTION_BYTES,
+    SizeLimit,
+    UnreadableError,
+    reason_of,
+)
 from ros2_memory.storage.mcap.chunk import (
     Column,
     Extent,
@@ -49,10 +55,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
-    from ros2_memory.core.pauses import Pauses
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import Channel
-    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")

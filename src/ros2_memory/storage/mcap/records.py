@@ -32,12 +32,11 @@ from ros2_memory.storage.errors import (
     MAX_SECTION_BYTES,
     UnreadableError,
 )
-from ros2_memory.storage.file_io import EMPTY_FILE
+from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ros2_memory.storage.file_io import OpenFile
 
 MAGIC: Final = MCAP0_MAGIC
 MAGIC_SIZE: Final = len(MAGIC)

@@ -18,21 +18,18 @@ import yaml
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Metadata
+from mcap.records import McapRecord, Metadata
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.chunk import ChunkOpener
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, file_records, section_records
+from ros2_memory.storage.mcap.records import MAGIC_SIZE, FileRecord, file_records, section_records
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from mcap.records import McapRecord
-
-    from ros2_memory.storage.mcap.records import FileRecord
 
 _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] = {
     Opcode.HEADER: mcap_records.Header.read,

@@ -13,16 +13,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, pauses_among
-from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import Closing
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
+from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.storage.base import Closing, IntArray
 from ros2_memory.storage.cache import unshared_bytes
-from ros2_memory.storage.errors import (
-    UnreadableError,
-    as_unreadable,
-    too_large,
-)
-from ros2_memory.storage.mcap.chunk import ChunkOpener, column_of
+from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
+from ros2_memory.storage.mcap.chunk import ChunkContent, ChunkOpener, Column, Extent, column_of
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     Chunk,
@@ -35,6 +31,7 @@ from ros2_memory.storage.mcap.records import (
     MAGIC_SIZE,
     MESSAGE,
     Declarations,
+    FileRecord,
     closing_of,
     file_records,
     statistics,
@@ -45,13 +42,7 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
-    from ros2_memory.core.pauses import Pauses
-    from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import IntArray
-    from ros2_memory.storage.errors import SizeLimit
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.chunk import ChunkContent, Column, Extent
-    from ros2_memory.storage.mcap.records import FileRecord
 
 _DECLARED: Final = frozenset((Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS))
 

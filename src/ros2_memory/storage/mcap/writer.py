@@ -7,13 +7,13 @@ from collections import Counter
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
-from typing import TYPE_CHECKING, Final
+from typing import IO, TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
 from mcap.writer import CompressionType, IndexType, Writer
 
 from ros2_memory.core.errors import BagError, EpisodicError
-from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Rewritten
+from ros2_memory.storage.base import ROS2_PROFILE, BagWriter, Channel, Record, Rewritten, Schema
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, reason_of
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
@@ -25,11 +25,9 @@ from ros2_memory.typestore import full_name
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
-    from typing import IO
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import Channel, Record, Schema
 
 _DENSE_CHUNK_BYTES: Final = 512 << 10
 CHUNK_BYTES: Final = 64 << 10

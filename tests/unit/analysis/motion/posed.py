@@ -11,6 +11,7 @@ import numpy as np
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     BLOCK_NS,
+    Standstill,
     joined_blocks,
     stands_of,
     standstills_of,
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-    from ros2_memory.analysis.motion.standstills import Standstill
     from ros2_memory.core.model import Quaternion, Vector3
 
 

@@ -15,7 +15,7 @@ from ros2_memory.analysis.motion.odometry import MotionTotals
 from ros2_memory.analysis.motion.trajectory import TOLERANCE_M, Trajectory
 from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.geometry import normalised
-from ros2_memory.core.model import Pose
+from ros2_memory.core.model import Pose, Vector3
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.history.driven_path import length_notes
 from tests.support.rosbags_oracle import messages
@@ -26,7 +26,6 @@ from tests.unit.analysis.motion.posed import posed, way_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.core.model import Vector3
 
 S = NS_PER_S
 MS = NS_PER_MS
