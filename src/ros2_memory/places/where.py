@@ -17,7 +17,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
 from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.text import abbreviate
@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.motion.robot_track import RobotTrack
+
+    # Not at runtime: pydantic, which `WhileCondition` is an argument of, takes no recursive type.
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
 
