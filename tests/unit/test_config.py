@@ -61,7 +61,7 @@ class TestDefaults:
                 "index_refresh_s": 5.0,
                 "include_active": False,
                 "custom_msg_paths": (),
-                "chunk_cache_mb": 64,
+                "chunk_cache_mb": 24,
                 "max_chunk_mb": 64,
                 "schemas_file": ROOT / "config/message_schemas.yaml",
             },
@@ -114,7 +114,7 @@ class TestDefaults:
             "storage": {
                 "target": MCAP,
                 "custom_msg_paths": (),
-                "cache_mb": 64,
+                "cache_mb": 24,
                 "max_chunk_mb": 64,
             },
             "recorder": {

@@ -86,7 +86,8 @@ class Coverage:
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
         """Returns those of the numbers of a part whose bags are bags of the timeline."""
         if part not in self._of_parts:
-            self._of_parts[part] = numbers[self._are_there(numbers)]
+            there = self._are_there(numbers)
+            self._of_parts[part] = numbers if there.all() else numbers[there]
         return self._of_parts[part]
 
     def counts(self, groups: Sequence[IntArray]) -> IntArray:

@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 17
+FORMAT: Final = 18
 """Version of the file. Raise it with every change of its tables and of their bytes."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4
@@ -146,7 +146,9 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
         return _unpack_texts(rest, count, data)
     dtype = np.dtype(kind)
     if rest == "constant":
-        return np.full(count, np.nan if least is None and dtype.kind == "f" else least or 0, dtype)
+        value = np.nan if least is None and dtype.kind == "f" else least or 0
+        # A row of the one value that is held.
+        return np.broadcast_to(np.array(value, dtype), count)
     form, _, arrangement = rest.partition(" ")
     if form == "whole":
         return _whole_numbers(arrangement, count, int(least or 0), data).astype(dtype)
@@ -466,7 +468,7 @@ def _is_small(text: str) -> bool:
 def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:
     words, end = _words(data)
     if arrangement == "constant":
-        return Texts(np.zeros(count, np.uint32), words)
+        return Texts(np.broadcast_to(np.uint32(0), count), words)
     return Texts(_whole_numbers(arrangement, count, 0, data[end:]).astype(np.uint32), words)
 
 

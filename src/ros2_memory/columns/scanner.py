@@ -42,7 +42,7 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-CACHE_MB: Final = 80
+CACHE_MB: Final = 64
 """How much unpacked columns and fragments may take in memory, in MiB."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 DECODED_BYTES: Final = 8 << 20

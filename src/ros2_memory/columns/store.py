@@ -19,6 +19,8 @@ import json
 import os
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
+from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -303,19 +305,25 @@ class ColumnStore(Database):
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
                 " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
-            )
+            ).fetchall()
+            # Thousands of small arrays would keep other memory from going back: one has all.
+            bags = [json.loads(row[4]) for row in rows]
+            every = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
+            own = np.split(every, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [
                 PartHead(
                     self.offset + number,
                     self.offset + of_topic,
                     first,
                     last,
-                    np.array(json.loads(bags), np.int64) + self.offset,
+                    numbers,
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for number, of_topic, first, last, bags, messages, dropped, whole in rows
+                for (number, of_topic, first, last, _, messages, dropped, whole), numbers in zip(
+                    rows, own, strict=True
+                )
             ]
 
         return self.read(ask, [])
@@ -344,7 +352,7 @@ class ColumnStore(Database):
                 (topic - self.offset, path, self._ids(parts)),
             )
             return {
-                part + self.offset: Packed(codec, count, error, zone_of(*zone), b"")
+                part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
                 for part, codec, count, error, *zone in rows
             }
 

@@ -197,20 +197,25 @@ def lazy_columns(
         column: returns the column, or the owners, at a path of `Layout.slots`.
         dropped: the paths of those that there are not.
     """
-
-    def elements_in(inside: Layout, around: str) -> Mapping[str, Elements]:
-        def elements(path: str) -> Elements:
-            whole, inner = f"{around}{path}", inside.sequences[path]
-            return Elements(
-                cast("IntArray", column(f"{whole}#")),
-                Lazily(inner.columns, lambda name: column(f"{whole}.{name}".rstrip("."))),
-                elements_in(inner, f"{whole}."),
-            )
-
-        paths = [path for path in inside.sequences if f"{around}{path}#" not in dropped]
-        return Lazily(paths, elements)
-
     columns = (
         [path for path in layout.columns if path not in dropped] if dropped else layout.columns
     )
-    return Lazily(columns, column), elements_in(layout, "")
+    return Lazily(columns, column), _lazy_elements(layout, column, dropped, "")
+
+
+def _lazy_elements(
+    inside: Layout, column: Callable[[str], Column], dropped: Collection[str], around: str
+) -> Mapping[str, Elements]:
+    """Returns the sequences inside of what the path `around` begins with."""
+
+    def elements(path: str) -> Elements:
+        whole, inner = f"{around}{path}", inside.sequences[path]
+        return Elements(
+            cast("IntArray", column(f"{whole}#")),
+            Lazily(inner.columns, lambda name: column(f"{whole}.{name}".rstrip("."))),
+            _lazy_elements(inner, column, dropped, f"{whole}."),
+        )
+
+    return Lazily(
+        [path for path in inside.sequences if f"{around}{path}#" not in dropped], elements
+    )

@@ -379,8 +379,8 @@ def _joined_elements(
 def column_bytes(column: Column) -> int:
     """Returns about how many bytes of memory a column takes."""
     if isinstance(column, Texts):
-        return column.codes.nbytes + sum(map(len, column.words)) + 60 * len(column.words)
-    return column.nbytes
+        return column_bytes(column.codes) + sum(map(len, column.words)) + 60 * len(column.words)
+    return column.nbytes if all(column.strides) else column.itemsize
 
 
 def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:

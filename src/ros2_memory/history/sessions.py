@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from weakref import proxy
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
@@ -75,8 +76,9 @@ class Sessions:
         edges: every parent and child pair of all, once that is asked.
     """
 
-    def __init__(self, view: View, children: Callable[[Session], set[str]]) -> None:
-        self._view = view
+    def __init__(self, view: View, children: Callable[[View, Session], set[str]]) -> None:
+        # A view holds its sessions: so the arrays of a call are freed as it ends.
+        self._view: View = proxy(view)
         self._children = children
         self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
@@ -212,7 +214,8 @@ class Sessions:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
         if self._kinds(one) & self._kinds(other):
             return False
-        return not self._children(one) & self._children(other)
+        frames_of_one, of_other = (self._children(self._view, each) for each in (one, other))
+        return not frames_of_one & of_other
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""

@@ -359,12 +359,15 @@ def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
 def sessions_of(view: View) -> Sessions:
     """Returns the sessions of a view, made once."""
     if view.sessions is None:
-        limits = view.limits
-        topics = (*limits.tf_topics, *limits.tf_static_topics)
-        view.sessions = Sessions(
-            view, lambda among: {child for _, child in _pairs(view, topics, among=among)}
-        )
+        view.sessions = Sessions(view, _children_in)
     return view.sessions
+
+
+def _children_in(view: View, session: Session) -> set[str]:
+    """Returns the child frames of all transforms of a session."""
+    limits = view.limits
+    topics = (*limits.tf_topics, *limits.tf_static_topics)
+    return {child for _, child in _pairs(view, topics, among=session)}
 
 
 def newest_in_session(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -14,7 +16,7 @@ from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.pack import decompressed, folded, unpack
 from ros2_memory.columns.parts import packed_part, part_table
 from ros2_memory.columns.stored import StoredTable, Topic
-from ros2_memory.columns.table import Column, Elements, Table, Texts, joined
+from ros2_memory.columns.table import Column, Elements, Table, Texts, column_bytes, joined
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
 from ros2_memory.storage.cache import ByteLru
@@ -132,6 +134,31 @@ def test_a_part_states_its_zones_and_the_errors_of_what_was_rounded_alone() -> N
     assert back.error("objects.hypotheses.") == 0.0
     assert 0.0 < back.error("orientation.w") <= 2.5e-5
     assert 0.0 < back.error("objects.position.x") <= 0.5e-4
+
+
+def test_what_is_unpacked_of_a_constant_column_is_one_value() -> None:
+    back = part(table(rows=1000))
+    assert column_bytes(back.columns["mode"]) == 1
+    assert column_bytes(back.columns["header.frame_id"]) < 100
+    assert column_bytes(back.columns["speed"]) == 4 * 1000
+
+
+def test_a_table_is_freed_when_nobody_holds_it_without_the_garbage_collector() -> None:
+    """Each question opens thousands of them."""
+
+    def load(path: str) -> Column:
+        return loaded.pop(path)
+
+    loaded: dict[str, Column] = {"objects#": np.arange(3), "objects.label": Texts.of(["cup"] * 3)}
+    told, loads = Topic(CHANNEL, Layout.of(table(), None)), weakref.ref(load)
+    gc.disable()
+    try:
+        back = part_table(told, lambda _: None, load, messages=3)
+        assert back.elements["objects"].columns["label"]
+        del back, load
+        assert loads() is None
+    finally:
+        gc.enable()
 
 
 def test_an_unknown_column_has_no_zone() -> None:

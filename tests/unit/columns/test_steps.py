@@ -113,7 +113,7 @@ def test_what_a_number_means_changes_with_the_format_alone() -> None:
     steps = [step.per_unit for step in (METRES, RADIANS, VELOCITY, QUATERNION, DEGREES)]
     limits = (MOST_RELATIVE, MAX_NUMBERS, MAX_RANGED_BYTES)
     assert (FORMAT, steps, limits) == (
-        17,
+        18,
         [10_000, 10_000, 10_000, 20_000, 1_000_000_000],
         (1e-6, 9, 4096),
     )

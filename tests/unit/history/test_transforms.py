@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -65,6 +67,19 @@ def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repe
         if second <= at or child.lstrip("/") not in expected:
             expected[child.lstrip("/")] = float(x)
     assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected
+
+
+def test_a_view_is_freed_with_its_call_without_the_garbage_collector(tmp_path: Path) -> None:
+    bag(tmp_path, 0, [static(0, "eye", 1.0)])
+    gc.disable()
+    try:
+        view = View(memory_of(tmp_path), Call())
+        assert sessions_of(view).recorded_at(T0)
+        known = weakref.ref(view)
+        del view
+        assert known() is None
+    finally:
+        gc.enable()
 
 
 def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) -> None:

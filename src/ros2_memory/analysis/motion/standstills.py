@@ -491,12 +491,14 @@ def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterat
 
 def _creeping(blocks: Blocks, chain: Ints, still: Marks) -> Marks:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
-    is_new = np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])]
-    run, begins = np.cumsum(is_new), np.flatnonzero(is_new)
+    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
     centres, noises = (blocks.lows + blocks.highs) / 2, blocks.noises
-    across = np.maximum.reduceat(centres, begins) - np.minimum.reduceat(centres, begins)
-    # In most runs the robot stands: no block is that far from another.
-    moved = np.flatnonzero(_lengths(across)[run - 1] > LARGEST_M)
+    # Mostly the robot stands: no block is that far from another one as near in time.
+    groups = np.arange(0, len(blocks), _CREEP_BLOCKS)
+    lows, highs = (each.reduceat(centres, groups) for each in (np.minimum, np.maximum))
+    lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
+    has_moved = _lengths(highs - lows) > LARGEST_M
+    moved = np.flatnonzero(np.repeat(has_moved, _CREEP_BLOCKS)[: len(blocks)])
     nearest = np.full(len(blocks), -1)
     for lag in range(1, _CREEP_BLOCKS):
         waiting = moved[(moved >= lag) & (nearest[moved] < 0)]

@@ -44,7 +44,10 @@ LEAST_OF_SPEED_S: Final = 0.5
 
 _MOST_VERTICES: Final = 400
 """Vertices that a slice stores of its path, but for the ends of jumps."""
-_OF_TIME: Final = 0.5
+_KEPT_WITHIN_M: Final = 0.0175
+"""How far a pose may be from the path of a slice. Within 1.25 cm a position's noise of 4 mm keeps
+four times as many vertices."""
+_OF_TIME: Final = 0.7
 """So the metres that a slice has driven up to a time are right within 2.5 cm."""
 _FEW: Final = 32
 """Slices of no more poses are measured together with those beside them that have few, too."""
@@ -231,7 +234,7 @@ class PathSlice:
 
 
 def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
-    """Measures poses, which are in order, and draws them within a quarter of `TOLERANCE_M`.
+    """Measures poses, which are in order, and draws them within `_KEPT_WITHIN_M`.
 
     A step that would take a higher speed than `fastest_mps` is a jump.
     """
@@ -251,7 +254,7 @@ def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
                 known.positions,
                 seconds,
                 ends,
-                tolerance_m=TOLERANCE_M / 4,
+                tolerance_m=_KEPT_WITHIN_M,
                 at_most=_MOST_VERTICES,
                 of_time=_OF_TIME,
             )
