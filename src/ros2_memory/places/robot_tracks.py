@@ -22,7 +22,6 @@ from ros2_memory.analysis.motion.robot_track import (
     TrackPart,
     joined_parts,
     jumps,
-    thinned,
     track_by,
     track_part,
 )
@@ -295,7 +294,7 @@ class RobotTracks:
         def make() -> TrackPart:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
-            placed = self._placed(rows, groups, thins=True)
+            placed = self._placed(rows, groups)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
             return track_part(*placed)._replace(recording=recording)
 
@@ -355,7 +354,7 @@ class RobotTracks:
         found = [NOWHERE]
         for topic in self._topics:
             found += [
-                self._placed(rows, self._groups(rows, window), thins=False)
+                self._placed(rows, self._groups(rows, window))
                 for rows in scan(self._view, topic, window)
             ]
         return _joined(found)
@@ -367,11 +366,10 @@ class RobotTracks:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _placed(self, rows: Rows, groups: Sequence[_Group], *, thins: bool) -> Placed:
-        """Returns the poses of some rows; with `thins` those that a track needs."""
+    def _placed(self, rows: Rows, groups: Sequence[_Group]) -> Placed:
+        """Returns the poses of some rows."""
         if self._body is None:
             poses = self._reader.poses(rows)
-            poses = poses.rows(thinned(poses.times)) if thins else poses
         if not groups:
             return _placed(poses, None, self._frame_id)
         found: list[Placed] = []
@@ -382,7 +380,7 @@ class RobotTracks:
                 found.append(_placed(some, frames, self._frame_id))
             else:
                 edges = edges_of_rows(self._view, rows, group.session)
-                found.append(_placed_body(edges, self._body, frames, group.span, thins=thins))
+                found.append(_placed_body(edges, self._body, frames, group.span))
         return _joined(found)
 
 
@@ -448,16 +446,13 @@ def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _placed_body(
-    edges: Edges, body: Body, frames: Frames, span: TimeWindow, *, thins: bool
-) -> Placed:
+def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     own = [edge for (_, child), edge in edges.items() if child == body.child]
     times = np.concatenate([edge.log_times for edge in own] or [np.zeros(0, np.int64)])
     stamps = np.concatenate([edge.stamps for edge in own] or [np.zeros(0, np.int64)])
     order = np.argsort(times, kind="stable")
     order = order[(times[order] >= span.start) & (times[order] < span.stop)]
-    order = order[thinned(times[order])] if thins else order
     found = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
     if found is None:
         return NOWHERE
