@@ -42,6 +42,7 @@ Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
 
+_LOGS: Final = FOXGLOVE_LOGS | {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2
@@ -349,7 +350,7 @@ class Segment:
 
 def is_log(type_name: str) -> bool:
     """Returns whether messages of a type are lines of a log."""
-    return type_name in {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"} | FOXGLOVE_LOGS
+    return type_name in _LOGS
 
 
 def wider(known: Span | None, span: Span) -> Span:
