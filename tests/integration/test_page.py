@@ -311,7 +311,7 @@ def test_where_no_pose_topic_is_clear_it_is_chosen_and_the_address_keeps_it(
                 "chosen.dispatchEvent(new Event('change'));",
                 topic,
             )
-            chromium.awaits("return state.view.poses === arguments[0]", topic)
+            chromium.awaits("return state.view.poses === arguments[0] && state.view.isWhole", topic)
             x, y = chromium.run("return [map.paths[0].x.at(-1), map.paths[0].y.at(-1)]")
             assert (x, y) == pytest.approx(end, abs=0.02)
         assert "east and north of 48.123457, 11.765432" in chromium.text("#map-key")
