@@ -206,7 +206,7 @@ def lazy_columns(
 def _lazy_elements(
     inside: Layout, column: Callable[[str], Column], dropped: Collection[str], around: str
 ) -> Mapping[str, Elements]:
-    """Returns the sequences inside of what the path `around` begins with."""
+    """Returns the sequences of a layout inside of another one; `around` is its path and a dot."""
 
     def elements(path: str) -> Elements:
         whole, inner = f"{around}{path}", inside.sequences[path]

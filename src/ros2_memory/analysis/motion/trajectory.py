@@ -234,7 +234,7 @@ class PathSlice:
 
 
 def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
-    """Measures poses, which are in order, and draws them within `_KEPT_WITHIN_M`.
+    """Measures poses, which are in order, and draws them within 1.75 cm.
 
     A step that would take a higher speed than `fastest_mps` is a jump.
     """
