@@ -36,7 +36,7 @@ from ros2_memory.history.coverage import (
 from ros2_memory.index.recordings import is_named_after_folder
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    from collections.abc import Collection, Iterator
 
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -317,36 +317,46 @@ def no_data_at(
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
     if around is not None:
         when = f"within {seconds(around)} of"
-    detail = [f"no message of {' or '.join(topics)} {when} {unix_text(at)}", *elsewhere]
+    before = tolerance if around is None else around
+    start = MIN_NS if before is None else max(at - before, MIN_NS)
+    window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
+    reason, why = between(view, window) if is_between else beyond(view, at), list[str]()
+    if older and newer and around is None and reason is NoDataReason.GAP:
+        reason, why = _within_recording(view, older, newer)
+    if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
+        reason = NoDataReason.DELETED
+    to_come = _to_come(view, at)
+    detail = [
+        f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
+        *elsewhere,
+        *_distances(at, older, newer, tolerance),
+        *why,
+        *_advice(view, reason),
+        *(to_come or _enough_tolerance(at, older, tolerance)),
+    ]
+    return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+
+
+def _distances(
+    at: Ns, older: StoredMessage | None, newer: StoredMessage | None, tolerance: Ns | None
+) -> Iterator[str]:
+    """Yields how far the nearest messages are from a moment."""
     if older:
         ago = seconds(at - older.time)
         if tolerance is not None and ago == seconds(tolerance):
             # Rounded it would read as near enough.
             ago = f"{unix_from_ns(at - older.time):.6f} s"
-        detail.append(f"the nearest older one is {ago} before it, at {unix_text(older.time)}")
+        yield f"the nearest older one is {ago} before it, at {unix_text(older.time)}"
     if newer:
         later = seconds(newer.time - at)
-        detail.append(f"the nearest newer one is {later} after it, at {unix_text(newer.time)}")
-    before = tolerance if around is None else around
-    start = MIN_NS if before is None else max(at - before, MIN_NS)
-    window = TimeWindow(start, min(at + (around or 0) + 1, MAX_NS))
-    reason = between(view, window) if is_between else beyond(view, at)
-    if older and newer and around is None and reason is NoDataReason.GAP:
-        reason, why = _within_recording(view, older, newer)
-        detail += why
-    if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
-        reason = NoDataReason.DELETED
-    to_come = _to_come(view, at)
-    detail += [*_advice(view, reason), *to_come]
-    if (
-        not to_come
-        and older
-        and tolerance is not None
-        and at - older.time <= max(_NEAR_NS, 2 * tolerance)
-    ):
+        yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
+
+
+def _enough_tolerance(at: Ns, older: StoredMessage | None, tolerance: Ns | None) -> Iterator[str]:
+    """Yields which `tolerance_s` would take the older message, if that is not far away."""
+    if older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
         enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
-        detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
-    return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
+        yield f"to accept the older one, ask with tolerance_s of at least {enough:.3f}"
 
 
 def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:

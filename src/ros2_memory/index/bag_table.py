@@ -125,9 +125,9 @@ class BagTable:
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._unchanged)
         known = self._known() if self._known is not None and is_first else {}
-        unchanged: list[BagFile] = []
+        unchanged = self._take_known(scanned.stamps, known, context)
         changed = self._forget(scanned.gone) | self._examine(
-            scanned.stamps, known, context, unchanged
+            scanned.stamps, known, context, unchanged if is_first else None
         )
         if unchanged:
             # Sorted here by numpy: sorting what is sorted takes no time later.
@@ -283,46 +283,53 @@ class BagTable:
                 found.bag.summary.pack()
             self._unchanged[path] = found.bag, self._files.pop(path).stamp.inode
 
-    def _examine(
-        self,
-        stamps: dict[str, Stamp],
-        known: Mapping[str, BagFile],
-        context: ScanContext,
-        unchanged: list[BagFile],
-    ) -> set[str]:
-        """Classifies files; returns those whose classification changed.
+    def _take_known(
+        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
+    ) -> list[BagFile]:
+        """Takes those files out of `stamps` that need no look, and returns their bags.
 
-        New ones that will not change are added to `unchanged` instead: a first scan of a week would
-        otherwise hold all that is known of each file at once. Those that are `known` are not looked
-        at, unless they are young, empty or incomplete.
+        They are as they were when they were read, have messages and an end, and are not young.
         """
-        changed = set()
-        is_first = not (self._classified or self._unchanged)
+        if not known:
+            return []
         last = context.now - max(context.three_splits, YOUNG_NS)
         kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
-        compressed = {path for path in stamps if path.endswith(COMPRESSED)} if known else set()
-        for path, stamp in stamps.items():
+        compressed = {path for path in stamps if path.endswith(COMPRESSED)}
+        taken = []
+        for path, stamp in [*stamps.items()]:
             file = known.get(path)
             if (
                 file is not None
-                and file.mtime_ns == stamp.mtime_ns < last
-                and (file.size, file.sidecar_ns) == (stamp.size, stamp.sidecar_ns)
+                and stamp.is_of(file)
+                and stamp.mtime_ns < last
                 and path.endswith(kinds)
                 and (schema := file.summary.schema).complete
                 and schema.topics
                 and not (compressed and other_form(path) in compressed)
             ):
                 self._unchanged[file.file] = file, stamp.inode
-                unchanged.append(file)
+                taken.append(file)
+                del stamps[path]
+        return taken
+
+    def _examine(
+        self,
+        stamps: Mapping[str, Stamp],
+        known: Mapping[str, BagFile],
+        context: ScanContext,
+        unchanged: list[BagFile] | None,
+    ) -> set[str]:
+        """Classifies files; returns those whose classification changed.
+
+        New ones that will not change are added to `unchanged` instead, if there is such a list: a
+        first scan of a week would otherwise hold all that is known of each file at once. Those that
+        are `known` are not read.
+        """
+        changed = set()
+        for path, stamp in stamps.items():
+            if not self._is_to_be_classified(path, stamp, known.get(path), context):
                 continue
-            notes = self._files.get(path)
-            if notes is None:
-                notes = FileNotes.first(path, stamp, context.now)
-                self._files[path] = notes
-                if file is not None and notes.trusted and stamp.is_of(file):
-                    notes.restore(file.summary)
-            elif not notes.update(stamp, context.now) and path not in self._watched:
-                continue
+            notes = self._files[path]
             try:
                 classification = classify(notes, self._reader, context)
             except BagVanishedError:
@@ -334,7 +341,7 @@ class BagTable:
             else:
                 self._watched.discard(path)
             if (
-                is_first
+                unchanged is not None
                 and other_form(path) not in stamps
                 and self._is_settled(path, classification, context)
                 and classification.bag is not None
@@ -345,6 +352,18 @@ class BagTable:
                 self._classified[path] = classification
                 changed.add(path)
         return changed
+
+    def _is_to_be_classified(
+        self, path: str, stamp: Stamp, known: BagFile | None, context: ScanContext
+    ) -> bool:
+        """Notes how a file is now; returns whether it is new, has changed, or is watched."""
+        notes = self._files.get(path)
+        if notes is not None:
+            return notes.update(stamp, context.now) or path in self._watched
+        notes = self._files[path] = FileNotes.first(path, stamp, context.now)
+        if known is not None and notes.trusted and stamp.is_of(known):
+            notes.restore(known.summary)
+        return True
 
     def _count(
         self, changed: Iterable[str], context: ScanContext
