@@ -11,7 +11,7 @@ import numpy as np
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-from ros2_memory.analysis.motion.standstills import PackedBlocks, Stands
+from ros2_memory.analysis.motion.standstills import Blocks, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import Frames, Poses
 from ros2_memory.columns.fragments import Fragment, Kind
@@ -110,16 +110,16 @@ def _vector(numbers: Vector3) -> Vector3:
 
 
 def _stands_fragment(stands: Stands) -> Fragment:
-    arrays = {each.name: getattr(stands.packed, each.name) for each in fields(stands.packed)}
+    arrays = {each.name: getattr(stands.blocks, each.name) for each in fields(stands.blocks)}
     return Fragment(json.dumps([stands.drops, stands.last]), arrays)
 
 
 def _stands_of(fragment: Fragment) -> Stands:
     drops, last = json.loads(fragment.head)
-    arrays = {each.name: fragment.arrays[each.name] for each in fields(PackedBlocks)}
+    arrays = {each.name: fragment.arrays[each.name] for each in fields(Blocks)}
     # By name: each array has one type.
-    packed = PackedBlocks(**cast("dict[str, Never]", arrays))
-    return Stands(packed, tuple(SpeedDrop(*drop) for drop in drops), last)
+    blocks = Blocks(**cast("dict[str, Never]", arrays))
+    return Stands(blocks, tuple(SpeedDrop(*drop) for drop in drops), last)
 
 
 PATHS: Final = Kind("path", _path_fragment, _path_of)
@@ -128,8 +128,8 @@ PATHS: Final = Kind("path", _path_fragment, _path_of)
 
 def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
     drops = tuple(drop for stands in found for drop in stands.drops)
-    packed = stacked([stands.packed for stands in found])
-    return [Stands(packed, drops, max(stands.last for stands in found))]
+    blocks = stacked([stands.blocks for stands in found])
+    return [Stands(blocks, drops, max(stands.last for stands in found))]
 
 
 STANDS: Final = Kind("stands", _stands_fragment, _stands_of, _joined_stands)

@@ -143,7 +143,7 @@ def _standstills_in(
     """
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     stands = [one for _, one in _stands(view, topic, window.widened(CONTEXT_NS))][::-1]
-    found = standstills_of(joined_blocks([each.packed for each in stands]))
+    found = standstills_of(joined_blocks([each.blocks for each in stands]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
     standstills = tuple(

@@ -121,49 +121,19 @@ class Standstill(NamedTuple):
 class Blocks:
     """Blocks of time with slots that are linked, in order; a block may hold parts of two chains.
 
+    In few bytes, since a week has 300,000.
+
     Attributes:
         numbers: which block, counted from the epoch.
-        firsts: log times (ns) of the first pose of each, in the chain that it is of.
-        lasts: of the last one.
+        firsts: when the first pose of each is, in the chain that it is of: ns from its begin.
+        lasts: when the last one is, likewise.
         noises: the highest standard deviation (m) of a slot's mean that noise of poses explains.
-        lows: x, y, z (m) of the lower corner of the box around the slots' means, as rows.
+        lows: x, y, z of the lower corner of the box around the slots' means, as rows, in
+            1 / `PER_METRE`.
         highs: of the upper corner.
         starts: of the first of still blocks in a row, the log time of the first pose at that place;
             else `MIN_NS`.
         ends: of the last of them, of the last pose there; else `MIN_NS`.
-    """
-
-    numbers: Ints
-    firsts: Ints
-    lasts: Ints
-    noises: Floats
-    lows: Vectors
-    highs: Vectors
-    starts: Ints
-    ends: Ints
-
-    def __len__(self) -> int:
-        """Returns the number of blocks."""
-        return self.numbers.size
-
-    def are_still(self) -> Marks:
-        """Returns whether drift and noise explain the boxes."""
-        found: Marks = _lengths(self.highs - self.lows) <= np.minimum(
-            np.maximum(_STILL_M, 4.5 * self.noises), LARGEST_M
-        )
-        return found
-
-
-_NONE: Final = np.empty(0, np.int64)
-_NOWHERE: Final = np.empty((0, 3))
-NO_BLOCKS: Final = Blocks(_NONE, _NONE, _NONE, np.empty(0), _NOWHERE, _NOWHERE, _NONE, _NONE)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PackedBlocks:
-    """`Blocks` in fewer bytes, as they are stored and remembered: a week has 300,000.
-
-    `firsts` and `lasts` count from where their block begins, corners in 1 / `PER_METRE`.
     """
 
     numbers: Ints
@@ -175,34 +145,26 @@ class PackedBlocks:
     starts: Ints
     ends: Ints
 
-    @classmethod
-    def of(cls, blocks: Blocks) -> PackedBlocks:
-        """Returns blocks in this form."""
-        begins = blocks.numbers * BLOCK_NS
-        return cls(
-            blocks.numbers,
-            (blocks.firsts - begins).astype(np.uint32),
-            (blocks.lasts - begins).astype(np.uint32),
-            blocks.noises.astype(np.float32),
-            _in_units(blocks.lows),
-            _in_units(blocks.highs),
-            blocks.starts,
-            blocks.ends,
-        )
+    def __len__(self) -> int:
+        """Returns the number of blocks."""
+        return self.numbers.size
 
-    def unpacked(self) -> Blocks:
-        """Returns the blocks."""
+    def span(self) -> tuple[Ints, Ints]:
+        """Returns the log times (ns) of the first and of the last pose of each."""
         begins = self.numbers * BLOCK_NS
-        return Blocks(
-            self.numbers,
-            begins + self.firsts,
-            begins + self.lasts,
-            self.noises.astype(np.float64),
-            self.lows / PER_METRE,
-            self.highs / PER_METRE,
-            self.starts,
-            self.ends,
+        return begins + self.firsts, begins + self.lasts
+
+    def corners(self) -> tuple[Vectors, Vectors]:
+        """Returns the lower and the upper corners (m)."""
+        return self.lows / PER_METRE, self.highs / PER_METRE
+
+    def are_still(self) -> Marks:
+        """Returns whether drift and noise explain the boxes."""
+        lows, highs = self.corners()
+        found: Marks = _lengths(highs - lows) <= np.minimum(
+            np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64)), LARGEST_M
         )
+        return found
 
     @property
     def memory_bytes(self) -> int:
@@ -217,23 +179,31 @@ def _in_units(corners: Vectors) -> Corners:
     return units.astype(np.int32) if is_small else units
 
 
+_NONE: Final = np.empty(0, np.int64)
+_NOWHERE: Final = np.empty((0, 3), np.int32)
+_OFFSETS: Final = np.empty(0, np.uint32)
+NO_BLOCKS: Final = Blocks(
+    _NONE, _OFFSETS, _OFFSETS, np.empty(0, np.float32), _NOWHERE, _NOWHERE, _NONE, _NONE
+)
+
+
 class Stands(NamedTuple):
     """What shows where the robot stood in a stretch of time.
 
     Attributes:
-        packed: its blocks.
+        blocks: its blocks.
         drops: sudden losses of speed; standstills may follow.
         last: log time (ns) of the last pose at a place; `MIN_NS` without one.
     """
 
-    packed: PackedBlocks
+    blocks: Blocks
     drops: tuple[SpeedDrop, ...]
     last: Ns
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 2000 + self.packed.memory_bytes + 200 * len(self.drops)
+        return 2000 + self.blocks.memory_bytes + 200 * len(self.drops)
 
 
 def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
@@ -241,7 +211,7 @@ def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
     inside = poses.between(start, stop)
     places = inside.times[are_places(inside.positions)]
     return Stands(
-        PackedBlocks.of(blocks_of(poses, start, stop)),
+        blocks_of(poses, start, stop),
         tuple(each for each in speed_drops(poses) if start <= each.time < stop),
         int(places[-1]) if places.size else MIN_NS,
     )
@@ -271,8 +241,8 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
         among[first + 1 : last] = True
     found = _blocks(slots, np.flatnonzero(among), np.cumsum(is_first))
-    inside = (found.firsts >= start) & (found.firsts < stop)
-    return rows_of(found, inside)
+    times, _ = found.span()
+    return rows_of(found, (times >= start) & (times < stop))
 
 
 def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:
@@ -283,23 +253,24 @@ def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:
     is_new[1:] = (np.diff(numbers) != 0) | (np.diff(chains[among]) != 0)
     begins = np.flatnonzero(is_new)
     firsts, lasts = among[begins], among[np.r_[begins[1:], among.size] - 1]
-    means = np.rint(slots.means[among] * PER_METRE) / PER_METRE
+    first_times, last_times = slots.firsts[firsts], slots.lasts[lasts]
+    starts_ns = numbers[begins] * BLOCK_NS
+    means = slots.means[among]
     noises = slots.noises[among] / np.sqrt(slots.counts[among])
     found = Blocks(
         numbers[begins],
-        slots.firsts[firsts],
-        slots.lasts[lasts],
-        # As they are stored.
-        np.maximum.reduceat(noises, begins).astype(np.float32).astype(np.float64),
-        np.minimum.reduceat(means, begins),
-        np.maximum.reduceat(means, begins),
+        (first_times - starts_ns).astype(np.uint32),
+        (last_times - starts_ns).astype(np.uint32),
+        np.maximum.reduceat(noises, begins).astype(np.float32),
+        _in_units(np.minimum.reduceat(means, begins)),
+        _in_units(np.maximum.reduceat(means, begins)),
         np.full(begins.size, MIN_NS),
         np.full(begins.size, MIN_NS),
     )
     chain = chains[firsts]
     for begin, stop in zip(*_runs(found.are_still(), chain), strict=True):
         is_inside = begin > 0 and stop < chain.size and chain[begin - 1] == chain[stop]
-        if is_inside and found.lasts[stop - 1] - found.firsts[begin] < SHORTEST_NS:
+        if is_inside and last_times[stop - 1] - first_times[begin] < SHORTEST_NS:
             continue  # noise hides slow motion for as long
         first, last = int(firsts[begin]), int(lasts[stop - 1])
         found.starts[begin] = slots.edge(first, last, -1)
@@ -415,9 +386,9 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     return found
 
 
-def joined_blocks(parts: Sequence[PackedBlocks]) -> Blocks:
+def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
     """Returns the blocks of stretches of time that follow each other, maybe none."""
-    return stacked([PackedBlocks.of(NO_BLOCKS), *parts]).unpacked()
+    return stacked([NO_BLOCKS, *parts])
 
 
 def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
@@ -425,8 +396,9 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     if not len(blocks):
         return ()
     begins_chain = blocks.starts != MIN_NS
+    firsts, lasts = blocks.span()
     # Parts of a history that each go on may have a silence between them.
-    begins_chain[1:] |= blocks.firsts[1:] - blocks.lasts[:-1] > SILENCE_NS
+    begins_chain[1:] |= firsts[1:] - lasts[:-1] > SILENCE_NS
     begins_chain[0] = True
     chain = np.cumsum(begins_chain)
     still = blocks.are_still()
@@ -434,11 +406,12 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     found: list[Standstill] = []
     begins, stops = _runs(~moves, chain)
     starts, ends = blocks.starts[begins], blocks.ends[stops - 1]
-    starts = np.where(starts == MIN_NS, blocks.firsts[begins], starts)
-    ends = np.where(ends == MIN_NS, blocks.lasts[stops - 1], ends)
+    starts = np.where(starts == MIN_NS, firsts[begins], starts)
+    ends = np.where(ends == MIN_NS, lasts[stops - 1], ends)
     runs = (column.tolist() for column in (begins, stops, starts, ends))
+    corners = blocks.corners()
     until = MIN_NS
-    for begin, stop, since, end, box in zip(*runs, _boxes(blocks, begins, stops), strict=True):
+    for begin, stop, since, end, box in zip(*runs, _boxes(corners, begins, stops), strict=True):
         # Ends are followed into each other's slots.
         start = max(since, until)
         if end - start < SHORTEST_NS:
@@ -446,19 +419,19 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
         if box.diagonal <= LARGEST_M:
             found.append(Standstill(start, end, box))
         else:
-            found += _in_run(blocks, begin, stop, start, end)
+            found += _in_run(corners, firsts[begin:stop], begin, start, end)
         until = found[-1].end
     return tuple(found)
 
 
-def _boxes(blocks: Blocks, begins: Ints, stops: Ints) -> Iterator[Box3]:
+def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Iterator[Box3]:
     """Yields the boxes around some half-open ranges of blocks, which follow each other."""
     if not begins.size:
         return
     edges = np.stack([begins, stops], axis=1).reshape(-1)
     # One row more, since the last range may end where the blocks do.
-    lows = np.minimum.reduceat(np.append(blocks.lows, blocks.lows[-1:], axis=0), edges)[::2]
-    highs = np.maximum.reduceat(np.append(blocks.highs, blocks.highs[-1:], axis=0), edges)[::2]
+    lows, highs = (np.append(each, each[-1:], axis=0) for each in corners)
+    lows, highs = np.minimum.reduceat(lows, edges)[::2], np.maximum.reduceat(highs, edges)[::2]
     for (a, b, c), (d, e, f) in zip(lows.tolist(), highs.tolist(), strict=True):
         yield Box3((a, b, c), (d, e, f))
 
@@ -470,20 +443,32 @@ def _runs(marks: Marks, chain: Ints) -> tuple[Ints, Ints]:
     return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
 
 
-def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterator[Standstill]:
-    """Yields the standstills of consecutive still blocks, of a robot that drifts away."""
-    while begin < stop:
+def _in_run(
+    corners: tuple[Vectors, Vectors], firsts: Ints, first: int, start: Ns, end: Ns
+) -> Iterator[Standstill]:
+    """Yields the standstills of consecutive still blocks, of a robot that drifts away.
+
+    Args:
+        corners: of all blocks (m).
+        firsts: of those in the run, the log time (ns) of the first pose.
+        first: the position of the first of them among all.
+        start: when the robot began to stand.
+        end: when it ended.
+    """
+    lows, highs = (each[first : first + firsts.size] for each in corners)
+    begin = 0
+    while begin < firsts.size:
         some = _BLOCKS_AT_ONCE
         while True:
-            lows = np.minimum.accumulate(blocks.lows[begin : min(begin + some, stop)])
-            highs = np.maximum.accumulate(blocks.highs[begin : min(begin + some, stop)])
-            fits = int((_lengths(highs - lows) <= LARGEST_M).sum())
-            if fits < some or begin + fits == stop:
+            low = np.minimum.accumulate(lows[begin : begin + some])
+            high = np.maximum.accumulate(highs[begin : begin + some])
+            fits = int((_lengths(high - low) <= LARGEST_M).sum())
+            if fits < some or begin + fits == firsts.size:
                 break
             some *= 4
-        (a, b, c), (d, e, f) = lows[fits - 1].tolist(), highs[fits - 1].tolist()
+        (a, b, c), (d, e, f) = low[fits - 1].tolist(), high[fits - 1].tolist()
         begin += fits
-        until = min(int(blocks.firsts[begin]), end) if begin < stop else end
+        until = min(int(firsts[begin]), end) if begin < firsts.size else end
         if start < until:
             yield Standstill(start, until, Box3((a, b, c), (d, e, f)))
             start = until
@@ -492,7 +477,8 @@ def _in_run(blocks: Blocks, begin: int, stop: int, start: Ns, end: Ns) -> Iterat
 def _creeping(blocks: Blocks, chain: Ints, still: Marks) -> Marks:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
     run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
-    centres, noises = (blocks.lows + blocks.highs) / 2, blocks.noises
+    low, high = blocks.corners()
+    centres, noises = (low + high) / 2, blocks.noises.astype(np.float64)
     # Mostly the robot stands: no block is that far from another one as near in time.
     groups = np.arange(0, len(blocks), _CREEP_BLOCKS)
     lows, highs = (each.reduceat(centres, groups) for each in (np.minimum, np.maximum))

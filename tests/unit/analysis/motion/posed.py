@@ -67,4 +67,4 @@ def stood_in(
         for number in np.unique(poses.times // length).tolist()
     ]
     drops = [drop for stand in stands for drop in stand.drops]
-    return standstills_of(joined_blocks([each.packed for each in stands])), drops
+    return standstills_of(joined_blocks([each.blocks for each in stands])), drops
