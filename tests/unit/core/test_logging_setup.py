@@ -129,14 +129,6 @@ def test_events_below_the_level_are_left_out(capsys: pytest.CaptureFixture[str])
     assert [event["event"] for event in events(capsys)] == ["large", "large"]
 
 
-def test_an_exception_is_one_line_of_json(capsys: pytest.CaptureFixture[str]) -> None:
-    configure_logging("info", "json")
-    log_failure("bad bag")
-    (event,) = events(capsys)
-    assert event["level"] == "error"
-    assert "ValueError: bad bag" in event["exception"]
-
-
 @pytest.mark.parametrize("layout", ["json", "pretty"])
 def test_an_exception_does_not_show_local_variables(
     layout: str, capsys: pytest.CaptureFixture[str]
@@ -202,17 +194,6 @@ def test_what_a_library_repeats_is_logged_now_and_then(
     assert counts == {"uvicorn.error": 3, "asyncio": 6, "mcp.server.sse": 3, **ours}
     seen = [each.get("suppressed") for each in logged if each["logger"] == "uvicorn.error"]
     assert seen == [None, 9, 9]
-
-
-def test_refusals_are_counted_between_what_is_logged() -> None:
-    now = [0.0]
-    refusals = logging_setup.LogThrottle(lambda: now[0])
-    counts = []
-    for second in range(25):
-        now[0] = float(second)
-        counts.append(refusals.count("a"))
-    assert [each for each in counts if each] == [1, 10, 10]
-    assert refusals.count("b") == 1
 
 
 def test_nothing_that_is_logged_is_endless(capsys: pytest.CaptureFixture[str]) -> None:

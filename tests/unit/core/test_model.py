@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import (
@@ -61,10 +61,6 @@ def test_both_ends_of_a_question_are_inclusive_with_the_slack_of_a_float(
     assert not window.contains(window.start - 1)
 
 
-def test_a_window_may_be_one_moment() -> None:
-    assert not TimeWindow.from_unix(5.0, 5.0).empty
-
-
 def test_a_window_saturates_at_64_bits() -> None:
     assert TimeWindow.from_unix(-1e300, 1e300) == TimeWindow(MIN_NS, MAX_NS)
 
@@ -114,24 +110,6 @@ def test_overlapping_and_covering_count_the_moments_of_a_span(
 @given(windows)
 def test_a_window_is_empty_when_no_moment_lies_inside(window: TimeWindow) -> None:
     assert window.empty == (not any(window.contains(moment) for moment in range(-20, 20)))
-
-
-def test_everything_contains_any_moment_that_a_bag_can_hold() -> None:
-    assert TimeWindow.everything().covers(MIN_NS, MAX_NS - 1)
-
-
-def test_a_summary_spans_its_topics() -> None:
-    summary = BagSummary(
-        (
-            TopicSummary("/a", "std_msgs/msg/Bool", "cdr", 3, 20, 50),
-            TopicSummary("/b", "std_msgs/msg/Bool", "cdr", 2, 10, 40),
-        )
-    )
-    assert (summary.count, summary.start, summary.end, summary.empty) == (5, 10, 50, False)
-
-
-def test_a_bag_without_messages_is_empty() -> None:
-    assert BagSummary((), silent=("/a",)).empty
 
 
 def test_a_bag_file_belongs_to_the_recording_in_whose_directory_it_lies() -> None:

@@ -41,7 +41,7 @@ def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) 
     path = steps(draw)
     parts = parts_inside(region, path)
     assert (parts.start <= parts.stop).all()
-    for _ in range(2000):
+    for _ in range(500):
         step, share = draw.randrange(len(path.x)), draw.random()
         x = path.x[step] + (path.to_x[step] - path.x[step]) * share
         y = path.y[step] + (path.to_y[step] - path.y[step]) * share
@@ -59,13 +59,6 @@ def test_a_path_may_be_inside_of_a_horseshoe_twice_in_one_step() -> None:
     assert parts.step.tolist() == [0, 0]
     assert (6 * parts.start - 1).tolist() == pytest.approx([0.0, 3.0])
     assert (6 * parts.stop - 1).tolist() == pytest.approx([1.0, 4.0])
-
-
-@pytest.mark.parametrize("region", [CIRCLE, BOX, SQUARE])
-def test_a_robot_that_stands_is_inside_or_not(region: Region) -> None:
-    path = Steps(*(np.array(each) for each in ([1.0, 9.0], [2.0, 9.0], [1.0, 9.0], [2.0, 9.0])))
-    parts = parts_inside(region, path)
-    assert [each.tolist() for each in parts] == [[0], [0.0], [1.0]]
 
 
 def test_of_places_within_each_other_the_smallest_is_named() -> None:

@@ -22,13 +22,9 @@ from ros2_memory.tools.replies import Replies
 class Heard(Observer):
     def __init__(self) -> None:
         self.calls: list[Answered] = []
-        self.is_stopped = False
 
     def answered(self, call: Answered) -> None:
         self.calls.append(call)
-
-    def stop(self) -> None:
-        self.is_stopped = True
 
 
 class Failing(Observer):
@@ -105,14 +101,3 @@ async def test_a_call_that_its_client_left_is_told_as_cancelled() -> None:
 async def test_an_observer_that_fails_costs_no_answer() -> None:
     reply = await dispatcher(Failing()).answer("good", {})
     assert not reply.is_error
-
-
-def test_whoever_observes_is_told_to_stop() -> None:
-    heard = Heard()
-    Telemetry((heard,)).stop()
-    assert heard.is_stopped
-
-
-async def test_by_default_nobody_is_told_and_nothing_is_shown() -> None:
-    silent = Telemetry()
-    assert (silent.observers, silent.metrics) == ((), None)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import listed
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -90,11 +90,6 @@ def test_what_is_reported_stays_short_however_much_was_lost(
     sentences = told(snapshot, *sorted(window), nothing=nothing)
     assert len(sentences) <= 5
     assert sum(map(len, sentences)) < 2000
-
-
-def test_a_count_of_one_is_not_a_plural() -> None:
-    assert [counted(n, "jump") for n in (0, 1, 2)] == ["0 jumps", "1 jump", "2 jumps"]
-    assert counted(2, "entry", "entries") == "2 entries"
 
 
 def test_a_list_names_a_few_and_counts_the_rest() -> None:

@@ -71,15 +71,6 @@ def test_what_lies_outside_of_the_overlap_is_kept_both_ways(
     assert not Counter(map(id, outside)) - Counter(map(id, forwards))
 
 
-def test_as_many_remain_as_the_recording_holds_that_holds_the_most() -> None:
-    messages = [found("a", 0), found("b", 1), found("b", 2), found("b", 3), found("a", 4)]
-    kept = [each.time for each in deduplicate_forward(messages, EVERYWHERE)]
-    assert kept == [0, 2, 3]
-    assert [each.time for each in deduplicate_backward(reversed(messages), EVERYWHERE)] == kept[
-        ::-1
-    ]
-
-
 def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:
     taken = 0
 

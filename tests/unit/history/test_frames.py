@@ -122,12 +122,3 @@ def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
             assert poses.valid.all()
             found.append(np.stack([*poses.translation, *poses.rotation]))
     assert (found[0] == found[1]).all()
-
-
-def test_static_transforms_that_change_inside_a_window_hold_from_then_on(tmp_path: Path) -> None:
-    view = View(world(tmp_path, [25, 30]).memory, Call())
-    window = TimeWindow(T0 + 10 * S, T0 + 38 * S)
-    times = np.array([T0 + 24 * S, T0 + 25 * S, T0 + 31 * S], np.int64)
-    poses = frames_over(view, session_of(view), window, "base").poses("camera", times)
-    assert poses is not None
-    assert poses.translation[0].tolist() == [1.0, 2.0, 2.0]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -131,26 +131,27 @@ APART: list[tuple[str, dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "catalogue"])
+def torn(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    """Of three splits the second is torn."""
+    folder = tmp_path_factory.mktemp("torn")
+    tear(write_splits(folder, 3)[1])
+    return memory_of(folder, clock=FixedClock(T0 + HOUR), recalls=request.param)
+
+
 @pytest.mark.parametrize(("tool", "given"), TOUCHING)
 def test_every_tool_says_that_a_split_of_its_window_could_not_be_read(
-    tool: str, given: dict[str, Any], recall: bool, tmp_path: Path
+    tool: str, given: dict[str, Any], torn: Memory
 ) -> None:
-    tear(write_splits(tmp_path, 3)[1])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    if recall:
-        memory = with_store(memory, tmp_path)
-    told = notes_of(asked(memory, tmp_path, tool, **given))
+    told = notes_of(asked(torn, torn.index.bag_dir, tool, **given))
     assert any(note.startswith(LOST) for note in told), told
 
 
 @pytest.mark.parametrize(("tool", "given"), APART)
 def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
-    tool: str, given: dict[str, Any], tmp_path: Path
+    tool: str, given: dict[str, Any], torn: Memory
 ) -> None:
-    tear(write_splits(tmp_path, 3)[1])
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    reply = asked(memory, tmp_path, tool, **given)
+    reply = asked(torn, torn.index.bag_dir, tool, **given)
     assert reply is None or "error" not in reply
     assert not any("could not be read" in note for note in notes_of(reply))
 
@@ -166,7 +167,9 @@ def test_never_seen_is_null_only_where_everything_was_searched(tmp_path: Path) -
     assert [*reply] == ["notes"]
 
 
-def test_the_split_being_written_is_reported_where_it_may_hold_newer(tmp_path: Path) -> None:
+def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_future_is(
+    tmp_path: Path,
+) -> None:
     write_splits(tmp_path, 2)
     active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
     os.utime(active, ns=(T0 + 29 * S,) * 2)
@@ -180,13 +183,7 @@ def test_the_split_being_written_is_reported_where_it_may_hold_newer(tmp_path: P
     assert lately["notes"] == [written]
     now = asked(memory, tmp_path, "get_position_seconds_ago", seconds_ago=1)
     assert (now["reason"], now["notes"]) == ("not_closed_yet", [written])
-
-
-def test_a_time_in_the_future_is_not_waited_for(tmp_path: Path) -> None:
-    write_splits(tmp_path, 2)
-    active = write_mcap(tmp_path / "rec" / "rec_2.mcap", messages(20), McapLayout(finish=False))
-    os.utime(active, ns=(T0 + 29 * S,) * 2)
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + 30 * S))
+    # A time in the future is not waited for.
     soon = asked(memory, tmp_path, "get_position_at", timestamp=at(80))
     assert soon["reason"] == "not_closed_yet"
     future = asked(memory, tmp_path, "get_position_at", timestamp=at(3630))

@@ -8,17 +8,15 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import Transform
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
@@ -172,34 +170,3 @@ def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: P
     frames_that_part(tmp_path)
     with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
         queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))
-
-
-def test_a_window_that_reaches_into_the_split_being_written_has_no_answer_yet(
-    tmp_path: Path,
-) -> None:
-    clock = SettableClock(T0 + 21 * NS_PER_S)
-    messages = [boolean(T0 + second * NS_PER_S, False) for second in range(10)]
-    closed = write_mcap(
-        tmp_path / "run" / "run_0.mcap", [*messages, odom(T0 + 9_900 * NS_PER_MS, 0.0, 0.0)]
-    )
-    (tmp_path / "run" / "run_1.mcap").write_bytes(closed.read_bytes()[:200])
-    write_heartbeat(
-        tmp_path,
-        Heartbeat(
-            pid=1,
-            updated=clock.at,
-            state=RecorderState.RECORDING,
-            recordings=("run",),
-            since=T0,
-            bytes_written=0,
-            subscribed=(),
-            silent=(),
-            last_error=None,
-            interval_s=5.0,
-        ),
-    )
-    memory = memory_of(tmp_path, clock=clock)
-    assert memory.index.snapshot(None).active
-    with pytest.raises(NoDataError) as caught:
-        queries.topic_range(memory, Call(), "/bumper", TimeRange(T0_S + 9.5, T0_S + 15))
-    assert caught.value.reason is NoDataReason.NOT_CLOSED_YET

@@ -16,7 +16,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import pose_rows, poses_of
 from ros2_memory.history.view import View
-from tests.support.bags import Msg, make, odom, quaternion, text, write_mcap
+from tests.support.bags import Msg, odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
@@ -96,27 +96,6 @@ def test_poses_that_cannot_be_decoded_are_left_out_and_named(tmp_path: Path) -> 
     assert block.poses.positions[:, 0].tolist() == [1.0, 2.0]
     assert [error.topic for error in failures] == ["/odom"]
     assert block.parts is None
-
-
-def test_types_of_one_topic_come_in_one_order(tmp_path: Path) -> None:
-    place = make("geometry_msgs/msg/Point", x=5.0, y=0.5, z=0.0)
-    pose = make("geometry_msgs/msg/Pose", position=place, orientation=quaternion(0.1))
-    messages = [
-        odom(T0, 1, 0),
-        Msg("/odom", "geometry_msgs/msg/Pose", T0 + S, pose),
-        odom(T0 + 2 * S, 2, 0),
-    ]
-    write_mcap(tmp_path / "rec/rec_0.mcap", messages)
-    poses = scanned(View(memory_of(tmp_path), Call()), "/odom", EVERYTHING)
-    assert poses.positions[:, 0].tolist() == [1.0, 5.0, 2.0]
-    assert poses.frames.values() == ["odom", "", "odom"]
-
-
-def test_a_topic_without_poses_says_so(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec/rec_0.mcap", [text(T0, "hello"), odom(T0, 1, 0)])
-    view = View(memory_of(tmp_path), Call())
-    with pytest.raises(InvalidArgumentsError, match="carries no position"):
-        scanned(view, "/chatter", EVERYTHING)
 
 
 def test_only_whole_parts_have_numbers(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from ros2_memory import queries
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
@@ -105,12 +104,6 @@ def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
     assert reader.names == ["rec_0.mcap"]
 
 
-def test_the_newest_of_many_matches_is_found_first(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
-    assert at(last(memory, "contains", "cup")) == 41
-    assert reader.names == ["rec_4.mcap"]
-
-
 @pytest.mark.parametrize(
     ("topic", "condition_type", "value"),
     [
@@ -137,16 +130,6 @@ def test_a_place_is_looked_for_only_where_it_may_be(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert at(last(memory, "near_position", {"x": 20.0, "y": 0.0}, topic="/odom")) == 20
     assert reader.names == ["rec_2.mcap"]
-
-
-def test_what_is_known_of_all_bags_is_reported_without_reading_one(bag_dir: Path) -> None:
-    memory, reader = filled(bag_dir)
-    queries.list_recorded_topics(memory, Call())
-    queries.data_time_range(memory, Call())
-    queries.trajectory_summary(
-        memory, Call(), TimeRange(start_s=T0_S - 1, end_s=T0_S + 100), topic="/odom"
-    )
-    assert reader.names == []
 
 
 # Before, and the deadline

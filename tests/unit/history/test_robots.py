@@ -34,6 +34,15 @@ def mounted(parent: str, at: int = T0) -> Msg:
     return tf(at, transform(at, parent, "laser", (0.1, 0.0, 0.0)), topic="/tf_static")
 
 
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The bags of two robots that drive at once, 10 m apart."""
+    folder = tmp_path_factory.mktemp("both")
+    for number, robot in enumerate(("red", "blue")):
+        write_mcap(folder / robot / f"{robot}_0.mcap", drive(10.0 * number))
+    return folder
+
+
 def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
     return [(pair.names, topic) for pair, topic in mixed_recordings(memory, Call())]
 
@@ -69,13 +78,13 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
         ("get_topic_in_range", {"by": "hour", "fields": ["position.x"]}),
         ("find_last_match", {}),
         ("get_value_when", {}),
+        ("get_position_at", {"timestamp": T0 / NS_PER_S + 9}),
+        ("recap", {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 60}),
     ],
 )
 def test_answers_from_messages_of_both_robots_say_so(
-    tmp_path: Path, name: str, asks: dict[str, object]
+    both: Path, name: str, asks: dict[str, object]
 ) -> None:
-    for number, robot in enumerate(("red", "blue")):
-        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
     condition = {"condition_type": "above", "field": "position.x", "value": 5}
     if name.startswith("find_") and name != "find_things":
         asks = {"topic": "/odom", **condition, **asks}
@@ -83,7 +92,7 @@ def test_answers_from_messages_of_both_robots_say_so(
         asks = {"value_topic": "/odom", "condition_topic": "/odom", **condition}
     if name == "get_topic_in_range":
         asks = {"topic": "/odom", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 60, **asks}
-    answer = asked(memory_of(tmp_path), tmp_path, name, **asks)
+    answer = asked(memory_of(both), both, name, **asks)
     assert [
         note for note in answer["notes"] if re.search("as from several robots.*blue, red", note)
     ]
@@ -105,29 +114,27 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
 @pytest.mark.parametrize(
     "asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}], ids=["all", "where"]
 )
-def test_a_way_over_both_robots_is_not_known(tmp_path: Path, asks: dict[str, object]) -> None:
-    for number, robot in enumerate(("red", "blue")):
-        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
-    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+def test_a_way_over_both_robots_is_not_known(both: Path, asks: dict[str, object]) -> None:
+    memory, begin = memory_of(both), T0 / NS_PER_S
     window = {"start": begin, "end": begin + 60, **asks}
-    told = asked(memory, tmp_path, "recap", **window)
+    told = asked(memory, both, "recap", **window)
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
     assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]
     assert any("the path is unknown: 2 recordings" in note for note in told["notes"])
-    compared = asked(memory, tmp_path, "compare", **window, with_start=begin, with_end=begin + 30)
+    compared = asked(memory, both, "compare", **window, with_start=begin, with_end=begin + 30)
     assert any("the path is unknown: 2 recordings" in note for note in compared["notes"])
     assert "distance_m" not in compared.get("way", {})
 
 
-@pytest.mark.parametrize("by", ["hour", "place"])
-def test_metres_of_both_robots_are_not_counted(tmp_path: Path, by: str) -> None:
-    for number, robot in enumerate(("red", "blue")):
-        write_mcap(tmp_path / robot / f"{robot}_0.mcap", drive(10.0 * number))
-    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+@pytest.mark.parametrize(
+    "asks", [{}, {"where": {"x": 0, "y": 0, "radius_m": 9}}, {"by": "hour"}, {"by": "place"}]
+)
+def test_metres_of_both_robots_are_not_counted(both: Path, asks: dict[str, object]) -> None:
+    memory, begin = memory_of(both), T0 / NS_PER_S
     memory = replace(
         memory, limits=replace(memory.limits, places=(Place("a", "odom", Circle(0, 0, 1)),))
     )
-    told = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 60, by=by)
+    told = asked(memory, both, "trajectory_summary", start=begin, end=begin + 60, **asks)
     assert told["reason"] == "mixed"
 
 

@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
-from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.insights.recap import recap
+from ros2_memory.history.view import AtTime
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import (
-    find_last_match,
     frames,
-    position,
-    trajectory_summary,
     transform,
     value_when,
 )
@@ -31,7 +25,6 @@ from tests.support.memories import each_way, memory_of
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.model import JsonValue
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -113,14 +106,6 @@ def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls:
 def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:
     found = transform(memory, Call(), parent, child, AtTime(unix_from_ns(at)))
     return round(found.transform.translation[0], 3)
-
-
-@each_way
-def test_a_transform_is_that_of_the_time_that_is_asked(tmp_path: Path, recalls: bool) -> None:
-    two_robots(tmp_path, BEGIN + DAY, BEGIN)
-    memory = remembered(tmp_path, recalls=recalls)
-    assert asked(memory, BEGIN + 4 * S) == 3.0
-    assert asked(memory, BEGIN + DAY + 4 * S) == 100.0
 
 
 @each_way
@@ -310,47 +295,6 @@ def test_a_value_of_another_recording_than_the_match_is_noted(
     reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
     assert reply.value is not None
     assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
-
-
-@each_way
-def test_two_robots_on_one_topic_are_named(tmp_path: Path, recalls: bool) -> None:
-    two_at_once(tmp_path)
-    memory = remembered(tmp_path, recalls=recalls)
-    begin, end = unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S)
-    at = AtTime(unix_from_ns(BEGIN + 5 * S))
-    somewhere: JsonValue = {"x": 0.0, "y": 0.0, "radius_m": 9.0}
-    for path_of in (trajectory_summary, partial(driven_inside, where=somewhere)):
-        with pytest.raises(NoDataError, match="one path over them would be wrong") as refused:
-            path_of(memory, Call(), TimeRange(begin, end))
-        assert refused.value.reason is NoDataReason.MIXED
-        assert "as from several robots: r1, r2;" in refused.value.detail
-    for answer in (
-        recap(memory, Call(), TimeRange(begin, end)),
-        position(memory, Call(), at),
-        find_last_match(memory, Call(), "/odom", "near_position", {"x": 50, "y": 0}),
-    ):
-        [note] = [note for note in answer.notes if "as from several robots" in note]
-        assert "2 recordings have different messages on /odom" in note
-        assert ": r1, r2" in note
-
-
-@each_way
-@pytest.mark.parametrize("joined", [False, True])
-def test_copies_and_what_a_handover_joins_are_of_one_robot(
-    tmp_path: Path, joined: bool, recalls: bool
-) -> None:
-    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T000010Z"
-    record(first, drive(BEGIN, 20))
-    if joined:
-        record(second, drive(BEGIN + 10 * S, 20))
-        write_handover(first, Handover(next=second.name))
-        write_handover(second, Handover(previous=first.name))
-    else:
-        record(second, [each for each in drive(BEGIN, 20) if each.log_time >= BEGIN + 10 * S])
-    memory = remembered(tmp_path, recalls=recalls)
-    span = TimeRange(unix_from_ns(BEGIN), unix_from_ns(BEGIN + 20 * S))
-    answer = trajectory_summary(memory, Call(), span)
-    assert not [note for note in answer.notes if "robots" in note]
 
 
 @each_way

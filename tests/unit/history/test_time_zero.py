@@ -24,7 +24,7 @@ SEARCH = {"condition_type": "equals", "value": True}
 NEVER = {"condition_type": "contains", "value": "never recorded"}
 PLACE = {"condition_type": "near_position", "value": {"x": 0.0, "y": 0.0}}
 
-each_now = pytest.mark.parametrize("now", ["wall", "latest"])
+each_pair = pytest.mark.parametrize(("recalls", "now"), [(False, "wall"), (True, "latest")])
 
 
 def questions(topic: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -96,8 +96,7 @@ def memory_at(bag_dir: Path, recalls: bool, now: Now = "wall") -> Memory:
     )
 
 
-@each_way
-@each_now
+@each_pair
 def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
     bag_dir: Path, recalls: bool, now: Now
 ) -> None:
@@ -105,13 +104,12 @@ def test_no_reply_about_a_memory_from_time_zero_holds_a_bound_of_the_clock(
 
 
 @needs_real
-@each_now
 @pytest.mark.parametrize(
-    ("folder", "storage", "topic"),
+    ("folder", "storage", "topic", "now"),
     [
-        ("rosbag2_time0_mcap", "mcap", "/test_topic"),
-        ("ait_time0_images_db3", "rosbag2", "/image"),
-        ("rosbag2_wbag_5split_mcap", "mcap", "AAA"),
+        ("rosbag2_time0_mcap", "mcap", "/test_topic", "wall"),
+        ("ait_time0_images_db3", "rosbag2", "/image", "wall"),
+        ("rosbag2_wbag_5split_mcap", "mcap", "AAA", "latest"),
     ],
 )
 def test_no_reply_about_public_bags_from_time_zero_does(
@@ -147,8 +145,7 @@ def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool
     assert "-5.000000" in nothing["detail"]
 
 
-@each_way
-@each_now
+@each_pair
 @pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
 @pytest.mark.parametrize(("start", "end"), [(-50, -10), (-1e300, -1e-6), (-5, -5), (-1, 0)])
 def test_a_window_below_zero_is_clamped_at_both_ends(

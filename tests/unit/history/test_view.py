@@ -18,7 +18,7 @@ from ros2_memory.history.counting import pick
 from ros2_memory.history.view import View
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of
 
@@ -53,38 +53,6 @@ def times(view: View, topic: str, *, newest_first: bool = False) -> list[int]:
     return [each.time for each in found]
 
 
-def test_splits_follow_each_other_by_time_and_not_by_name(tmp_path: Path) -> None:
-    for split in (9, 10, 11):
-        start = T0 + split * 10 * S
-        write_mcap(
-            tmp_path / "rec" / f"rec_{split}.mcap",
-            [odom(start + n * S, n, 0.0) for n in range(10)],
-        )
-    seen = times(view_of(tmp_path), "/odom")
-    assert len(seen) == 30
-    assert seen == sorted(seen)
-    assert times(view_of(tmp_path), "/odom", newest_first=True) == seen[::-1]
-
-
-def test_a_message_in_two_overlapping_recordings_counts_once_at_its_earliest_time(
-    tmp_path: Path,
-) -> None:
-    first = [odom(T0 + n * 50 * MS, n, 0.0) for n in range(100)]
-    recorded(tmp_path, "a", first)
-    second = [shifted(each, 24_000) for each in first[60:]]
-    second += [odom(T0 + n * 50 * MS, n, 0.0) for n in range(100, 140)]
-    recorded(tmp_path, "b", second)
-    view = view_of(tmp_path)
-    expected = [T0 + n * 50 * MS for n in range(140)]
-    assert times(view, "/odom") == expected
-    assert times(view, "/odom", newest_first=True) == expected[::-1]
-    census = view.census("/odom")["nav_msgs/msg/Odometry"]
-    assert (census.count, census.first, census.last) == (140, expected[0], expected[-1])
-    total, chosen = pick(view, "/odom", TimeWindow.everything(), 1000)
-    assert total == 140
-    assert [each.time for each in chosen] == expected
-
-
 def test_a_copy_just_inside_a_window_whose_original_lies_outside_does_not_count(
     tmp_path: Path,
 ) -> None:
@@ -96,53 +64,10 @@ def test_a_copy_just_inside_a_window_whose_original_lies_outside_does_not_count(
     assert [each.time for each in view.stream.messages(["/odom"], window)] == [T0 + S]
 
 
-def test_alike_messages_inside_one_recording_are_not_copies(tmp_path: Path) -> None:
-    recorded(tmp_path, "a", [boolean(T0, True), boolean(T0, True), boolean(T0 + S, True)])
-    view = view_of(tmp_path)
-    assert times(view, "/bumper") == [T0, T0, T0 + S]
-    assert view.census("/bumper")["std_msgs/msg/Bool"].count == 3
-
-
 def test_payload_alone_makes_no_copy(tmp_path: Path) -> None:
     recorded(tmp_path, "a", [boolean(T0 + n * S, True) for n in range(4)])
     recorded(tmp_path, "b", [boolean(T0 + n * S + 10 * MS, True) for n in range(4)])
     assert len(times(view_of(tmp_path), "/bumper")) == 8
-
-
-def test_a_latched_message_received_again_counts_when_it_was_first_received(
-    tmp_path: Path,
-) -> None:
-    docked = text(T0, "docked", "/dock")
-    undocked = text(T0 + 700 * S, "undocked", "/dock")
-    recorded(tmp_path, "a", [docked, odom(T0 + S, 0, 0)], latched=["/dock"])
-    recorded(tmp_path, "b", [shifted(docked, 600 * S), undocked], latched=["/dock"])
-    recorded(tmp_path, "c", [shifted(undocked, 500 * S)], latched=["/dock"])
-    view = view_of(tmp_path)
-    assert times(view, "/dock") == [T0, T0 + 700 * S]
-    assert times(view, "/dock", newest_first=True) == [T0 + 700 * S, T0]
-    found = view.stream.newest("/dock", TimeWindow.until(T0 + 650 * S))
-    assert found is not None
-    assert found.time == T0
-    census = view.census("/dock")["std_msgs/msg/String"]
-    assert (census.count, census.first, census.last) == (2, T0, T0 + 700 * S)
-    assert pick(view, "/dock", TimeWindow.everything(), 10)[0] == 2
-
-
-def test_where_the_first_copy_is_gone_the_next_one_counts(tmp_path: Path) -> None:
-    docked = text(T0, "docked", "/dock")
-    recorded(tmp_path, "b", [shifted(docked, 600 * S)], latched=["/dock"])
-    recorded(tmp_path, "c", [shifted(docked, 1200 * S)], latched=["/dock"])
-    assert times(view_of(tmp_path), "/dock") == [T0 + 600 * S]
-
-
-def test_several_topics_are_one_stream(tmp_path: Path) -> None:
-    recorded(
-        tmp_path,
-        "a",
-        [text(T0 + n * S, str(n), "/a" if n % 2 else "/b") for n in range(10)],
-    )
-    found = list(view_of(tmp_path).stream.messages(["/a", "/b"], TimeWindow.everything()))
-    assert [each.time for each in found] == [T0 + n * S for n in range(10)]
 
 
 def test_a_bag_that_fails_is_named_and_the_others_still_answer(tmp_path: Path) -> None:
@@ -184,19 +109,6 @@ def test_a_question_past_its_deadline_gives_up(tmp_path: Path) -> None:
     view = View(memory_of(tmp_path), Call(over))
     with pytest.raises(QueryTimeoutError, match="shorter window"):
         view.stream.newest("/odom", TimeWindow.everything())
-
-
-def test_picked_samples_are_evenly_spaced_over_the_messages_of_many_splits(
-    tmp_path: Path,
-) -> None:
-    for split in range(5):
-        write_mcap(
-            tmp_path / "rec" / f"rec_{split}.mcap",
-            [odom(T0 + (split * 20 + n) * S, n, 0.0) for n in range(20)],
-        )
-    total, chosen = pick(view_of(tmp_path), "/odom", TimeWindow(T0 + 3 * S, T0 + 98 * S), 7)
-    assert total == 95
-    assert [each.time for each in chosen] == [T0 + (3 + index) * S for index in evenly(95, 7)]
 
 
 @st.composite
