@@ -43,10 +43,19 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @cache
-def extractor() -> SchemaExtractor:
-    """The extractor of the shipped schema map."""
+def shipped_schemas() -> dict[str, dict[str, str]]:
     text = (ROOT / "config" / "message_schemas.yaml").read_text(encoding="utf-8")
-    return SchemaExtractor(yaml.safe_load(text)["schemas"], max_array_length=50)
+    schemas: dict[str, dict[str, str]] = yaml.safe_load(text)["schemas"]
+    return schemas
+
+
+@cache
+def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
+    return SchemaExtractor(shipped_schemas(), max_array_length)
+
+
+def extractor() -> SchemaExtractor:
+    return shipped_extractor()
 
 
 def memory_of(
@@ -86,19 +95,6 @@ def memory_of(
 
 each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 """Asked of the bags alone, and of columns that are stored."""
-
-
-SCHEMA_FILE = Path(__file__).resolve().parents[2] / "config" / "message_schemas.yaml"
-
-
-@cache
-def shipped_schemas() -> dict[str, dict[str, str]]:
-    schemas: dict[str, dict[str, str]] = yaml.safe_load(SCHEMA_FILE.read_text("utf-8"))["schemas"]
-    return schemas
-
-
-def shipped_extractor(max_array_length: int = 50) -> SchemaExtractor:
-    return SchemaExtractor(shipped_schemas(), max_array_length)
 
 
 def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:

@@ -15,7 +15,6 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, Msg, write_db3, write_mcap
-from tests.support.fakes import FakeReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable
@@ -68,34 +67,9 @@ class Shelf:
         messages: Iterable[Msg] = (),
         *,
         declared: Collection[tuple[str, str]] = (),
-    ) -> Stocked:
+    ) -> tuple[BagReader, Path]:
         """A reader, and one bag that it reads."""
-        reader = self.make_reader()
-        path = folder / f"bag{self.suffix}"
-        if isinstance(reader, FakeReader):
-            reader.add(path, messages, declared=declared)
-        else:
-            self.write(path, messages, declared)
-        return Stocked(reader, path)
-
-
-@dataclass
-class Stocked:
-    reader: BagReader
-    path: Path
-
-    def remove(self) -> None:
-        if isinstance(self.reader, FakeReader):
-            self.reader.remove(self.path)
-        else:
-            self.path.unlink()
-
-    def spoil(self, content: bytes) -> None:
-        """Puts something in its place that is not a bag."""
-        if isinstance(self.reader, FakeReader):
-            self.reader.add_damaged(self.path)
-        else:
-            self.path.write_bytes(content)
+        return self.make_reader(), self.write(folder / f"bag{self.suffix}", messages, declared)
 
 
 def _mcap(
@@ -161,4 +135,3 @@ COUNTING: Final = [
     )
 ]
 FILES: Final = MCAP + ROSBAG2 + COUNTING
-ALL: Final = [Shelf("fake", FakeReader, partial(_mcap, McapLayout())), *FILES]

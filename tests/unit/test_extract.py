@@ -69,22 +69,6 @@ def test_exactly_odometry_is_neither_rounded_nor_made_of_ints() -> None:
     }
 
 
-def test_a_twist_is_shown_as_velocities() -> None:
-    message = bags.Msg("/cmd_vel", "geometry_msgs/msg/Twist", NS, bags.twist(0.25, -0.5))
-    assert shown(decoded(message), message.type) == {
-        "linear_velocity": {"x": 0.25, "y": 0, "z": 0},
-        "angular_velocity": {"x": 0, "y": 0, "z": -0.5},
-    }
-
-
-def test_a_stamped_string_is_shown_as_its_value() -> None:
-    type_name = "ros2_vision_interfaces/msg/StampedString"
-    body = bags.make(type_name, header=bags.header(NS, ""), data="a red cup")
-    assert shown(decoded(bags.Msg("/scene", type_name, NS, body)), type_name) == {
-        "value": "a red cup"
-    }
-
-
 def test_detections_are_shown_with_label_score_point_and_box() -> None:
     assert shown(detections("cup"), DETECTIONS) == {
         "skill": "scene",

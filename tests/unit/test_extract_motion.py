@@ -114,15 +114,6 @@ def test_an_acceleration_is_no_twist() -> None:
     assert EXTRACTOR.twist({"angular_velocity": {"x": 0}}, "sensor_msgs/msg/Imu") is None
 
 
-def test_positions_that_are_nan_are_given_as_they_stand() -> None:
-    message = pose_stamped(quaternion(0.0, 0.0, 0.0, 0.0), bags.point(math.nan, 1.0, 2.0))
-    pose = EXTRACTOR.pose(message, "geometry_msgs/msg/PoseStamped")
-    assert pose is not None
-    assert math.isnan(pose.position[0])
-    assert pose.orientation is None
-    assert pose.frame_id == "map"
-
-
 def test_orientations_are_normalised() -> None:
     pose = EXTRACTOR.pose(
         pose_stamped(quaternion(5.0, 6.0, 7.0, 8.0), bags.point(1.0, 2.0)),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sqlite3
 from typing import TYPE_CHECKING
 
@@ -95,20 +94,6 @@ def test_each_field_of_each_type_can_be_asked_for_alone() -> None:
 def test_constants_of_definitions_are_not_shown() -> None:
     for _, type_name, message in messages(REAL / "rosbags_rs_94types_mcap"):
         assert all(not name.isupper() for name in names_of(message)), type_name
-
-
-@needs_real
-def test_the_nan_positions_of_the_auv_are_poses_and_leave_as_null() -> None:
-    odometry = [m for m in messages(REAL / "cougars_auv_mcap") if m[0] == "/coug2/odom"]
-    assert len(odometry) == 3
-    for _, type_name, message in odometry:
-        pose = EXTRACTOR.pose(message, type_name)
-        assert pose is not None
-        assert any(math.isnan(part) for part in pose.position)
-        value = EXTRACTOR.shown(message, type_name, ["position"]).value
-        assert isinstance(value, dict)
-        assert isinstance(value["position"], dict)
-        assert None in value["position"].values()
 
 
 @needs_real

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import fixes_in
 from tests.support.bags import (
@@ -126,9 +127,14 @@ CARRIERS = {
 }
 
 
+@lru_cache(maxsize=2)
+def remembered(bag_dir: Path, recalls: bool) -> Memory:
+    return memory_of(bag_dir, recalls=recalls)
+
+
 def ask(bag_dir: Path, recalls: bool, tool: str, **given: Any) -> Any:
-    memory = memory_of(bag_dir, limits=QuerySettings(**given.pop("limits", {})))
-    return asked(with_store(memory, bag_dir) if recalls else memory, bag_dir, tool, **given)
+    limits = QuerySettings(**given.pop("limits", {}))
+    return asked(replace(remembered(bag_dir, recalls), limits=limits), bag_dir, tool, **given)
 
 
 def driven(topic: str) -> list[Msg]:
@@ -235,25 +241,6 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> No
         assert any(note.startswith("no fix") for note in found.get("notes", ())) != has_fix
     _, fixes = fixes_in(View(memory, Call()), "/fix", TimeWindow.everything())
     assert [at for at, _ in fixes] == [T0 + n * S for n in range(5, 9)]
-
-
-@each_way
-def test_the_only_topic_with_poses_of_the_robot_answers_with_a_note(
-    tmp_path: Path, recalls: bool
-) -> None:
-    driven = [pose_stamped(T0 + n * S, float(n), 0.0, "/pose") for n in range(4)]
-    goal = pose_stamped(T0, 9.0, 9.0, "/goal_pose")
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [*driven, goal])
-    for tool, given, key, expected in (
-        ("get_position_at", {"timestamp": T0_S + 2}, "x", 2.0),
-        ("trajectory_summary", {"start": T0_S, "end": T0_S + 3}, "distance_m", 3.0),
-    ):
-        reply = ask(tmp_path, recalls, tool, **given)
-        assert (reply["topic"], reply[key]) == ("/pose", expected)
-        assert any(note.startswith("by /pose, the only topic") for note in reply["notes"])
-    between = ask(tmp_path, recalls, "get_position_at", timestamp=T0_S + 1.5)
-    assert between["reason"] == "between_messages"
-    assert "a message every 1 s" in between["detail"]
 
 
 @each_way
@@ -581,13 +568,6 @@ def test_once_the_usual_topic_of_poses_is_recorded_it_places_the_robot(tmp_path:
     write_mcap(tmp_path / "rec" / "rec_1.mcap", [odom(T0 + n * S, 2.0, 0.0) for n in range(20, 26)])
     [known] = asked(recalls, tmp_path, "visits", **near)["visits"]
     assert known["arrived"] == T0_S + 20
-
-
-def test_of_several_topics_with_poses_each_is_named(tmp_path: Path) -> None:
-    messages = [pose_stamped(T0, 1.0, 2.0, name) for name in ("/a", "/b")]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S)
-    assert "set data.pose_topic to one of them" in reply["detail"]
 
 
 def test_a_topic_without_a_position_is_refused_with_those_that_have_one(tmp_path: Path) -> None:

@@ -17,7 +17,6 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
-    McapLayout,
     Msg,
     boolean,
     detections,
@@ -111,33 +110,6 @@ def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: P
         "the memory begins",
         "the memory ends",
     ]
-
-
-def test_a_latched_copy_in_a_later_window_does_not_count_there(tmp_path: Path) -> None:
-    latched = McapLayout(latched=frozenset({"/dock"}))
-    docked = text(T0, "docked", "/dock")
-    again = Msg(docked.topic, docked.type, T0 + 600 * S, docked.body, docked.published)
-    write_mcap(tmp_path / "a" / "a_0.mcap", [docked], latched)
-    write_mcap(tmp_path / "b" / "b_0.mcap", [again, odom(T0 + 601 * S, 0, 0)], latched)
-    memory = memory_of(tmp_path)
-    with pytest.raises(NoDataError):
-        queries.topic_range(memory, Call(), "/dock", span(590, 610))
-    held = queries.topic_value(memory, Call(), "/dock", AtTime(at_s=T0 / 1e9 + 605))
-    assert held.sample.time == T0
-
-
-def test_many_latched_messages_of_a_simulated_clock_count_once_each(tmp_path: Path) -> None:
-    latched = McapLayout(latched=frozenset({"/log"}))
-
-    def line(number: int, log_time: int) -> Msg:
-        return Msg("/log", text(0, "", "/log").type, log_time, text(0, str(number)).body, number)
-
-    write_mcap(tmp_path / "a" / "a_0.mcap", [line(n, T0 + n * S) for n in range(30)], latched)
-    write_mcap(
-        tmp_path / "b" / "b_0.mcap", [line(n, T0 + (100 + n) * S) for n in range(20, 40)], latched
-    )
-    rows = queries.list_recorded_topics(memory_of(tmp_path), Call())
-    assert [(row.topic, row.count) for row in rows] == [("/log", 40)]
 
 
 def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 import math
 import random
-from typing import Any
+from functools import cache
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from rosbags.rosbag2 import Reader
@@ -33,6 +34,9 @@ from tests.support.closed_form import (
 )
 from tests.support.memories import memory_of
 from tests.support.shared_bags import RECORDED, needs_recorded
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 WRITTEN = "written"
 """In place of a session: the one that the test writes."""
@@ -62,9 +66,14 @@ def session(request: pytest.FixtureRequest) -> Session:
     return found
 
 
+@cache
+def remembered(folder: Path, storage: str) -> Memory:
+    return memory_of(folder, storage=storage)
+
+
 @pytest.fixture
 def memory(session: Session) -> Memory:
-    return memory_of(session.folder, storage=session.storage)
+    return remembered(session.folder, session.storage)
 
 
 def spanned(memory: Memory, session: Session) -> tuple[float, float]:

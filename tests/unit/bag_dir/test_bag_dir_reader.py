@@ -18,11 +18,10 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
-from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
-from tests.support.fakes import FakeReader
+from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.memories import memory_of
+from tests.support.noting_reader import NotingReader
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9
@@ -172,47 +171,16 @@ def test_a_relative_path_has_its_sidecar_beside_it(
     assert BagDirReader(McapReader()).summarize(old.relative_to(old.parent)).count == 16
 
 
-OPEN, FULL = Path("rec/rec_1.mcap"), Path("rec/rec_2.mcap")
 EVER = TimeWindow.everything()
 
 
-class Adapter(FakeReader):
-    def __init__(self) -> None:
-        super().__init__({"nav_msgs/msg/Odometry": "it is not wanted"})
-        self.add(OPEN, [text(10, "open")], closing=Closing.OPEN)
-        self.add(FULL, [text(1, "first"), text(2, "last"), odom(3, 0, 0)])
-
-
-def test_without_a_sidecar_it_answers_as_the_adapter() -> None:
-    adapter = Adapter()
-    reader = BagDirReader(adapter)
-    assert [reader.reads(Path(name)) for name in ("a.mcap", "a.db3")] == [True, False]
-    assert reader.closing(OPEN) is Closing.OPEN
-    assert reader.summarize(FULL) == adapter.summarize(FULL)
-    newest_first = reader.records(FULL, ["/chatter"], EVER, newest_first=True)
-    assert [record.log_time for record in newest_first] == [2, 1]
-    newest = reader.newest(FULL, "/chatter", EVER)
-    assert newest is not None
-    assert newest.log_time == 2
-    assert [channel.topic for channel in reader.channels(FULL)] == ["/chatter", "/odom"]
-    assert reader.profile(FULL) == adapter.profile(FULL)
-
-
-def test_messages_are_decoded_as_the_adapter_decodes_them() -> None:
-    adapter = Adapter()
-    reader = BagDirReader(adapter)
-    chatter, *_, pose = reader.records(FULL, ["/chatter", "/odom"], EVER)
-    assert reader.undecodable(chatter.channel) is None
-    assert reader.undecodable(pose.channel) == "it is not wanted"
-    assert getattr(reader.decode(chatter), "data", None) == "first"
-
-
-def test_nothing_is_opened_before_the_first_message_is_asked_for() -> None:
-    adapter = Adapter()
-    records = BagDirReader(adapter).records(FULL, ["/chatter"], EVER)
-    assert adapter.opened == []
+def test_nothing_is_opened_before_the_first_message_is_asked_for(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(1, "first")])
+    adapter = NotingReader()
+    records = BagDirReader(adapter).records(path, ["/chatter"], EVER)
+    assert adapter.names == []
     next(records)
-    assert adapter.opened == [FULL]
+    assert adapter.names == ["rec_0.mcap"]
 
 
 def test_every_message_is_read_where_counts_are_compared_with_the_files(tmp_path: Path) -> None:

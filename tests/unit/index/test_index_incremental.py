@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,8 +21,8 @@ from ros2_memory.bag_dir.heartbeat import (
     write_heartbeat,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import Clock
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
@@ -46,16 +47,6 @@ steps = st.one_of(
 )
 
 
-class HandClock(Clock):
-    """A clock that stands still until a test moves it."""
-
-    def __init__(self) -> None:
-        self.at = NOW
-
-    def now(self) -> int:
-        return self.at
-
-
 class World:
     """A bag directory in which things happen; every mtime is that of the hand-moved clock.
 
@@ -68,7 +59,7 @@ class World:
         self.root = root
         self._held = held
         self._grown = False
-        self.clock = HandClock()
+        self.clock = SettableClock(NOW)
         self.index = self.fresh_index()
         self.index.refresh()
 
@@ -98,7 +89,7 @@ class World:
     def _deeds(self) -> dict[str, Callable[[Path, int], None]]:
         return {
             "add": self._add,
-            "open": self._open,
+            "open": partial(self._add, closed=False),
             "replace": self._replace,
             "overwrite": self._overwrite,
             "empty": self._empty,
@@ -119,9 +110,6 @@ class World:
         path.unlink(missing_ok=True)
         topic = "/odom" if number % 2 else "/tf_static"
         plain(path, [number, number + 5], topic=topic, silent=["/scan"], closed=closed)
-
-    def _open(self, path: Path, number: int) -> None:
-        self._add(path, number, closed=False)
 
     def _empty(self, path: Path, _: int) -> None:
         path.unlink(missing_ok=True)

@@ -146,13 +146,3 @@ def test_a_db3_with_its_wal_beside_it_is_active_and_then_left_behind(tmp_path: P
     left = _scan(bags, Rosbag2Reader(), written + 31 * S)
     assert _states(left) == [("rec_0.db3", BagState.INCOMPLETE)]
     assert left.bags[0].summary.count == 5
-
-
-def test_a_young_db3_is_active_unless_its_recording_was_closed(tmp_path: Path) -> None:
-    path = write_db3(tmp_path / "rec" / "rec_0.db3", [text(n * S, "hello") for n in range(5)])
-    written = path.stat().st_mtime_ns
-    assert _names(_scan(tmp_path, Rosbag2Reader(), written + S).active) == ["rec_0.db3"]
-    path.with_name("metadata.yaml").write_text("relative_file_paths:\n  - rec_0.db3\n")
-    assert _states(_scan(tmp_path, Rosbag2Reader(), written + S)) == [
-        ("rec_0.db3", BagState.CLOSED)
-    ]

@@ -24,7 +24,6 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
 )
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
-from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
@@ -37,12 +36,11 @@ from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import McapLayout, Msg, odom, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
 
-    from ros2_memory.tools.declaration import Tool
 
 S = 10**9
 T0 = 1_784_023_200 * S
@@ -134,23 +132,7 @@ class Tail:
         return [bag.state for bag in self.memory.index.refresh().bags]
 
     def asked(self, name: str, **arguments: object) -> Any:
-        return reply_of(self.memory, name, **arguments)
-
-
-@cache
-def tools() -> Mapping[str, Tool]:
-    """Those of this deployment, by name."""
-    return {tool.name: tool for tool in build_tools(LIVE)}
-
-
-def reply_of(memory: Memory, name: str, **arguments: object) -> Any:
-    """A reply as a client gets it."""
-    replies, call = Replies(Path("bags"), 24_000), Call()
-    try:
-        answer = tools()[name].question(arguments)(memory, call)
-    except EpisodicError as error:
-        return json.loads(replies.error(error).text)
-    return json.loads(replies.answer(answer, from_active=call.used_active).text)
+        return asked(self.memory, self.bag_dir, name, **arguments)
 
 
 @pytest.fixture
@@ -176,7 +158,12 @@ def test_wherever_the_file_ends_all_whole_chunks_answer_and_nothing_that_is_not_
         assert aside.until == (T0 + (len(ticks) - 1) * TENTH if ticks else None)
         for tick in {*ticks[:1], *ticks[-1:]}:
             live = tail.asked("get_position_at", timestamp=T0 / S + tick / 10)
-            whole = reply_of(closed(layout), "get_position_at", timestamp=T0 / S + tick / 10)
+            whole = asked(
+                closed(layout),
+                closed(layout).index.bag_dir,
+                "get_position_at",
+                timestamp=T0 / S + tick / 10,
+            )
             assert live.pop("from_active") is True
             assert {**live, "notes": None} == {**whole, "notes": None}
 
@@ -196,7 +183,7 @@ def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) 
     assert (reply["bags"], reply["from_active"]) == (1, True)
     assert tail.asked("memory_status")["from_active"] is True
     assert reply["active"] == [
-        {"file": "rec_0.mcap", "reason": "still being written: its complete chunks are read"}
+        {"file": "rec/rec_0.mcap", "reason": "still being written: its complete chunks are read"}
     ]
     assert (reply["incomplete"], reply["damaged"]) == ([], [])
     assert not any("ends early" in note for note in reply.get("notes", ()))
@@ -228,7 +215,9 @@ def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
             ("trajectory_summary", {"start": T0 / S, "end": T0 / S + 30}),
             ("get_topic_in_range", {"topic": "/odom", "start": T0 / S, "end": T0 / S + 30}),
         ):
-            assert reply_of(catalogued, name, **arguments) == tail.asked(name, **arguments)
+            assert asked(catalogued, tail.bag_dir, name, **arguments) == tail.asked(
+                name, **arguments
+            )
 
 
 def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:
@@ -394,7 +383,7 @@ def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail
     later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
     tail.write("rec/rec_1.mcap", later[: len(later) * 6 // 10], at=12 * S)
     dispatcher = Dispatcher(
-        tail.memory, [*tools().values()], Replies(tail.bag_dir, 24_000), call_timeout_s=25.0
+        tail.memory, build_tools(LIVE), Replies(tail.bag_dir, 24_000), call_timeout_s=25.0
     )
     old, new = {"timestamp": T0 / S + 5}, {"timestamp": T0 / S + 11}
     from_active: list[bool] = []

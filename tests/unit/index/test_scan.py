@@ -128,24 +128,6 @@ def test_a_watched_file_is_looked_at_though_its_folder_did_not_change(tmp_path: 
     assert {key: stamp.size for key, stamp in scanned.stamps.items()} == {str(path): 6}
 
 
-def test_what_vanished_is_named_once(tmp_path: Path) -> None:
-    path = _file(tmp_path / "rec" / "a.mcap")
-    _file(tmp_path / "rec" / "b.mcap")
-    tree = Tree(_aged(tmp_path))
-    tree.scan(NOW, ())
-    path.unlink()
-    assert tree.scan(NOW, ()).gone == {str(path)}
-    assert tree.scan(NOW, ()).gone == set()
-
-
-def test_a_whole_tree_that_vanished_is_gone_to_the_last_file(tmp_path: Path) -> None:
-    paths = {str(_file(tmp_path / "day" / name / "a.mcap")) for name in ("rec_1", "rec_2")}
-    tree = Tree(_aged(tmp_path))
-    tree.scan(NOW, ())
-    (tmp_path / "day").rename(tmp_path / ".trash")
-    assert tree.scan(NOW, ()).gone == paths
-
-
 def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
     path = _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import IndexType
 
-from ros2_memory.core.bag_summary import SummarySchema
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import data_time_range, topic_range
@@ -94,11 +93,3 @@ def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Pa
         memory, Call(), messages[0].topic, TimeRange(start_s=T0 / S, end_s=T0 / S + 10)
     )
     assert any("set back" in note for note in result.notes)
-
-
-def test_the_catalogue_keeps_it(tmp_path: Path) -> None:
-    messages = [message(n) for n in range(20)] + [message(n - STEP) for n in range(20, 40)]
-    write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
-    shape = McapReader().summarize(tmp_path / "a.mcap").schema
-    assert shape.set_back
-    assert SummarySchema.from_json(shape.to_json()) == shape

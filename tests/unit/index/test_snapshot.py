@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import replace
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -32,13 +30,6 @@ def _bag(
     return BagFile(name, 1, 1, BagState.CLOSED, summary, summary.start, summary.end)
 
 
-def test_an_empty_timeline_has_neither_beginning_nor_end() -> None:
-    empty = Snapshot()
-    assert (empty.earliest, empty.latest, empty.timeline.topics()) == (None, None, ())
-    assert [*empty.timeline.extents("/odom", TimeWindow.everything())] == []
-    assert empty.timeline.overlapping(TimeWindow.everything()) == ()
-
-
 def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> None:
     bags = [
         _bag(f"rec/rec_{nth}.mcap", ("/odom", nth, nth))._replace(
@@ -54,26 +45,6 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
     assert len(snapshot.bags) == len(bags)
     assert Timeline.of([carried]).disk_use == (7, 0)
     assert Timeline().disk_use == (0, 0)
-
-
-def test_what_is_held_of_a_topic_is_one_entry_for_each_type_in_bag_order() -> None:
-    both = _bag("b", ("/x", 10, 19), ("/odom", 10, 19))
-    second = replace(both.summary.topics[0], type="std_msgs/msg/String", first=12, last=17)
-    both = both._replace(summary=BagSummary((*both.summary.topics, second)))
-    first = _bag("a", ("/x", 0, 9))
-    snapshot = Snapshot(Timeline.of((first, both)))
-    assert [*snapshot.timeline.extents("/x", TimeWindow.everything())] == [
-        (first, 0, 9),
-        (both, 10, 19),
-        (both, 12, 17),
-    ]
-    assert snapshot.timeline.types_of("/x") == (ODOM, "std_msgs/msg/String")
-    assert snapshot.timeline.types_of("/nothing") == ()
-
-
-def test_removing_a_bag_that_is_not_there_is_refused() -> None:
-    with pytest.raises(ValueError, match="not in list"):
-        Timeline.of([_bag("a", ("/odom", 0, 9))]).changed([_bag("b", ("/odom", 0, 9))], [])
 
 
 bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))

@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
+from ros2_memory.index.timeline import Timeline
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, text, write_mcap
@@ -86,26 +86,6 @@ def test_the_time_of_what_was_never_looked_into_is_unknown() -> None:
     assert Snapshot(unread=(link,), scanned_at=T0).unread_spans == {link: None}
 
 
-def test_the_span_leaves_out_what_a_wrong_clock_dated(tmp_path: Path) -> None:
-    write_splits(tmp_path, 0, 10)
-    write_mcap(tmp_path / "boot" / "boot_0.mcap", [text(0, "a"), text(9 * S, "b")])
-    write_mcap(tmp_path / "max" / "max_0.mcap", [text(T0, "a"), text(2**62, "b")])
-    snapshot = snapshot_of(tmp_path, T0 + 100 * S)
-    assert (snapshot.earliest, snapshot.latest) == (T0, T0 + 19 * S)
-    assert (snapshot.dating.earliest, snapshot.dating.latest) == (T0, T0 + 19 * S)
-    assert {fault.bag.path.name for fault in snapshot.dating.faults} == {
-        "boot_0.mcap",
-        "max_0.mcap",
-    }
-
-
-def test_a_clock_that_was_set_back_while_a_recording_ran_is_told(tmp_path: Path) -> None:
-    write_splits(tmp_path, 100, 110, 60, 70)
-    [fault] = snapshot_of(tmp_path, T0 + 1000 * S).dating.faults
-    assert fault.reason == "the clock was set back by 59 s after rec_1.mcap was begun"
-    assert fault.bag.path.name == "rec_2.mcap"
-
-
 def test_a_question_about_now_looks_for_newer_bags_though_one_is_from_the_future(
     tmp_path: Path,
 ) -> None:
@@ -132,12 +112,3 @@ def test_what_is_amiss_in_a_window_reaches_on_to_the_end_of_an_open_file(
     )
     window = TimeWindow(T0 + start * S, T0 + stop * S)
     assert [each.path.name for each in Snapshot(Timeline.of(bags)).timeline.faulty(window)] == found
-
-
-def test_neighbours_are_found_across_the_parts_of_a_long_history() -> None:
-    numbers = [n for n in range(3 * SEGMENT_BAGS) if n != SEGMENT_BAGS]
-    bags = tuple(bag(f"/b/rec/rec_{n}.mcap", T0 + n * S, T0 + n * S + 5) for n in numbers)
-    lost = SetAside(Path(f"/b/rec/rec_{SEGMENT_BAGS}.mcap"), "torn", T0)
-    snapshot = Snapshot(Timeline.of(bags), damaged=(lost,), scanned_at=T0 + DAY)
-    window = TimeWindow(T0 + (SEGMENT_BAGS - 1) * S + 5, T0 + (SEGMENT_BAGS + 1) * S + 1)
-    assert snapshot.unread_spans[lost] == window

@@ -69,15 +69,6 @@ def test_only_files_named_after_their_folder_are_splits_of_one_recording() -> No
     assert [place is not None and is_recording(place[0]) for place in places] == [True, False]
 
 
-def test_a_clock_that_was_set_back_shows_between_two_splits() -> None:
-    bags = [split(0, 100, 110), split(1, 110, 120), split(2, 60, 70), split(3, 70, 80)]
-    assert steps(bags) == [("rec_1.mcap", "rec_2.mcap", 60 * S)]
-
-
-def test_splits_that_overlap_by_little_are_messages_out_of_order() -> None:
-    assert steps([split(0, 100, 110), split(1, 109, 120), split(2, 120, 130)]) == []
-
-
 def test_files_that_people_named_tell_nothing_of_a_clock() -> None:
     assert steps([bag("drive_1.mcap", 100, 110), bag("drive_2.mcap", 10, 20)]) == []
 

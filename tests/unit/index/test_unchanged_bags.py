@@ -110,13 +110,6 @@ def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> No
     assert [*reader.summaries] == ["rec_3.mcap"]
 
 
-def test_a_bag_of_which_nothing_is_known_is_read_beside_the_others(start: Start) -> None:
-    del start.known[str(start.bag_dir / "rec" / "rec_0.mcap")]
-    index, reader = start.index()
-    assert index.refresh() == start.read()
-    assert [*reader.summaries] == ["rec_0.mcap"]
-
-
 def test_what_is_known_of_a_young_bag_is_believed_and_the_bag_watched(start: Start) -> None:
     start.age(NOW - 5 * S)
     start.remember()
@@ -130,32 +123,6 @@ def test_a_known_bag_of_a_kind_that_the_reader_does_not_read_is_set_aside(start:
     reader.kinds = (".db3",)
     snapshot = index.refresh()
     assert (len(snapshot.bags), len(snapshot.unread)) == (0, 6)
-
-
-def test_a_bag_that_is_written_over_in_place_is_noticed_on_patrol(start: Start) -> None:
-    index, reader = start.index()
-    index.refresh()
-    plain(start.bag_dir / "rec" / "rec_2.mcap", [20, 21, 22])
-    start.age()
-    assert index.refresh() == start.read()
-    assert [*reader.summaries] == ["rec_2.mcap"]
-
-
-def test_a_bag_that_goes_is_known_no_more(start: Start) -> None:
-    index, reader = start.index()
-    index.refresh()
-    (start.bag_dir / "rec" / "rec_2.mcap").unlink()
-    assert index.refresh() == start.read()
-    assert reader.summaries.total() == 0
-
-
-def test_a_compressed_copy_beside_a_known_bag_is_weighed_against_it(start: Start) -> None:
-    index, _ = start.index()
-    index.refresh()
-    plain(start.bag_dir / "rec" / "rec_2.mcap.zstd", [20, 29])
-    start.age()
-    os.utime(start.bag_dir / "rec", ns=(LONG_AGO + S, LONG_AGO + S))
-    assert index.refresh() == start.read()
 
 
 def test_a_sidecar_that_comes_has_the_bags_beside_it_read_again(start: Start) -> None:

@@ -8,16 +8,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ros2_memory.messages.conversions import (
     ABSENT,
-    euler,
     nanoseconds,
-    rotation,
     view,
     xyz,
     xyzw,
 )
 from tests.support import bags
-
-NAN = math.nan
 
 
 def quaternion(x: float, y: float, z: float, w: float) -> object:
@@ -123,28 +119,6 @@ def test_a_quaternion_has_angles_and_no_components_in_this_view() -> None:
     assert view(node, "yaw_deg") == pytest.approx(30)
     assert view(node, "roll_deg") == pytest.approx(0)
     assert view(node, "w") is ABSENT
-
-
-def test_a_time_is_one_number_in_this_view() -> None:
-    assert view(bags.stamp(5), "sec") is ABSENT
-
-
-@pytest.mark.parametrize("parts", [(0.0, 0.0, 0.0, 0.0), (NAN, 0.0, 0.0, 1.0), (0, 0, math.inf, 1)])
-def test_a_zero_or_unfinite_quaternion_is_no_rotation(
-    parts: tuple[float, float, float, float],
-) -> None:
-    node = quaternion(*parts)
-    assert rotation(node) is None
-    assert euler(node) is None
-    assert view(node, "yaw_deg") is None
-
-
-def test_a_quaternion_that_is_not_of_unit_length_is_normalised() -> None:
-    unit = rotation(quaternion(5.0, 6.0, 7.0, 8.0))
-    assert unit is not None
-    assert math.hypot(*unit) == pytest.approx(1, abs=1e-15)
-    assert unit[3] / unit[0] == pytest.approx(8 / 5)
-    assert rotation(quaternion(0.0, 0.0, 0.0, 2.0)) == (0.0, 0.0, 0.0, 1.0)
 
 
 def test_points_are_read_from_messages_and_from_json_alike() -> None:

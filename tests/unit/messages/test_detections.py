@@ -67,11 +67,6 @@ def test_a_point_that_nobody_filled_in_is_no_place() -> None:
     assert detections_of(value) == (Detection("cup"),)
 
 
-def test_a_text_that_is_json_is_looked_into() -> None:
-    value: JsonValue = {"value": '[{"label": "cup", "point": [1, 2, 3]}]'}
-    assert detections_of(value, "odom") == (Detection("cup", (1.0, 2.0, 3.0), "odom"),)
-
-
 def test_a_json_object_with_a_list_of_detections_in_a_text_is_looked_into() -> None:
     """As of a detector that publishes std_msgs/msg/String."""
     said = json.dumps({"detections": [{"label": "cup", "score": 0.8}, {"label": "fork"}]})
@@ -149,13 +144,6 @@ def test_detections_of_a_low_score_leave_their_places_empty() -> None:
     }
     assert without_low_scores(SCORED, 0.1) is SCORED
     assert without_low_scores({"class": "cup", "score": 0.4}, 0.5) is None
-
-
-def test_detections_of_a_low_score_are_left_out_of_json_in_a_text() -> None:
-    text = '[{"label": "cup", "score": 0.4}, {"label": "f\u00fcrk"}]'
-    assert without_low_scores({"data": text}, 0.3) == {"data": text}
-    kept = without_low_scores({"data": text}, 0.5)
-    assert detections_of(kept) == (Detection("f\u00fcrk"),)
 
 
 _scores = st.none() | st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, math.nan])

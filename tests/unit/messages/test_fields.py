@@ -10,7 +10,6 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ros2_memory.messages.conversions import (
     ABSENT,
-    Route,
     descend,
     field_of,
     field_table_of,
@@ -94,44 +93,8 @@ def test_a_dot_path_is_names_and_numbers_joined_by_dots(
     assert parse_path(path) == segments
 
 
-SEEN = {"seen": [{"label": "cup", "at": [1, 2]}, {"label": "mug"}], "none": None, "empty": []}
-
-
-@pytest.mark.parametrize(
-    ("path", "found"),
-    [
-        ("seen.label", ["cup", "mug"]),
-        ("seen.1.label", "mug"),
-        ("seen.at", [[1, 2], None]),
-        ("seen.0.at.1", 2),
-        ("seen.7.label", None),
-        ("seen.99999999999999999999", None),
-        ("seen.colour", ABSENT),
-        ("seen.-1", ABSENT),
-        ("seen.²", ABSENT),
-        ("none.x", None),
-        ("empty.x", []),
-        ("nothing", ABSENT),
-        ("nothing.x", ABSENT),
-        ("seen.label.x", ABSENT),
-    ],
-)
-def test_a_path_takes_elements_by_number_and_otherwise_maps_over_them(
-    path: str, found: object
-) -> None:
-    assert descend(SEEN, path.split(".")) == found
-
-
 def test_the_numbers_of_an_array_are_reached_by_number_and_have_no_fields() -> None:
     scan = SimpleNamespace(ranges=np.array([1.5, 2.5]), none=np.zeros(0))
     assert descend(scan, ("ranges", "1")) == 2.5
     assert descend(scan, ("ranges", "size")) is ABSENT
     assert descend(scan, ("none", "x")) == []
-
-
-def test_a_route_finds_the_same_in_a_message_and_in_its_json_likeness() -> None:
-    route = Route("pose", "x")
-    assert route.of(SimpleNamespace(pose=SimpleNamespace(x=1.5))) == 1.5
-    assert route.of({"pose": {"x": 1.5}}) == 1.5
-    assert route.of({"pose": 3}) is ABSENT
-    assert route.of(None) is None

@@ -41,16 +41,16 @@ def _messages() -> list[Msg]:
 def test_whatever_happened_to_a_bag_only_the_error_tree_escapes(
     shelf: Shelf, tmp_path: Path
 ) -> None:
-    stocked = shelf.stocked(tmp_path, _messages())
-    whole = stocked.path.read_bytes()
+    reader, path = shelf.stocked(tmp_path, _messages())
+    whole = path.read_bytes()
     read = 0
     for accident in range(ACCIDENTS):
         # The seed depends on the shelf, so that the shelves do not all meet the same accidents.
         seed = accident + zlib.crc32(shelf.name.encode())
-        stocked.path.write_bytes(damaged(whole, seed))
-        error = _error_of_reading(stocked.reader, stocked.path)
+        path.write_bytes(damaged(whole, seed))
+        error = _error_of_reading(reader, path)
         if error is not None:
-            assert (error.path, bool(error.reason)) == (str(stocked.path), True)
+            assert (error.path, bool(error.reason)) == (str(path), True)
         read += error is None
     assert read
 

@@ -165,23 +165,6 @@ def test_the_truncated_file_has_its_whole_chunk() -> None:
 
 
 @needs_recorded
-def test_a_killed_session_is_read_as_far_as_it_reached_the_disk() -> None:
-    folder = RECORDED / "session_killed_chunk64k"
-    cut = folder / "session_killed_chunk64k_2.mcap"
-    summary = mcap().summarize(cut)
-    assert mcap().closing(cut) is Closing.OPEN
-    assert not summary.complete
-    assert summary.count == 251
-    assert summary.notes == ("the file ends early: the last 54 bytes could not be read",)
-    t0 = json.loads((RECORDED / "session_killed_chunk64k.truth.json").read_text())["t0_ns"]
-    assert 24.0 < (summary.end - t0) / 1e9 < 24.5
-    empty = RECORDED / "session_killed" / "session_killed_2.mcap"
-    assert mcap().closing(empty) is Closing.OPEN
-    with pytest.raises(BagError, match="empty file: nothing had reached the disk"):
-        mcap().summarize(empty)
-
-
-@needs_recorded
 @every_recorded_file
 def test_every_recorded_file_is_read_or_reports_why_not(path: Path) -> None:
     for reader in readers_of(path):

@@ -38,13 +38,6 @@ _chunks = st.lists(st.lists(st.integers(0, 8), min_size=1, max_size=6), max_size
 
 
 @given(_chunks)
-def test_runs_that_overlap_come_out_by_time_and_ties_in_file_order(chunks: list[list[int]]) -> None:
-    times = [time for chunk in chunks for time in chunk]
-    whole = sorted((time, place) for place, time in enumerate(times))
-    assert list(merged(runs_of(chunks, [], newest_first=False), newest_first=False)) == whole
-
-
-@given(_chunks)
 def test_newest_first_is_exactly_the_reverse(chunks: list[list[int]]) -> None:
     forwards = list(merged(runs_of(chunks, [], newest_first=False), newest_first=False))
     backwards = list(merged(runs_of(chunks, [], newest_first=True), newest_first=True))

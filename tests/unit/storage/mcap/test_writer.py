@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Channel, Closing, Record, Schema
+from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -82,29 +82,6 @@ class TestRewriting:
         complete = write_mcap(tmp_path / "c.mcap", messages())
         assert raw_contents(target) == raw_contents(complete)
         assert (result.messages, result.lost_bytes) == (len(messages()), 0)
-
-    @pytest.mark.parametrize("compression", list(CompressionType))
-    def test_a_file_that_its_writer_did_not_finish_is_closed_with_all_that_reached_the_disk(
-        self, tmp_path: Path, compression: CompressionType
-    ) -> None:
-        layout = McapLayout(chunk_size=2000, compression=compression, finish=False)
-        source = write_mcap(tmp_path / "a.mcap", messages(), layout)
-        before = contents(source)
-        McapWriter().rewrite(source, tmp_path / "b.mcap")
-        reader = McapReader()
-        assert reader.closing(source) is Closing.OPEN
-        assert reader.closing(tmp_path / "b.mcap") is Closing.CLOSED
-        assert contents(tmp_path / "b.mcap") == before
-        assert 0 < len(before) < len(messages())
-
-    def test_messages_of_the_last_partial_chunk_are_kept(self, tmp_path: Path) -> None:
-        layout = McapLayout(chunk_size=10_000_000)
-        whole = write_mcap(tmp_path / "a.mcap", messages(), layout)
-        source = cut(whole, 20_000)
-        result = McapWriter().rewrite(source, tmp_path / "b.mcap")
-        assert 0 < result.messages < len(messages())
-        assert result.lost_bytes > 0
-        assert any("ends early" in note for note in result.notes)
 
     @settings(
         suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=examples(60)
