@@ -1,7 +1,6 @@
 """What `ros2 bag record` does when it is signalled, starved or robbed: the real one and the double.
 
-One suite holds both, so that it fails where the double differs. What the double does as other
-distributions than Jazzy is tested on it alone.
+One suite holds both, so that it fails where the double differs.
 """
 
 from __future__ import annotations
@@ -53,28 +52,16 @@ SECOND = 10**9
 TWICE = (signal.SIGTERM, signal.SIGINT)
 THRICE = (signal.SIGINT, signal.SIGTERM, signal.SIGINT)
 EVERY_SECOND = ("-e", "/odom", "-d", "1")
-# Name: distribution and options. They all begin at once, since each takes its time to begin.
+# Name: options. They all begin at once, since each takes its time to begin.
 STARTED = {
-    "sigint": ("jazzy", ("-e", "/odom|/bumper")),
-    "sigterm": ("jazzy", ("-e", "/odom|/bumper")),
-    "twice": ("jazzy", EVERY_SECOND),
-    "thrice": ("jazzy", EVERY_SECOND),
-    "sighup": ("jazzy", EVERY_SECOND),
-    "sigkill": ("jazzy", EVERY_SECOND),
-    "ignoring": ("jazzy", EVERY_SECOND),
-    "stalled": ("jazzy", EVERY_SECOND),
-    "moved": ("jazzy", EVERY_SECOND),
-    "thinned": ("jazzy", EVERY_SECOND),
-    "humble": ("humble", ("-d", "1", "/odom")),
-    "lyrical": (
-        "lyrical",
-        ("-d", "1", "-e", "/odom|/tf_static", "--repeat-transient-local", "/tf_static=1"),
+    "sigint": ("-e", "/odom|/bumper"),
+    "sigterm": ("-e", "/odom|/bumper"),
+    **dict.fromkeys(
+        ("twice", "thrice", "sighup", "sigkill", "ignoring", "stalled", "moved", "thinned"),
+        EVERY_SECOND,
     ),
-    "packed": (
-        "jazzy",
-        (*EVERY_SECOND, "--compression-mode", "file", "--compression-format", "zstd"),
-    ),
-    "blocks": ("jazzy", ("-e", "/odom", "--storage-preset-profile", "fastwrite")),
+    "packed": (*EVERY_SECOND, "--compression-mode", "file", "--compression-format", "zstd"),
+    "blocks": ("-e", "/odom", "--storage-preset-profile", "fastwrite"),
 }
 
 
@@ -104,9 +91,6 @@ OVERRIDES = {
 }
 
 
-of_the_double = pytest.mark.parametrize("real", ["double"], indirect=True)
-
-
 @pytest.fixture(scope="module", params=RECORDERS)
 def real(request: pytest.FixtureRequest) -> RealRecorder | None:
     """Whose `ros2` it is; None: the double's."""
@@ -129,22 +113,16 @@ def env(
 
 @pytest.fixture(scope="module")
 def started(
-    env: dict[str, str], real: RealRecorder | None, tmp_path_factory: pytest.TempPathFactory
+    env: dict[str, str], tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[dict[str, Recording]]:
     """Recordings under way, each for one test."""
     folder = tmp_path_factory.mktemp("started")
     with ExitStack() as stack:
         yield {
             name: stack.enter_context(
-                Recording(
-                    {**env, "ROS2_DOUBLE_DISTRO": distro},
-                    folder / name,
-                    *options,
-                    ignore_sigint=name == "ignoring",
-                )
+                Recording(env, folder / name, *options, ignore_sigint=name == "ignoring")
             )
-            for name, (distro, options) in STARTED.items()
-            if real is None or distro == "jazzy"
+            for name, options in STARTED.items()
         }
 
 
@@ -466,32 +444,6 @@ def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
         assert "ERROR" not in recording.said
     finally:
         subprocess.run(["umount", str(disk)], check=True)
-
-
-@of_the_double
-def test_humble_writes_one_time_for_both(started: dict[str, Recording]) -> None:
-    recording = started["humble"]
-    recording.await_splits(2)
-    assert recording.stop() == 0
-    assert all(log == published for _, log, published, _ in messages(recording))
-    assert metadata(recording.directory)["ros_distro"] == "humble"
-
-
-@of_the_double
-def test_lyrical_repeats_latched_messages_in_every_split_and_names_files_by_time(
-    started: dict[str, Recording],
-) -> None:
-    recording = started["lyrical"]
-    recording.await_splits(3)
-    assert recording.stop() == 0
-    time_of_day = r"\d{4}(_\d\d){2}-\d\d(_\d\d){2}"
-    for number, split in enumerate(recording.splits()):
-        assert re.fullmatch(rf"{number}_lyrical_{time_of_day}\.mcap", split.name)
-    before, after = (in_file(split) for split in recording.splits()[:2])
-    assert after[0][0] == "/tf_static"
-    # The copy has both times of the message before it.
-    assert after[0][1:3] == before[-1][1:3]
-    assert after[0][3] in [payload for topic, *_, payload in before if topic == "/tf_static"]
 
 
 def test_whole_files_are_compressed_once_they_are_closed(started: dict[str, Recording]) -> None:

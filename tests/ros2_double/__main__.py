@@ -6,29 +6,26 @@ import os
 import sys
 from importlib import import_module
 
-from tests.ros2_double.arguments import DISTROS, Options, RefusedError, options
+from tests.ros2_double.arguments import Options, RefusedError, options
 from tests.ros2_double.signals import Signals
 
 
 def main(argv: list[str]) -> int:
     """Runs the command; the exit code is the real recorder's."""
     signals = Signals()
-    distro = os.environ.get("ROS2_DOUBLE_DISTRO", "jazzy")
-    if distro not in DISTROS:
-        return _refusal(f"ROS2_DOUBLE_DISTRO is {distro!r}; the double knows {DISTROS}")
     if argv[:2] != ["bag", "record"]:
         return _refusal("this `ros2` is a test double: it knows `ros2 bag record` alone")
     try:
-        _record(options(distro, argv[2:]), distro, signals)
+        _record(options(argv[2:]), signals)
     except RefusedError as error:
         return _refusal(str(error))
     return 0
 
 
-def _record(wanted: Options, distro: str, signals: Signals) -> None:
+def _record(wanted: Options, signals: Signals) -> None:
     recorder = import_module("tests.ros2_double.recorder")  # slow: the help needs none of it
     try:
-        recorder.record(wanted, distro, signals)
+        recorder.record(wanted, signals)
     except OSError as error:
         sys.stderr.write(f"terminate called after throwing an exception\n  what():  {error}\n")
         sys.stderr.flush()

@@ -1,4 +1,4 @@
-"""The options of `ros2 bag record`, as far as the double has them, distro by distro."""
+"""The options of `ros2 bag record`, as far as the double has them: those of Jazzy."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ import yaml
 
 from tests.ros2_double.mcap_file import Layout
 
-DISTROS: Final = ("humble", "jazzy", "kilted", "lyrical")
-# What Jazzy's help lists besides; to use them is refused.
+# What its help lists besides; to use them is refused.
 _NOT_DONE: Final[dict[str, str | int | None]] = {
     "--services": "+",
     "--topic-types": "+",
@@ -65,7 +64,6 @@ class Options:
     node_name: str
     custom: dict[str, str]
     keyboard: bool
-    repeats: dict[str, int]
 
 
 class _Refused(argparse.Action):
@@ -75,18 +73,16 @@ class _Refused(argparse.Action):
         raise RefusedError(f"the double does not do {name}")
 
 
-def parser(distro: str) -> argparse.ArgumentParser:
-    """The model of one distro's options; an option that it lacks is unknown."""
+def parser() -> argparse.ArgumentParser:
+    """The options that the double knows."""
     model = argparse.ArgumentParser(
         prog="ros2 bag record",
-        description=f"Test double of `ros2 bag record`, ROS 2 {distro.capitalize()}.",
+        description="Test double of `ros2 bag record`, ROS 2 Jazzy.",
         allow_abbrev=False,
     )
     add = model.add_argument
-    if distro != "lyrical":
-        add("positional_topics", nargs="*", default=[], metavar="topics", help="Topics to record.")
-    if distro != "humble":
-        add("--topics", nargs="+", default=[], metavar="Topic", help="Topics to record.")
+    add("positional_topics", nargs="*", default=[], metavar="topics", help="Topics to record.")
+    add("--topics", nargs="+", default=[], metavar="Topic", help="Topics to record.")
     add("-a", "--all", action="store_true", help="Record all topics.")
     add("-e", "--regex", default="", help="Record only topics that contain a match.")
     add("-o", "--output", help="Directory to create; it must not exist.")
@@ -100,28 +96,22 @@ def parser(distro: str) -> argparse.ArgumentParser:
     add("--compression-format", default="", choices=("", "zstd"))
     add("--include-hidden-topics", action="store_true")
     add("--use-sim-time", action="store_true", help="Times are those of /clock.")
-    if distro != "humble":
-        add("--node-name", default="rosbag2_recorder")
-        add("--custom-data", nargs="*", default=[], metavar="KEY=VALUE")
-        add("--disable-keyboard-controls", action="store_true")
-    if distro == "jazzy":
-        for names, count in _NOT_DONE.items():
-            add(*names.split(", "), nargs=count, action=_Refused, help="The double refuses it.")
-    if distro == "lyrical":
-        add("--repeat-transient-local", nargs="+", default=[], metavar="Topic[=Depth]")
-        add("--max-bag-files", type=int, default=0)
-        add("--max-cache-duration", type=int, default=0)
+    add("--node-name", default="rosbag2_recorder")
+    add("--custom-data", nargs="*", default=[], metavar="KEY=VALUE")
+    add("--disable-keyboard-controls", action="store_true")
+    for names, count in _NOT_DONE.items():
+        add(*names.split(", "), nargs=count, action=_Refused, help="The double refuses it.")
     return model
 
 
-def options(distro: str, argv: list[str]) -> Options:
-    """Parses the arguments behind `ros2 bag record`; exits 2 on those that the distro lacks.
+def options(argv: list[str]) -> Options:
+    """Parses the arguments behind `ros2 bag record`; exits 2 on those that are not known.
 
     Raises:
         RefusedError: as the real recorder does, or for what the double does not do.
     """
-    given = vars(parser(distro).parse_args(argv))
-    topics = (*given.get("topics", ()), *given.get("positional_topics", ()))
+    given = vars(parser().parse_args(argv))
+    topics = (*given["topics"], *given["positional_topics"])
     regex = ".*" if given["all"] else given["regex"]
     if not topics and not regex:
         raise RefusedError("Need to specify at least one option out of --all, topics or --regex")
@@ -132,13 +122,8 @@ def options(distro: str, argv: list[str]) -> Options:
         raise RefusedError(f"Output folder '{output}' already exists.")
     if bool(given["compression_format"]) != (given["compression_mode"] != "none"):
         raise RefusedError("Compression needs both a mode and a format.")
-    for name, allowed in (
-        ("storage", "mcap"),
-        ("max_bag_files", 0),
-        ("max_cache_duration", 0),
-    ):
-        if given.get(name, allowed) != allowed:
-            raise RefusedError(f"the double does not do --{name.replace('_', '-')} {given[name]}")
+    if given["storage"] != "mcap":
+        raise RefusedError(f"the double does not do --storage {given['storage']}")
     if given["compression_mode"] == "message":
         raise RefusedError("MCAP storage plugin does not support message compression")
     return Options(
@@ -152,10 +137,11 @@ def options(distro: str, argv: list[str]) -> Options:
         compress_files=given["compression_mode"] == "file",
         include_hidden=given["include_hidden_topics"],
         use_sim_time=given["use_sim_time"],
-        node_name=given.get("node_name", "rosbag2_recorder"),
-        custom=dict(_pair(text, "") for text in given.get("custom_data", ())),
-        keyboard=not given.get("disable_keyboard_controls", False),
-        repeats=dict(_depth(text) for text in given.get("repeat_transient_local", ())),
+        node_name=given["node_name"],
+        custom={
+            key: value for key, _, value in (text.partition("=") for text in given["custom_data"])
+        },
+        keyboard=not given["disable_keyboard_controls"],
     )
 
 
@@ -185,15 +171,3 @@ def _layout(preset: str, file: Path | None) -> Layout:
         zstd_level=zstd_level if compression == "Zstd" else None,
         summary_crc=base.summary_crc,
     )
-
-
-def _pair(text: str, default: str) -> tuple[str, str]:
-    key, _, value = text.partition("=")
-    return key, value or default
-
-
-def _depth(text: str) -> tuple[str, int]:
-    topic, depth = _pair(text, "1")
-    if not depth.isdigit() or not int(depth):
-        raise RefusedError(f"Invalid depth for --repeat-transient-local: {text}")
-    return topic, int(depth)

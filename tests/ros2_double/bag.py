@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from copy import deepcopy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
@@ -29,19 +27,9 @@ class Writing:
     directory: Path
     layout: Layout
     split_after_ns: int | None
-    distro: str
     custom: dict[str, str]
     compress_files: bool
     cached: bool
-    repeats: dict[str, int]  # topic: how many of its last messages begin every split
-
-
-@dataclass(frozen=True)
-class _Message:
-    topic: str
-    payload: bytes
-    log_time: int
-    publish_time: int
 
 
 class Bag:
@@ -51,10 +39,8 @@ class Bag:
         self._how = how
         self._say = say
         self._topics: dict[str, Topic] = {}
-        self._latched = {topic: deque[_Message](maxlen=n) for topic, n in how.repeats.items()}
-        self._last = (0, 0)  # log and publish time of the newest message
         compression = ("zstd", "FILE") if how.compress_files else ("", "")
-        self._info = Info(how.distro, how.custom, compression)
+        self._info = Info(how.custom, compression)
         how.directory.mkdir(parents=True)
         self._file = self._opened()
         self._list()
@@ -79,10 +65,8 @@ class Bag:
         whole = self._info.whole
         whole.start = min(whole.start, log_time)
         whole.duration = max(whole.duration, log_time - whole.start)
-        self._put(_Message(topic, payload, log_time, publish_time))
-        if topic in self._latched:
-            self._latched[topic].append(_Message(topic, payload, log_time, publish_time))
-        self._last = (log_time, publish_time)
+        self._topics[topic].count += 1
+        self._file.message(topic, payload, log_time, publish_time)
 
     def close(self) -> None:
         self._flush()
@@ -100,10 +84,6 @@ class Bag:
             if error.errno not in DISK_FULL:
                 raise
 
-    def _put(self, message: _Message) -> None:
-        self._topics[message.topic].count += 1
-        self._file.message(message.topic, message.payload, message.log_time, message.publish_time)
-
     def _declare(self, topic: Topic) -> None:
         metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
         self._file.declare(topic.name, topic.type, full_text(topic.type), metadata)
@@ -120,25 +100,13 @@ class Bag:
         # The real recorder declares in the order of a hash table: ids differ between files.
         for topic in reversed(self._topics.values()):
             self._declare(topic)
-        self._repeat()
-
-    def _repeat(self) -> None:
-        """Lyrical gives the copies both times of the message before them, not their own."""
-        span = self._info.files[-1][1]
-        latched = (message for last in self._latched.values() for message in last)
-        for message in sorted(latched, key=lambda message: message.log_time):
-            self._put(_Message(message.topic, message.payload, *self._last))
-            span.count += 1
 
     def _flush(self) -> None:
         if self._how.cached:
             self._say("info", "rosbag2_cpp", _FLUSHING)
 
     def _opened(self) -> McapFile:
-        index, name = len(self._info.files), self._how.directory.name
-        self._name = f"{name}_{index}.mcap"
-        if self._how.distro == "lyrical":
-            self._name = f"{index}_{name}_{time.strftime('%Y_%m_%d-%H_%M_%S')}.mcap"
+        self._name = f"{self._how.directory.name}_{len(self._info.files)}.mcap"
         return McapFile(self._how.directory / self._name, self._how.layout)
 
     def _list(self) -> None:

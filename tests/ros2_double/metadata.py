@@ -44,7 +44,6 @@ class Topic:
 class Info:
     """What a recording is known to hold."""
 
-    distro: str
     custom: dict[str, str]
     compression: tuple[str, str] = ("", "")  # format and mode
     whole: Span = field(default_factory=Span)
@@ -81,7 +80,7 @@ def metadata_text(info: Info, topics: Iterable[Topic] = ()) -> str:
             f"relative_file_paths:\n{indent(paths, '  ')}",
             f"files:\n{indent(files, '  ')}",
             f"custom_data:\n{custom}" if custom else "custom_data: ~",
-            f"ros_distro: {info.distro}",
+            "ros_distro: jazzy",
         )
     )
 

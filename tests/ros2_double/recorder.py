@@ -31,7 +31,7 @@ _POLLING_S: Final = 0.1
 _DRAINING_S: Final = 0.1
 
 
-def record(options: Options, distro: str, signals: Signals) -> None:
+def record(options: Options, signals: Signals) -> None:
     """Records until a signal comes. The directory is complete when this returns.
 
     Raises:
@@ -40,7 +40,7 @@ def record(options: Options, distro: str, signals: Signals) -> None:
     """
     profiles = overrides(options.overrides)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    recorder = _Recorder(options, distro, profiles, signals)
+    recorder = _Recorder(options, profiles, signals)
     try:
         recorder.run()
     finally:
@@ -49,11 +49,8 @@ def record(options: Options, distro: str, signals: Signals) -> None:
 
 
 class _Recorder:
-    def __init__(
-        self, options: Options, distro: str, profiles: dict[str, Any], signals: Signals
-    ) -> None:
+    def __init__(self, options: Options, profiles: dict[str, Any], signals: Signals) -> None:
         self._options = options
-        self._distro = distro
         self._profiles = profiles
         self._signals = signals
         self._regex = re.compile(options.regex)
@@ -103,11 +100,9 @@ class _Recorder:
             directory=options.output,
             layout=options.layout,
             split_after_ns=options.duration_s * 10**9 or None,
-            distro=self._distro,
             custom=options.custom,
             compress_files=options.compress_files,
             cached=options.cached,
-            repeats=options.repeats,
         )
 
     def _greet(self) -> None:
@@ -216,9 +211,7 @@ class _Recorder:
 
     def _write(self, topic: str, payload: bytes, info: dict[str, int], now: int) -> None:
         log_time = now if self._options.use_sim_time else info["received_timestamp"]
-        # Humble has one time for both.
-        publish_time = log_time if self._distro == "humble" else info["source_timestamp"]
-        self._bag.write(topic, payload, log_time, publish_time)
+        self._bag.write(topic, payload, log_time, info["source_timestamp"])
 
     def _check(self, topic: str) -> None:
         publishers = self._node.get_publishers_info_by_topic(topic)

@@ -64,13 +64,12 @@ _WRAPPER: Final = """\
 #!/bin/sh
 # Test double of ROS 2's command line, made by a test.
 export PYTHONPATH='{root}'
-export ROS2_DOUBLE_DISTRO="${{ROS2_DOUBLE_DISTRO:-{distro}}}"
 exec '{python}' -P -m tests.ros2_double "$@"
 """
 _SETUP: Final = """\
 export PATH='{folder}/bin':"$PATH"
 export AMENT_PREFIX_PATH='{folder}'
-export ROS_DISTRO='{distro}' ROS_VERSION=2
+export ROS_DISTRO=jazzy ROS_VERSION=2
 """
 
 
@@ -99,14 +98,13 @@ def _require_double() -> None:
         pytest.skip(_NO_ROS)
 
 
-def write_workspace(folder: Path, distro: str = "jazzy") -> Path:
+def write_workspace(folder: Path) -> Path:
     """What an installed ROS has, as far as a recorder looks: the way to its `setup.bash`.
 
     `bin/ros2`, and the definitions of the message types that the wheels lack.
     """
     values = {
         "folder": folder,
-        "distro": distro,
         "root": ROOT,
         "python": ROS / "bin" / "python",
     }
@@ -127,9 +125,7 @@ def write_workspace(folder: Path, distro: str = "jazzy") -> Path:
 
 
 @contextmanager
-def ros_environment(
-    folder: Path, distro: str = "jazzy", *, real: RealRecorder | None = None
-) -> Iterator[dict[str, str]]:
+def ros_environment(folder: Path, *, real: RealRecorder | None = None) -> Iterator[dict[str, str]]:
     """An environment for subprocesses, see above; `folder` gets the workspace and the logs.
 
     At the end, files that Fast DDS left in shared memory since the start are removed, where no
@@ -137,11 +133,10 @@ def ros_environment(
 
     Args:
         folder: a folder of the test's own.
-        distro: which one the double is.
         real: the installation whose `ros2` it is; None: the double.
     """
     before = _shared_memory()
-    known = _of_double(folder / "ros", distro) if real is None else _of_real(real)
+    known = _of_double(folder / "ros") if real is None else _of_real(real)
     with _domain() as domain:
         try:
             yield {
@@ -154,14 +149,14 @@ def ros_environment(
             _remove_unused(_shared_memory() - before)
 
 
-def _of_double(workspace: Path, distro: str) -> dict[str, str]:
-    setup = write_workspace(workspace, distro)
+def _of_double(workspace: Path) -> dict[str, str]:
+    setup = write_workspace(workspace)
     kept = env_without_ros()
     return {
         **kept,
         "PATH": f"{workspace / 'bin'}{os.pathsep}{kept['PATH']}",
         "AMENT_PREFIX_PATH": str(workspace),
-        "ROS_DISTRO": distro,
+        "ROS_DISTRO": "jazzy",
         "ROS_VERSION": "2",
         "ROS2_LIVE_SETUP": str(setup),
         "ROS2_LIVE_PYTHON": str(ROS / "bin" / "python"),
