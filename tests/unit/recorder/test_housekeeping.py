@@ -13,7 +13,6 @@ from ros2_memory import queries
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import NoDataError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
@@ -291,15 +290,6 @@ class TestDeletionsThatFail:
         assert "b/b_0.mcap" not in files_in(tmp_path)
         assert size_of(tmp_path) <= 45_000
 
-    def test_that_the_budget_cannot_be_held_is_reported_once(self, tmp_path: Path) -> None:
-        recording(tmp_path, "b", 100, splits=1)
-        keeper = keeper_of(tmp_path, max_bytes=1)
-        with structlog.testing.capture_logs() as captured:
-            keeper.apply()
-            keeper.apply()
-        (reported,) = events(captured, "budget_not_held")
-        assert reported["total_bytes"] == size_of(tmp_path)
-
     def test_the_budget_names_what_takes_it_in_the_log_and_to_who_asks(
         self, tmp_path: Path
     ) -> None:
@@ -309,6 +299,7 @@ class TestDeletionsThatFail:
         keeper = keeper_of(tmp_path, max_bytes=1_000_000)
         assert keeper.status().counted_bytes is None
         with structlog.testing.capture_logs() as captured:
+            keeper.apply()
             keeper.apply()
         (reported,) = events(captured, "budget_not_held")
         assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
@@ -368,20 +359,6 @@ class TestMakingRoom:
 
 
 class TestInTheBackground:
-    def test_limits_are_applied_while_the_caller_goes_on(self, tmp_path: Path) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        keeper = background_keeper_of(tmp_path, max_bytes=1)
-        keeper.apply()
-        keeper.apply()
-        keeper.wait()
-        assert not first.exists()
-
-    def test_repair_is_waited_for(self, tmp_path: Path) -> None:
-        open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-        keeper = background_keeper_of(tmp_path)
-        keeper.repair()
-        assert McapReader().summarize(open_one).complete
-
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
         held, asked = threading.Event(), []
@@ -424,17 +401,6 @@ class TestInTheBackground:
 
 
 class TestQuestionsMeanwhile:
-    def test_a_question_under_way_over_a_bag_that_is_deleted_still_answers(
-        self, tmp_path: Path
-    ) -> None:
-        first, *_ = recording(tmp_path, "a", 0)
-        records = McapReader().records(first, ["/odom"], TimeWindow.everything())
-        begun = next(records)
-        keeper_of(tmp_path, max_bytes=1).apply()
-        assert not first.exists()
-        rest = list(records)
-        assert (begun.log_time, len(rest)) == (T0, 19)
-
     @pytest.mark.parametrize("kept", [1, 0])
     def test_what_was_known_before_answers_from_what_is_left_and_says_what_is_gone(
         self, tmp_path: Path, kept: int
@@ -509,3 +475,99 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
         recorded_before(tmp_path)
     keeper_of(tmp_path).repair()
     assert [each.by for each in read_losses(tmp_path, 0, MAX_NS)] == found
+
+
+def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
+    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+    empty = tmp_path / OWN / f"{OWN}_1.mcap"
+    empty.write_bytes(b"")
+    readable = McapReader().summarize(open_one).topics
+    with structlog.testing.capture_logs() as captured:
+        keeper_of(tmp_path, clock=later(0)).repair()
+    after = McapReader().summarize(open_one)
+    assert (after.complete, after.topics) == (True, readable)
+    assert not empty.exists()
+    (reported,) = events(captured, "bag_repaired")
+    assert reported["path"] == str(open_one)
+    assert reported["messages"] == after.count
+    assert reported["cut_bytes"] >= 0
+    newest = max(topic.last for topic in after.topics) / 1e9
+    assert f"the newest message is of {newest:.3f}; later ones that had not" in reported["reason"]
+    assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
+
+
+def test_a_metadata_file_of_no_bytes_is_no_last_word(tmp_path: Path) -> None:
+    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+    (tmp_path / OWN / "metadata.yaml").write_bytes(b"")
+    keeper_of(tmp_path).repair()
+    assert McapReader().summarize(open_one).complete
+
+
+def test_a_recording_that_the_dead_recorder_named_is_repaired_at_once(tmp_path: Path) -> None:
+    open_one = left_open(tmp_path / "rec" / "rec_0.mcap")
+    clock = later(0)
+    recording_now(tmp_path, "rec", clock=clock)
+    keeper_of(tmp_path, clock=clock).repair()
+    assert McapReader().summarize(open_one).complete
+
+
+def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
+    (tmp_path / OWN).mkdir()
+    (tmp_path / OWN / f"{OWN}_0.mcap").write_bytes(b"")
+    (tmp_path / OWN / "handover.json").write_text("{}")
+    keeper_of(tmp_path).repair()
+    assert files_in(tmp_path) == []
+
+
+def test_what_a_repair_left_that_was_cut_short_goes(tmp_path: Path) -> None:
+    left_open(tmp_path / OWN / f"{OWN}_0.mcap")
+    (tmp_path / OWN / f".{OWN}_0.mcap.repair").write_bytes(b"half")
+    keeper_of(tmp_path).repair()
+    assert files_in(tmp_path) == [OWN, f"{OWN}/{OWN}_0.mcap"]
+
+
+def test_a_recording_of_another_is_left_alone_until_it_lay_still(tmp_path: Path) -> None:
+    theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
+    clock = later(0)
+    keeper = keeper_of(tmp_path, clock=clock)
+    keeper.repair()
+    keeper.apply()
+    assert not McapReader().summarize(theirs).complete
+    clock.at += HOUR
+    keeper.apply()
+    assert McapReader().summarize(theirs).complete
+
+
+def test_a_file_that_a_process_holds_open_is_left_alone(tmp_path: Path) -> None:
+    theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
+    with theirs.open("rb"):
+        keeper_of(tmp_path).apply()
+    assert not McapReader().summarize(theirs).complete
+    keeper_of(tmp_path).apply()
+    assert McapReader().summarize(theirs).complete
+
+
+def test_splits_that_a_full_disk_cut_short_are_repaired_later_on(tmp_path: Path) -> None:
+    recording(tmp_path, OWN, 0)
+    cut = left_open(tmp_path / OWN / f"{OWN}_7.mcap", 50)
+    empty = tmp_path / OWN / f"{OWN}_8.mcap"
+    empty.write_bytes(b"")
+    keeper = keeper_of(tmp_path)
+    keeper.repair()
+    keeper.apply()
+    assert McapReader().summarize(cut).complete
+    assert not empty.exists()
+
+
+def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> None:
+    damaged = tmp_path / OWN / f"{OWN}_0.mcap"
+    damaged.parent.mkdir()
+    damaged.write_bytes(b"\x89MCAP")
+    keeper = keeper_of(tmp_path)
+    with structlog.testing.capture_logs() as captured:
+        keeper.apply()
+        keeper.apply()
+    (reported,) = events(captured, "bag_not_repaired")
+    assert reported["path"] == str(damaged)
+    assert "first 5 bytes" in reported["reason"]
+    assert damaged.read_bytes() == b"\x89MCAP"

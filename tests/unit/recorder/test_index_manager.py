@@ -132,13 +132,6 @@ def test_when_the_heartbeat_dies_a_still_bag_is_served_as_incomplete(yard: Yard)
     assert bag.state is BagState.INCOMPLETE
 
 
-def test_an_active_bag_is_served_once_it_lay_still_for_three_splits(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
-    yard.age(NOW)
-    assert yard.scan_after(30).bags == ()
-    assert _names(yard.scan_after(1).bags) == ["rec_0.mcap"]
-
-
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:
     for split in range(3):
         plain(yard.bag_dir / "rec" / f"rec_{split}.mcap", [split])
@@ -212,18 +205,6 @@ def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_
     plain(path, [1])
     yard.age()
     assert _names(yard.scan_after().bags) == ["rec_0.mcap", "rec_1.mcap"]
-
-
-def test_a_bag_directory_that_is_missing_is_a_problem_until_it_appears(tmp_path: Path) -> None:
-    yard = Yard(tmp_path / "bags")
-    snapshot = yard.index.snapshot()
-    assert (snapshot.bags, snapshot.latest) == ((), None)
-    assert "does not exist" in (snapshot.problem or "")
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
-    yard.age()
-    snapshot = yard.scan_after()
-    assert _names(snapshot.bags) == ["rec_0.mcap"]
-    assert snapshot.problem is None
 
 
 def test_a_bag_directory_that_is_unmounted_takes_its_bags_along(yard: Yard) -> None:

@@ -26,17 +26,6 @@ def write(splits: Splits, number: int, *topics: str, finish: bool = True) -> Non
     write_mcap(splits.directory / f"rec_1_{number}.mcap", messages, layout)
 
 
-def test_a_split_is_reported_once_when_it_closes(splits: Splits) -> None:
-    write(splits, 0, "/a", finish=False)
-    assert splits.observe(0) == SplitChanges()
-    write(splits, 0, "/a")
-    write(splits, 1, "/b", finish=False)
-    assert splits.observe(1).closed == ("rec_1_0.mcap",)
-    assert splits.observe(2) == SplitChanges()
-    assert splits.closed_names == {"rec_1_0.mcap"}
-    assert splits.names() == {"rec_1_0.mcap", "rec_1_1.mcap"}
-
-
 def test_splits_that_close_at_once_are_reported_in_the_order_of_recording(splits: Splits) -> None:
     """A directory lists its files in any order, and names are numbered without leading zeros."""
     for number in reversed(range(14)):
@@ -72,24 +61,3 @@ def test_a_directory_that_may_not_be_read_is_reported(splits: Splits) -> None:
     splits.directory.chmod(0)
     assert len(splits.observe(0).faults) == 1
     splits.directory.chmod(0o755)
-
-
-class Seconds(float):
-    """A moment that counts how often it is compared with another."""
-
-    compared = 0
-
-    def __gt__(self, other: float) -> bool:
-        Seconds.compared += 1
-        return float(self) > float(other)
-
-
-def test_a_look_does_not_compare_each_split_with_each(splits: Splits) -> None:
-    """A recording of a day has 8640 of them, and is looked at twice a second."""
-    splits.directory.mkdir()
-    for number in range(100):
-        (splits.directory / f"rec_1_{number}.mcap").touch()
-    splits.observe(Seconds(0))
-    Seconds.compared = 0
-    splits.observe(Seconds(1))
-    assert 0 < Seconds.compared <= 300

@@ -85,16 +85,6 @@ class TestSpace:
         world.run(2)
         assert world.heartbeat()["state"] == "paused"
 
-    def test_room_that_was_made_too_little_has_recording_pause(self, tmp_path: Path) -> None:
-        housekeeping = PlayedHousekeeper()
-        housekeeping.making = True
-        world = World(tmp_path, housekeeper=housekeeping).started(3)
-        world.free = 600
-        world.run(3)
-        housekeeping.making = False
-        world.run(2)
-        assert world.heartbeat()["state"] == "paused"
-
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
         world, _ = self.world(tmp_path)
         world.supervisor.start()

@@ -10,7 +10,12 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.recorder.sessions import Required
-from tests.support.simulated_recorders import World, assert_what_stands_counts_once, events
+from tests.support.simulated_recorders import (
+    PlayedHousekeeper,
+    World,
+    assert_what_stands_counts_once,
+    events,
+)
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
@@ -357,17 +362,6 @@ class TestShortfall:
         world.run(30)
         assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
 
-    def test_of_another_user_only_nodes_of_the_recorders_user_are_heard(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(tmp_path, advice=lambda: "look at the users")
-        world.defaults |= {"topics": ("/rosout", "/odom"), "heard": ("/rosout",)}
-        world.supervisor.start()
-        world.run(45)
-        beat = world.heartbeat()
-        assert beat["state"] == "waiting"
-        assert "look at the users" in beat["waiting_for"]
-
     def test_a_child_that_lives_and_writes_nothing_is_replaced_once(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.defaults["deaf"] = True
@@ -432,3 +426,45 @@ class TestChangedList:
         world.topics_path.write_text(whole)
         world.run(20)
         assert (len(world.recorders), world.heartbeat()["last_error"]) == (1, None)
+
+
+def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
+    tmp_path: Path,
+) -> None:
+    world = World(tmp_path, expected=("/odom", "/gone", "/bumper"))
+    world.defaults["topics"] = ("/bumper",)
+    world.supervisor.start()
+    assert world.heartbeat()["missing"] == []
+    world.run(7)
+    assert world.heartbeat()["missing"] == ["/gone", "/odom"]
+    world.defaults["topics"] = ("/odom",)
+    world.running[0].die()
+    world.run(10)
+    assert world.heartbeat()["missing"] == ["/gone"]
+
+
+def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path) -> None:
+    world = World(tmp_path).started(20)
+    world.running[0].die()
+    world.run(0.25)
+    beat = world.heartbeat()
+    assert "was killed" in beat["last_error"]
+    assert (beat["last_error_at"], beat["recovered"]) == (world.wall, False)
+    world.run(20)
+    later = world.heartbeat()
+    assert (later["last_error"], later["recovered"]) == (beat["last_error"], True)
+    assert later["last_error_at"] == beat["last_error_at"]
+
+
+def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
+    housekeeper = PlayedHousekeeper()
+    world = World(tmp_path, housekeeper=housekeeper).started()
+    housekeeper.failed = {"apply": "the list cannot be read"}
+    world.run(30)
+    assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (
+        "the list cannot be read",
+        False,
+    )
+    housekeeper.failed = {}
+    world.run(10)
+    assert world.heartbeat()["recovered"] is True

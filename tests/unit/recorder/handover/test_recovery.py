@@ -19,7 +19,6 @@ from ros2_memory.bag_dir.handover_file import (
     read_handover,
     write_handover,
 )
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat, write_heartbeat
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.handover.transfer import pending, void
 from ros2_memory.recorder.handover.union import intended, recover_handovers
@@ -186,30 +185,14 @@ def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: 
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(250)), 1)
 
 
-class TestWhileSomethingIsRecorded:
-    @pytest.fixture
-    def bag_dir(self, tmp_path: Path) -> Path:
-        """A handover that was cut short, and could not be settled when the recorder started."""
-        old = recording(tmp_path, "a", 0, 10, delay=5)
-        new = recording(tmp_path, "b", 8, 12, delay=9)
-        write_handover(old, intended(Handover(), "b"))
-        write_handover(new, pending("a"))
-        return tmp_path
-
-    def settle_beside(self, bag_dir: Path, running: str) -> None:
-        names = (running,)
-        beat = Heartbeat(1, T0, RecorderState.RECORDING, names, T0, 0, (), (), None, 5.0)
-        write_heartbeat(bag_dir, beat)
-        recover_handovers(bag_dir, READER, read_heartbeat(bag_dir).recordings)
-
-    def test_what_nobody_writes_is_completed(self, bag_dir: Path) -> None:
-        self.settle_beside(bag_dir, "c")
-        assert counted(bag_dir) == dict.fromkeys((T0 + n * S // 10 for n in range(120)), 1)
-
-    def test_a_recording_that_still_hands_over_is_left_alone(self, bag_dir: Path) -> None:
-        self.settle_beside(bag_dir, "a")
-        assert read_handover(bag_dir / "a").handover == intended(Handover(), "b")
-        assert read_handover(bag_dir / "b").handover == pending("a")
+def test_a_recording_that_still_hands_over_is_left_alone(tmp_path: Path) -> None:
+    old = recording(tmp_path, "a", 0, 10, delay=5)
+    new = recording(tmp_path, "b", 8, 12, delay=9)
+    write_handover(old, intended(Handover(), "b"))
+    write_handover(new, pending("a"))
+    recover_handovers(tmp_path, READER, ["a"])
+    assert read_handover(old).handover == intended(Handover(), "b")
+    assert read_handover(new).handover == pending("a")
 
 
 def test_one_whose_predecessor_was_deleted_is_settled(tmp_path: Path) -> None:

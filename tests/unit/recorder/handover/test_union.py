@@ -255,17 +255,6 @@ class TestWhenItIsDue:
         assert settle_handover(old, new, READER, running={"b"})
         assert_union(tmp_path)
 
-    def test_a_recorder_that_was_killed_before_does_it_at_its_next_start(
-        self, tmp_path: Path
-    ) -> None:
-        published = publications(13)
-        Recorder(0, 7.5).writes(tmp_path / "a", published)
-        Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)
-        hand_over(tmp_path, 5)
-        recover_handovers(tmp_path, READER)
-        assert read_handover(tmp_path / "a").handover.also_counts
-        assert_union(tmp_path)
-
     def test_a_disk_that_fails_is_no_missing_message(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

@@ -31,7 +31,6 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.retention import collect
-from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.delete import remove_bag
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
@@ -54,7 +53,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import HOUR, files_in, own_all
+from tests.support.housekeepers import HOUR, own_all
 from tests.support.memories import reply_over, shipped_extractor
 from tests.support.program import Program, exits
 
@@ -108,19 +107,20 @@ def house(
     now: int,
     *,
     max_age_h: float = 10**6,
-    max_bytes: int = 10**15,
     memory: MemoryDays | None = None,
+    monotonic: Callable[[], float] = time.monotonic,
 ) -> Housekeeping:
     return Housekeeping(
         bag_dir,
         BagDirReader(McapReader()),
         McapWriter(),
         SettableClock(now),
-        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=True),
+        RetentionLimits(10**15, round(max_age_h * HOUR), keeps_foreign=True),
         is_synchronised=lambda: True,
         split_duration_s=60.0,
         static_topics=("/tf_static",),
         moments_bytes=10**15,
+        monotonic=monotonic,
         memory=memory,
     )
 
@@ -153,6 +153,16 @@ def messages_in(path: Path) -> list[Record]:
     return list(reader.records(path, topics, TimeWindow.everything()))
 
 
+def labels_in(path: Path) -> set[str]:
+    reader = McapReader()
+    return {
+        seen.label
+        for record in messages_in(path)
+        if record.channel.topic == "/vision/scene/scene_objects"
+        for seen in reader.decode(record).detections  # type: ignore[attr-defined]
+    }
+
+
 @pytest.fixture
 def bag_dir(tmp_path: Path) -> Path:
     (tmp_path / "bags").mkdir()
@@ -173,36 +183,15 @@ def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> 
     assert McapReader().summarize(bag_dir / DAY_FILE).complete
 
 
-def test_texts_stay_of_topics_that_are_named(bag_dir: Path) -> None:
-    split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chat*",))), bag_dir)
-    said = [each for each in messages_in(bag_dir / DAY_FILE) if each.channel.topic == "/chatter"]
-    assert len(said) == 1
-
-
 def test_people_are_taken_out_unless_their_label_is_named(bag_dir: Path) -> None:
     split(bag_dir, 0, labels=("mug", "Person", "old man"))
     own_all(bag_dir)
     keep_all(days_of(bag_dir), bag_dir)
-    reader = McapReader()
-    seen = Counter(
-        one.label
-        for record in messages_in(bag_dir / DAY_FILE)
-        if record.channel.topic == "/vision/scene/scene_objects"
-        for one in reader.decode(record).detections  # type: ignore[attr-defined]
-    )
-    assert seen.keys() == {"mug"}
+    assert labels_in(bag_dir / DAY_FILE) == {"mug"}
     assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
     (bag_dir / DAY_FILE).unlink()
     keep_all(days_of(bag_dir, limits=MemoryLimits(labels=("Person",))), bag_dir)
-    seen = Counter(
-        one.label
-        for record in messages_in(bag_dir / DAY_FILE)
-        if record.channel.topic == "/vision/scene/scene_objects"
-        for one in reader.decode(record).detections  # type: ignore[attr-defined]
-    )
-    assert seen.keys() == {"mug", "Person"}
+    assert labels_in(bag_dir / DAY_FILE) == {"mug", "Person"}
 
 
 def camera(at: int, *frames: str) -> Msg:
@@ -238,14 +227,7 @@ def test_people_are_known_by_words_of_several_languages_and_those_that_are_named
     split(bag_dir, 0, labels=(*people, *things))
     own_all(bag_dir)
     keep_all(days_of(bag_dir, limits=MemoryLimits(people=("anna",))), bag_dir)
-    reader = McapReader()
-    seen = {
-        one.label
-        for record in messages_in(bag_dir / DAY_FILE)
-        if record.channel.topic == "/vision/scene/scene_objects"
-        for one in reader.decode(record).detections  # type: ignore[attr-defined]
-    }
-    assert seen == {*things}
+    assert labels_in(bag_dir / DAY_FILE) == {*things}
 
 
 def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> None:
@@ -627,7 +609,7 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     for nth in range(3):
         split(bag_dir, 60 * nth)
     own_all(bag_dir)
-    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chatter",))), bag_dir)
+    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chat*",))), bag_dir)
     for path in (bag_dir / "rec_A").iterdir():
         path.unlink()
     wanted = {"topic": "/chatter", "condition_type": "contains"}
@@ -638,44 +620,16 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     assert any("only some messages stayed" in note for note in never["notes"])
 
 
-def test_the_budget_does_not_wait_and_takes_the_rest_of_an_hour(bag_dir: Path) -> None:
-    for nth in range(80):
-        split(bag_dir, 60 * nth)
-    own_all(bag_dir)
-    total = sum(path.stat().st_size for path in (bag_dir / "rec_A").iterdir())
-    now = T0 + 5000 * S
-    house(bag_dir, now, max_bytes=round(0.97 * total), memory=days_of(bag_dir)).apply()
-    left = {path.name for path in (bag_dir / "rec_A").glob("*.mcap")}
-    assert left == {f"rec_A_{nth}.mcap" for nth in range(40, 80)}
-    assert (bag_dir / DAY_FILE).exists()
-
-
-def test_without_it_no_file_is_added_and_each_bag_goes_as_it_is_too_old(
-    bag_dir: Path, tmp_path: Path
-) -> None:
-    for nth in range(80):
-        split(bag_dir, 60 * nth)
-    split(bag_dir, 86_400 + 3000, name="rec_B")
-    own_all(bag_dir)
-    house(bag_dir, T0 + (86_400 + 3060) * S, max_age_h=24).apply()
-    assert not [name for name in files_in(bag_dir) if name.startswith("memory")]
-    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 30
-
-
 def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_dir: Path) -> None:
     for nth in range(80):
         split(bag_dir, 60 * nth)
     split(bag_dir, 86_400 + 3000, name="rec_B")
     own_all(bag_dir)
     monotonic = SettableClock(0)
-    keeper = Housekeeping(
+    keeper = house(
         bag_dir,
-        BagDirReader(McapReader()),
-        McapWriter(),
-        SettableClock(T0 + (86_400 + 3060) * S),
-        RetentionLimits(10**15, 24 * HOUR, keeps_foreign=True),
-        is_synchronised=lambda: True,
-        split_duration_s=60.0,
+        T0 + (86_400 + 3060) * S,
+        max_age_h=24,
         memory=days_of(bag_dir, writer=Failing(0)),
         monotonic=lambda: monotonic.now() / S,
     )
@@ -730,11 +684,3 @@ def test_days_of_earlier_versions_are_read(bag_dir: Path) -> None:
     seen = {"topic": "/vision/scene/scene_objects", "condition_type": "contains"}
     found = reply_over(bag_dir, "find_last_match", **seen, value="mug")
     assert found["value"]["detections"][0]["label"] == "mug"
-
-
-def test_clearing_at_the_start_takes_the_days_too(bag_dir: Path) -> None:
-    split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
-    clear_bags(bag_dir, OwnRecordings(bag_dir))
-    assert not [name for name in files_in(bag_dir) if name.endswith(".mcap")]

@@ -14,11 +14,10 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.memories import reply_over
-from tests.support.program import Program, exits
+from tests.support.program import exits
 from tests.unit.recorder.memory.test_days import (
     DAY_FILE,
     T0,
-    content_of,
     days_of,
     house,
     messages_in,
@@ -111,17 +110,6 @@ def test_a_moment_that_was_deleted_by_hand_leaves_no_memory_of_its_time(bag_dir:
     assert gone["error"] == "no_data", gone
     around = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 1150)
     assert around["from"] == "memory"
-
-
-def test_what_is_forgotten_of_a_topic_goes_from_moment_and_day(
-    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-) -> None:
-    house(bag_dir, NEWEST, max_age_h=12, memory=days_of(bag_dir)).apply()
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    given = ("--start", T0 / S, "--end", T0 / S + 3600, "--yes")
-    exits(0, "forget", "--topic", "/vision/*", *given)
-    for path in [bag_dir / DAY_FILE, *(bag_dir / "moments").rglob("*.mcap")]:
-        assert b"thing2" not in content_of(path)
 
 
 def test_nothing_can_be_saved_of_a_time_of_which_a_thinned_day_alone_is_left(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,11 +19,10 @@ from ros2_memory.recorder.memory.thinning import (
     MINUTE_NS,
     STANDING_NS,
     TopicThinning,
-    is_said,
     rounded,
 )
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, boolean, detections, make, odom, text, write_mcap
+from tests.support.bags import Msg, boolean, detections, make, odom, write_mcap
 from tests.support.memories import shipped_extractor
 
 S = 10**9
@@ -129,23 +128,6 @@ def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path)
             most = max(seen[n].count(label) for n in inside)
             assert max(seen[n].count(label) for n in inside if n in stays) == most
     assert len(stays) < 250
-
-
-@pytest.mark.parametrize(
-    ("make", "said"),
-    [
-        (lambda: text(T0, "hello"), True),
-        (lambda: odom(T0, 0.0, 0.0), False),
-        (lambda: detections(T0, ["mug"]), False),
-    ],
-)
-def test_messages_say_something_if_a_text_names_nothing(
-    tmp_path: Path, make: Callable[[], Msg], said: bool
-) -> None:
-    reader = McapReader()
-    path = write_mcap(tmp_path / "a.mcap", [make()])
-    [[table]] = decoded(reader, pieces(reader, path))
-    assert is_said(table) is said
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 6.28))

@@ -10,7 +10,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.installation import (
     advice_on_rmw,
     advice_on_silence,
-    advice_on_users,
     find_installation,
     setup_files_here,
 )
@@ -76,14 +75,3 @@ def test_what_zenoh_and_cyclone_need_is_said_of_them_alone() -> None:
     assert advice_on_rmw({}) is None
     assert advice_on_rmw({"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}) is None
     assert advice_on_silence({"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}) == zenoh
-
-
-def test_other_users_are_spoken_of_only_where_shared_memory_keeps_them_apart() -> None:
-    local, wide = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, {"RMW_IMPLEMENTATION": ""}
-    udp = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-    for env in (local, {**local, **udp}, wide):
-        advice = advice_on_users(env)
-        assert advice is not None
-        assert advice_on_silence(env) == advice
-    for env in (udp, {**local, "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}):
-        assert advice_on_users(env) is None

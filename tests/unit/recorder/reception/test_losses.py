@@ -122,26 +122,6 @@ def test_a_hole_between_two_splits_counts_and_only_once() -> None:
     assert counter.in_last_hour(loss.stop + HOUR_NS) == {}
 
 
-def test_what_the_other_recording_of_a_handover_has_is_not_lost() -> None:
-    old = progress([tick for tick in range(100) if not 40 <= tick < 50])
-    new = progress([tick for tick in range(20, 120) if tick != 70])
-    splits = {"old": old, "new": new}
-    for order in (("old", "new"), ("new", "old")):
-        counter = LossCounter()
-        for name in splits:
-            counter.begun(name)
-        losses = [loss for name in order for loss in counter.measured(name, splits[name])]
-        assert [*losses, *counter.flush()] == []
-
-
-def test_what_no_recording_has_is_lost_also_in_a_handover() -> None:
-    counter = LossCounter()
-    counter.measured("old", progress([tick for tick in range(100) if tick != 45]))
-    counter.measured("new", progress([*range(60, 160)]))
-    assert [loss.lost for loss in counter.flush()] == []
-    assert counter.in_last_hour(T0) == {"/odom": 1}
-
-
 @given(order=st.permutations(["old", "old", "old", "new", "new", "new"]), taken=st.booleans())
 def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
     order: list[str], taken: bool
