@@ -188,4 +188,4 @@ def test_every_message_is_read_where_counts_are_compared_with_the_files(tmp_path
     cut(tmp_path, T0 + 8 * S)
     reader = BagDirReader(McapReader(), tmp_path, every_message=True)
     assert reader.summarize(old).count == 20
-    assert len(list(reader.records(old, ["/bumper"], EVER))) == 20
+    assert len(list(reader.records(old, ["/bumper"], TimeWindow.everything()))) == 20

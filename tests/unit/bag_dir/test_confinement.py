@@ -341,13 +341,6 @@ class TestDeletions:
             directories.make(bags, bags / "moments/a/rec_0")
         assert contents(outside) == before
 
-    def test_a_repair_of_a_link_by_name_is_refused(self, bags: Path, outside: Path) -> None:
-        (outside / "rec_0.mcap").write_bytes(b"")
-        (bags / "x.mcap").symlink_to(outside / "rec_0.mcap")
-        with pytest.raises(BagError, match="not a regular file"):
-            build_repairer().repair(bags / "x.mcap")
-        assert (outside / "rec_0.mcap").exists()
-
     def test_a_store_behind_a_link_is_neither_written_nor_set_aside(
         self, bags: Path, outside: Path
     ) -> None:

@@ -54,8 +54,6 @@ FULL = Handover(
     notes=("a note",),
 )
 
-NO_BOUNDS = {"log_from_ns": None, "log_until_ns": None}
-
 
 def excluded(handover: Handover, file: str, publish_time: int, log_time: int) -> bool:
     return any(each.excludes(publish_time, log_time) for each in handover.exclusions(file))
@@ -131,16 +129,11 @@ class TestFile:
         [
             ({"format": 2}, "format is 2"),
             ({"state": "maybe"}, "state: Input should be 'counts', 'pending' or 'void'"),
-            ({"clock": "sun"}, "clock: Input should be 'publish' or 'log'"),
             ({"previous": "../elsewhere"}, "previous: Value error, it must be the name of"),
-            ({"previous": ""}, "previous: Value error, it must be the name of"),
-            ({"counts_from_ns": 1.5}, "counts_from_ns: Input should be a valid integer"),
             ({"counts_from_ns": True}, "counts_from_ns: Input should be a valid integer"),
             ({"counts_until_ns": 2**63}, "counts_until_ns: Input should be less than"),
             ({"begin": []}, "begin: Input should be a dictionary"),
             ({"end": {"files": "x"}}, "end.log_from_ns: Field required"),
-            ({"end": {**NO_BOUNDS, "files": "x"}}, "end.files: Input should be a valid tuple"),
-            ({"notes": [1]}, "notes.0: Input should be a valid string"),
         ],
     )
     def test_what_it_cannot_mean_is_told_and_then_everything_counts(

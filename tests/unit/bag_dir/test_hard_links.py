@@ -147,12 +147,3 @@ class TestOtherNames:
         outer = tmp_path / "a.mcap"
         os.link(recorded, outer)
         assert [bag.file for bag in memory.index.refresh().bags] == [str(outer)]
-
-    @pytest.mark.parametrize("name", [".x.mcap", ".x.db3", ".x.mcap.zstd", ".X.MCAP"])
-    def test_a_hidden_file_is_no_bag(self, tmp_path: Path, name: str) -> None:
-        recorded = write_mcap(tmp_path / "rec/rec_0.mcap", [odom(S, 1.0, 2.0)])
-        shutil.copy(recorded, tmp_path / "rec" / name)
-        (tmp_path / "rec/.y.mcap").symlink_to(recorded)
-        snapshot = memory_of(tmp_path).index.refresh()
-        assert [bag.file for bag in snapshot.bags] == [str(recorded)]
-        assert (snapshot.unread, snapshot.damaged) == ((), ())

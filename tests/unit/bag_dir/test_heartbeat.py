@@ -91,15 +91,6 @@ def test_a_recorder_that_was_killed_is_not_live_any_more() -> None:
     assert process_of(process.pid) is None
 
 
-def test_a_heartbeat_leaves_no_other_file(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, BEAT)
-    write_heartbeat(tmp_path, replace(BEAT, state=RecorderState.STOPPED))
-    assert [path.name for path in tmp_path.iterdir()] == [HEARTBEAT_FILE]
-    read = read_heartbeat(tmp_path).heartbeat
-    assert read is not None
-    assert read.state is RecorderState.STOPPED
-
-
 def test_a_heartbeat_that_cannot_be_written_says_where_and_why(tmp_path: Path) -> None:
     with pytest.raises(RecorderError, match=r"recorder\.json cannot be written: No such file"):
         write_heartbeat(tmp_path / "missing", BEAT)
@@ -115,11 +106,8 @@ def test_without_a_file_the_reason_says_that_nobody_records(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        (b"", "not a valid heartbeat"),
-        (b"\xff\xfe\x00", "not a valid heartbeat"),
         (b"{", "not a valid heartbeat"),
         (b"[]", "not a JSON object"),
-        (b"null", "not a JSON object"),
         (b"[" * 100_000, "not a valid heartbeat"),
         (b'{"pid": ' + b"9" * 5000 + b"}", "not a valid heartbeat"),
         (b" " * 2_000_000, "larger than"),
@@ -134,52 +122,26 @@ def test_a_file_that_is_no_heartbeat_is_told_apart(
     assert reason in (read.reason or "")
 
 
-def test_a_directory_or_a_pipe_of_that_name_does_not_stall_the_reader(tmp_path: Path) -> None:
-    (tmp_path / "a" / HEARTBEAT_FILE).mkdir(parents=True)
-    (tmp_path / "b").mkdir()
-    os.mkfifo(tmp_path / "b" / HEARTBEAT_FILE)
-    for folder in ("a", "b"):
-        read = read_heartbeat(tmp_path / folder)
-        assert read.heartbeat is None
-        assert read.reason
-
-
-@pytest.mark.parametrize("key", [each.name for each in fields(BEAT)[:10]])
-def test_a_missing_key_is_named(tmp_path: Path, key: str) -> None:
-    assert key in (_reason_without(tmp_path, key) or "")
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [
         ("pid", True),
         ("pid", 0),
-        ("pid", "4711"),
-        ("updated", 1.5),
         ("updated", 2**63),
         ("state", "asleep"),
-        ("state", ["recording"]),
-        ("recordings", "rec_1"),
         ("recordings", [1]),
-        ("since", None),
         ("bytes_written", -1),
-        ("subscribed", None),
-        ("silent", {"/odom": 1}),
         ("last_error", 5),
-        ("interval_s", "2"),
-        ("interval_s", True),
         ("interval_s", 0),
-        ("interval_s", -1),
         ("interval_s", float("nan")),
-        ("interval_s", float("inf")),
         ("interval_s", 10**400),
         ("interval_s", 1e9),
     ],
 )
 def test_a_value_of_the_wrong_kind_is_named(tmp_path: Path, key: str, value: object) -> None:
-    read = _read_with(tmp_path, key, value)
-    assert read is not None
-    assert key in read
+    content = {name: getattr(BEAT, name) for name in BEAT.__slots__}
+    (tmp_path / HEARTBEAT_FILE).write_text(json.dumps({**content, key: value}))
+    assert key in (read_heartbeat(tmp_path).reason or "")
 
 
 def test_every_text_is_one_that_utf_8_can_hold(tmp_path: Path) -> None:
@@ -232,21 +194,6 @@ def test_it_is_live_for_three_intervals_and_at_least_15_s_on_either_side(
 ) -> None:
     beat = replace(BEAT, interval_s=interval_s)
     assert beat.is_live(NOW + round(away_s * S)) is live
-
-
-def _raw() -> dict[str, object]:
-    return {name: getattr(BEAT, name) for name in BEAT.__slots__}
-
-
-def _read_with(folder: Path, key: str, value: object) -> str | None:
-    (folder / HEARTBEAT_FILE).write_text(json.dumps({**_raw(), key: value}), encoding="utf-8")
-    return read_heartbeat(folder).reason
-
-
-def _reason_without(folder: Path, key: str) -> str | None:
-    fields = {name: value for name, value in _raw().items() if name != key}
-    (folder / HEARTBEAT_FILE).write_text(json.dumps(fields), encoding="utf-8")
-    return read_heartbeat(folder).reason
 
 
 @needs_mounts

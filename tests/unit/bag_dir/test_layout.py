@@ -13,6 +13,7 @@ from ros2_memory.bag_dir.layout import (
     QOS_FILE,
     STORAGE_FILE,
     bag_kind,
+    has_own_name,
     node_name,
     recording_name,
 )
@@ -29,6 +30,9 @@ def test_a_name_that_is_taken_gets_a_number(tmp_path: Path) -> None:
         names.append(name.removeprefix("rec_20261120T050000Z"))
     assert names == ["", "_2", "_3", "_4"]
     assert recording_name(-1, tmp_path) == "rec_19691231T235959Z"
+    for path in tmp_path.iterdir():
+        assert has_own_name(path.name)
+        assert not has_own_name(f"{path.name}_x")
 
 
 def test_each_recording_has_a_node_of_its_own_with_a_valid_name(tmp_path: Path) -> None:

@@ -53,32 +53,6 @@ def restored(folder: Path) -> None:
     shutil.rmtree(aside)
 
 
-def spoil(path: Path, fault: str) -> None:
-    """Has a bag file damaged, or of a kind in which nothing that is embedded is looked for."""
-    data = bytearray(path.read_bytes())
-    if fault == "cut":
-        path.write_bytes(data[:40])
-    elif fault == "zeroed":
-        data[30:60] = bytes(30)
-        path.write_bytes(data)
-    elif fault == "flipped":  # the opcode of the record behind the header
-        data[8 + 9 + int.from_bytes(data[9:17], "little")] ^= 4
-        path.write_bytes(data)
-    elif fault == "db3":
-        path.unlink()
-        path.with_suffix(".db3").write_bytes(b"SQLite format 3\0")
-    elif fault == "compressed":
-        path.unlink()
-        path.with_name(path.name + ".zstd").write_bytes(b"\x28\xb5\x2f\xfd" + data[:50])
-    elif fault == "link":
-        path.rename(path.parents[1] / path.name)
-        path.symlink_to(path.parents[1] / path.name)
-    elif fault == "empty":
-        path.write_bytes(b"")
-    else:
-        path.unlink()
-
-
 def events_named(
     logs: list[MutableMapping[str, Any]], event: str
 ) -> list[MutableMapping[str, Any]]:
@@ -106,21 +80,6 @@ class TestWhatARecorderLists:
         world.run(2)
         assert lines(tmp_path)[-1]["inode"] == recorder.directory.stat().st_ino
         assert OwnRecordings(tmp_path).owns(recorder.directory)
-        world.supervisor.stop()
-
-    def test_both_recordings_of_a_handover(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20).started(60)
-        world.supervisor.stop()
-        made = [each.directory for each in world.recorders if each.directory.exists()]
-        assert len(made) > 2
-        own = OwnRecordings(tmp_path)
-        assert all(own.owns(directory) for directory in made)
-
-    def test_one_whose_child_dies_at_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(0.25)
-        world.recorders[0].die()
-        world.run(1)
-        assert OwnRecordings(tmp_path).owns(world.recorders[0].directory)
         world.supervisor.stop()
 
     def test_nothing_is_recorded_that_cannot_be_listed(self, tmp_path: Path) -> None:
@@ -204,13 +163,6 @@ class TestWhatARecorderLists:
 
 class TestWhatAKillLeaves:
     """The steps of a recording: list it, start the child, which makes it, list its directory."""
-
-    def test_where_no_directory_was_made_nothing_is_listed(self, tmp_path: Path) -> None:
-        own = claimed(tmp_path)
-        assert lines(tmp_path) == [{"bag_dir_id": own.bag_dir_id}]
-        own.begin(A)
-        claimed(tmp_path)
-        assert lines(tmp_path) == [{"bag_dir_id": own.bag_dir_id}]
 
     def test_made_and_its_directory_not_listed(self, tmp_path: Path) -> None:
         own = claimed(tmp_path)
@@ -401,22 +353,6 @@ class TestWithoutAList:
         [event] = events_named(logs, "recordings_not_adopted")
         assert (event["log_level"], event["recordings"], event["names"]) == ("warning", 2, [A, B])
         assert "ros2-memory adopt" in event["advice"]
-
-    def test_nothing_is_said_of_an_empty_folder(self, tmp_path: Path) -> None:
-        with structlog.testing.capture_logs() as logs:
-            claimed(tmp_path)
-        assert not events_named(logs, "recordings_not_adopted")
-
-    def test_what_is_being_recorded_stays_the_recorders(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(15)
-        (tmp_path / LIST_FILE).unlink()
-        world.run(0.5)
-        recording = world.recorders[0].directory
-        bags = [*recording.glob("*.mcap")]
-        own = claimed(tmp_path)
-        assert bags
-        assert all(map(own.owns_bag, bags))
-        world.supervisor.stop()
 
 
 class TestBags:

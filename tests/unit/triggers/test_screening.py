@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import itertools
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -95,13 +96,22 @@ class TestServing:
         bags.end()
         assert bags.seconds() == halves(0, 6)
 
-    def test_a_message_that_cannot_show_it_is_unknown_and_reported(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize(
+        ("said", "problem"),
+        [
+            (word(5, "/privacy_mode"), "/privacy_mode: the values hold no boolean"),
+            (replace(mode(5, value=False), body=b""), "the rule privacy: "),
+        ],
+        ids=["another type", "not decoded"],
+    )
+    def test_a_message_that_cannot_show_it_is_unknown_and_reported(
+        self, tmp_path: Path, said: Msg, problem: str
+    ) -> None:
         bags = ScreenedBags(tmp_path / "bags")
-        said = [mode(-2, value=False), word(5, "/privacy_mode")]
-        bags.split(bags.begin(0), [*said, *words(0, 10)])
+        bags.split(bags.begin(0), [mode(-2, value=False), said, *words(0, 10)])
         bags.end()
         assert bags.seconds() == halves(0, 4)
-        assert "/privacy_mode: the values hold no boolean" in (bags.screening.problem() or "")
+        assert problem in (bags.screening.problem() or "")
 
     def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected(
         self, tmp_path: Path
@@ -142,16 +152,6 @@ class TestServing:
         bags.end()
         assert bags.seconds() == halves(0, 5)
         assert (bags.screening.failing_rules(), bags.screening.problem()) == ((), None)
-
-    def test_a_message_that_cannot_be_decoded_is_unknown_and_reported(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        said = mode(5, value=False)
-        broken = type(said)(said.topic, said.type, said.log_time, b"")
-        bags.split(bags.begin(0), [mode(-2, value=False), broken, *words(0, 10)])
-        bags.step()
-        assert "the rule privacy: " in (bags.screening.problem() or "")
-        bags.end()
-        assert bags.seconds() == halves(0, 4)
 
 
 class TestRotations:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 from typing import TYPE_CHECKING
 
 import pytest
@@ -156,13 +155,6 @@ class TestOtherKinds:
         robot.close_all()
         assert robot.fired_at() == [T0 + 14 * S]
         assert robot.spans() == [(4, 17)]
-
-    def test_a_silence_within_one_split(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
-        robot.begin(T0)
-        robot.split([flag(0, False), *[text(T0 + n * S, "x") for n in range(1, 9)], flag(9, False)])
-        robot.close_all()
-        assert robot.fired_at() == [T0 + 5 * S]
 
     def test_a_recorder_that_was_off_is_no_silence(self, tmp_path: Path) -> None:
         robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
@@ -367,13 +359,3 @@ class TestFaults:
         robot.look()
         assert robot.spans() == [(1, 12), (15, 23)]
         assert (robot.record().fired, robot.record().moments) == (3, 2)
-
-
-def test_the_state_file_says_how_often_each_rule_fired(tmp_path: Path) -> None:
-    robot = watched(tmp_path)
-    robot.begin(T0)
-    robot.split(seconds(0, 10, {6}))
-    robot.close_all()
-    state = json.loads((robot.bag_dir / TRIGGERS_FILE).read_text())
-    assert state["rules"]["bumper"]["fired"] == 1
-    assert state["rules"]["bumper"]["last_fired"] == T0 + 6 * S
