@@ -229,23 +229,6 @@ class TestEnd:
         assert end_all([child]) == []
         assert child.exit_status() == status
 
-    def test_one_that_blocks_its_signals_is_ended_too(
-        self, tmp_path: Path, started: list[Child]
-    ) -> None:
-        body = "signal.pthread_sigmask(signal.SIG_BLOCK, range(1, 65))\nup()\nidle()"
-        child = start(started, program(tmp_path, body), patience=DEAFER)
-        lines_until(child, "up")
-        assert end_all([child]) == []
-        assert child.exit_status() == -signal.SIGKILL
-
-    def test_several_are_ended_side_by_side(self, tmp_path: Path, started: list[Child]) -> None:
-        path = program(tmp_path, "signal.signal(signal.SIGINT, signal.SIG_IGN)\nup()\nidle()")
-        children = [start(started, path, patience=DEAF) for _ in range(3)]
-        for child in children:
-            lines_until(child, "up")
-        assert end_all(children) == []
-        assert [child.exit_status() for child in children] == [-signal.SIGTERM] * 3
-
     def test_a_signal_in_the_first_moment_of_its_life_ends_it(
         self, tmp_path: Path, started: list[Child]
     ) -> None:

@@ -20,7 +20,6 @@ from typing import Any
 import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.model import TimeWindow
@@ -89,7 +88,6 @@ class Site:
         self.bag_dir = folder / "bags"
         self.topics = folder / "topics.yaml"
         self.topics.write_text("topics: [/odom, /tf]\n")
-        self.silent = folder / "silent"
         self.daemons: list[Daemon] = []
         programs = folder / "bin"
         programs.mkdir()
@@ -102,7 +100,6 @@ class Site:
         self.env = {
             **os.environ,
             "PATH": f"{programs}:{os.environ['PATH']}",
-            "STUB_SILENT": str(self.silent),
             "STUB_PERIOD_MS": str(PERIOD_NS // 10**6),
         }
 
@@ -316,33 +313,6 @@ def test_a_disk_with_too_little_room_pauses_recording_within_seconds(site: Site)
     assert daemon.stop() == 0
 
 
-def test_a_robot_that_falls_silent_has_its_last_words_closed(tmp_path: Path) -> None:
-    at_a_site(tmp_path, falls_silent)
-
-
-def falls_silent(site: Site) -> None:
-    daemon = site.run()
-    daemon.wait_for("split_closed", 5)
-    site.silent.touch()
-    daemon.wait_for("rotated")
-    first = daemon.recordings()[0]
-    until(lambda: {McapReader().closing(p) for p in first.glob("*.mcap")} == {Closing.CLOSED})
-    assert daemon.stop() == 0
-    assert published(site.bag_dir, counting=True) == dict.fromkeys(
-        published(site.bag_dir, counting=False), 1
-    )
-
-
-def test_a_recording_that_is_deleted_is_followed_by_another(site: Site) -> None:
-    daemon = site.run()
-    daemon.wait_for("split_closed")
-    (recording,) = daemon.recordings()
-    recording.rename(site.folder / "elsewhere")
-    daemon.wait_for("recording_vanished")
-    daemon.wait_for("recording", 2)
-    assert daemon.stop() == 0
-
-
 def test_the_service_manager_is_told(site: Site) -> None:
     address = site.folder / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
@@ -358,16 +328,6 @@ def test_the_service_manager_is_told(site: Site) -> None:
         while told != b"STOPPING=1":
             told = manager.recv(100)
         assert "NOTIFY_SOCKET" not in Path(f"/proc/{os.getpid()}/environ").read_text()
-
-
-def test_options_that_this_ros2_knows_are_used(site: Site) -> None:
-    site.env["STUB_OPTIONS"] = "--node-name --custom-data"
-    daemon = site.run()
-    argv = Path(f"/proc/{daemon.child}/cmdline").read_bytes().split(b"\0")
-    assert f"ros2_memory_{daemon.recordings()[0].name}".encode() in argv
-    assert b"recorded_by=ros2-memory" in argv
-    assert b"--disable-keyboard-controls" not in argv
-    assert daemon.stop() == 0
 
 
 def test_what_newer_distributions_can_do_is_asked_for(site: Site) -> None:
@@ -458,12 +418,6 @@ class TestRefusals:
         assert "refuses to delete bags" in message
         assert list(site.bag_dir.iterdir()) == []
 
-    def test_without_a_ros2_it_says_what_to_do(self, site: Site) -> None:
-        site.env["PATH"] = os.defpath
-        code, message = site.refusal()
-        assert code == 1
-        assert "recorder.setup_files" in message
-
     @pytest.mark.parametrize("cause", ["no ros2", "no setup file"])
     def test_a_start_that_is_refused_clears_nothing(self, site: Site, cause: str) -> None:
         old = site.bag_dir / "rec_old" / "rec_old_0.mcap"
@@ -477,11 +431,6 @@ class TestRefusals:
         code, message = site.refusal("recording.clear_on_startup=true", *setup)
         assert (code, "recorder.setup_files" in message) == (1, True)
         assert old.read_bytes() == b"old"
-
-    def test_a_setup_file_that_is_missing_is_named(self, site: Site) -> None:
-        code, message = site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
-        assert code == 1
-        assert f"{site.folder}/none.bash is not there" in message
 
     def test_a_bag_directory_that_cannot_be_made_is_named(self, site: Site) -> None:
         site.bag_dir.write_text("a file")
@@ -525,12 +474,3 @@ def test_recorder_none_names_what_set_it_and_is_no_failure_to_the_service_manage
         assert (code, manager.recv(100)) == (0, b"READY=1")
     assert "set by MEMORY_CONFIG_OVERRIDES" in message
     assert "such as robot" not in message
-
-
-def test_a_handover_names_both_recordings(site: Site) -> None:
-    daemon = site.run("recording.session_duration_s=1")
-    daemon.wait_for("rotated")
-    daemon.stop()
-    first, second = daemon.recordings()[:2]
-    assert read_handover(first).handover.next == second.name
-    assert read_handover(second).handover.previous == first.name

@@ -44,17 +44,6 @@ class TestSetupFiles:
             "/ros",
         )
 
-    def test_leave_our_own_environment_as_it_is(self, tmp_path: Path) -> None:
-        before = dict(os.environ)
-        robot_environment([setup_file(tmp_path, "a.bash", "export WAY=1 PATH=/x:$PATH")], LOGS)
-        assert dict(os.environ) == before
-
-    def test_what_was_there_passes_through(self, tmp_path: Path) -> None:
-        file = setup_file(tmp_path, "a.bash", "export FASTDDS_BUILTIN_TRANSPORTS=UDPv4\n")
-        env = robot_environment([file], LOGS, BASE)
-        assert env.items() >= BASE.items()
-        assert env["FASTDDS_BUILTIN_TRANSPORTS"] == "UDPv4"
-
     def test_values_with_newlines_and_bytes_of_any_kind_survive(self, tmp_path: Path) -> None:
         file = setup_file(tmp_path, "a.bash", "export ODD=$'a\\nB=b \\xff end'\n")
         env = robot_environment([file], LOGS, BASE)

@@ -6,8 +6,8 @@ that run side by side record the same messages, with the same publish times and 
 two real recorders do. It splits when a message comes, closes a split after opening the next, writes
 metadata.yaml at a clean end, and refuses a directory that exists.
 
-Environment: STUB_PERIOD_MS, STUB_SUBSCRIBE_S (when topics are subscribed to), STUB_SILENT (a file:
-while it exists nothing is published), STUB_OPTIONS (what the help lists besides the common ones).
+Environment: STUB_PERIOD_MS, STUB_SUBSCRIBE_S (when topics are subscribed to), STUB_OPTIONS (what
+the help lists besides the common ones).
 """
 
 from __future__ import annotations
@@ -86,7 +86,6 @@ def record(directory: Path, split_s: float, pattern: str) -> None:
     offered = ("/odom", "/tf", "/tf_static", LOST)
     topics = [topic for topic in offered if re.search(pattern, topic)]
     period = int(os.environ.get("STUB_PERIOD_MS", "10")) * 10**6
-    silent = Path(os.environ.get("STUB_SILENT", "/nonexistent"))
     directory.mkdir(parents=True)
     number = 0
     split = Split(directory / f"{directory.name}_0.mcap", topics)
@@ -101,8 +100,6 @@ def record(directory: Path, split_s: float, pattern: str) -> None:
         now = time.time_ns()
         tick = now // period
         for published in range((done + 1) * period, (tick + 1) * period, period):
-            if silent.exists():
-                continue
             if split.first is not None and now - split.first > split_s * 1e9:
                 number += 1
                 following = Split(directory / f"{directory.name}_{number}.mcap", topics)
