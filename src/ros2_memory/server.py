@@ -317,7 +317,7 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
                     tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
                 if shipped is not None:
                     tasks.start_soon(keep_fresh, shipped, lake_s, limiter)
-            if not fleet.grows:
+            if fleet.join is None:
                 return
             await anyio.sleep(lake_s)
             robots = await anyio.to_thread.run_sync(

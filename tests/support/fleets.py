@@ -39,6 +39,43 @@ LABELS: Final = ("mug", "scissors", "table")
 SEEN: Final = "/vision/scene/scene_objects"
 MOST_CHARS: Final = 10**6
 
+_AT: Final[dict[str, object]] = {"timestamp": START_S + 205, "tolerance_s": 200}
+_AGO: Final[dict[str, object]] = {"seconds_ago": 10}
+_SPAN: Final[dict[str, object]] = {"start": START_S, "end": START_S + 300}
+_FRAMES: Final[dict[str, object]] = {"parent": "map", "child": "base_link"}
+MUG: Final[dict[str, object]] = {
+    "topic": "/vision/*",
+    "condition_type": "contains",
+    "value": "mug",
+}
+CALLS: Final[dict[str, dict[str, object]]] = {
+    "get_topic_at_time": {"topic": "/is_docked", **_AT},
+    "get_topic_seconds_ago": {"topic": "/is_docked", **_AGO},
+    "get_topic_in_range": {"topic": "/is_docked", **_SPAN},
+    "get_topic_in_last": {"topic": "/is_docked", "seconds": 600},
+    "get_position_at": _AT,
+    "get_position_seconds_ago": _AGO,
+    "get_velocity_at": _AT,
+    "get_velocity_seconds_ago": _AGO,
+    "get_transform_at": {**_FRAMES, "timestamp": START_S + 205},
+    "get_transform_seconds_ago": {**_FRAMES, **_AGO},
+    "find_last_match": MUG,
+    "find_matches": MUG,
+    "get_value_when": {
+        "value_topic": "/odom",
+        "condition_topic": "/vision/*",
+        "condition_type": "contains",
+        "value": "mug",
+    },
+    "trajectory_summary": _SPAN,
+    "recent_trajectory_summary": {"seconds": 600},
+    "recap": _SPAN,
+    "compare": {**_SPAN, "start": START_S + 30, "with_start": START_S, "with_end": START_S + 30},
+    "visits": {"where": {"x": 1, "y": 2, "radius_m": 2}},
+}
+"""Arguments with which a tool answers about some seeded robot; others need none."""
+TOOLS: Final = [tool.name for tool in build_tools(QuerySettings())]
+
 
 @dataclass(frozen=True)
 class SeededRobot:

@@ -12,15 +12,13 @@ import math
 from collections import Counter
 from dataclasses import dataclass
 from heapq import merge
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import BagError, EpisodicError, QueryTimeoutError
-from ros2_memory.core.reply import JsonObject, Merging, with_notes
+from ros2_memory.core.reply import PLAIN, JsonObject, Key, Merging, with_notes
 from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import Ns, iso_local, unix_rounded_up
 from ros2_memory.results import (
-    AnswerWithNotes,
     Before,
     Comparison,
     DataTimeRange,
@@ -71,42 +69,19 @@ class RobotReply:
         return self.value if isinstance(self.value, dict) else {}
 
 
-class MergedRows(NamedTuple):
-    """How the rows of a tool's replies become one list, as the class of the replies declares it.
-
-    Attributes:
-        rows: by the key of the rows, that of their time; a row whose time is null goes on.
-        merging: of the other keys. Those that are added up are also listed by robot.
-        marks_more: whether `more` says that rows are left out.
-    """
-
-    rows: Mapping[str, str]
-    merging: Mapping[str, Merging] = MappingProxyType({})
-    marks_more: bool = False
-
-    @classmethod
-    def declared(cls, answer: type[AnswerWithNotes]) -> MergedRows:
-        """Returns what the keys of an answer say."""
-        return cls(
-            {key.name: key.row_time for key in answer.reply.all if key.row_time},
-            {key.name: key.merging for key in answer.reply.all if key.merging},
-            any(key.name == "more" for key in answer.reply.all),
-        )
-
-
 _TOTAL: Final = "total"
 AT_LEAST: Final = "at_least"
 """How many there are in a reply that did not count all, in place of the total."""
 MATCHES: Final = "matches"
 TOPICS: Final = "topics"
-MERGED_ROWS: Final[Mapping[str, MergedRows]] = {
-    "find_last_match": MergedRows({MATCHES: "timestamp"}),
-    "list_recorded_topics": MergedRows({TOPICS: "last_ts"}),
-    "find_matches": MergedRows.declared(Sightings),
-    "find_things": MergedRows.declared(Things),
-    "visits": MergedRows.declared(Visits),
+MERGED_ROWS: Final[Mapping[str, Sequence[Key]]] = {
+    "find_last_match": (PLAIN(MATCHES).along("timestamp"),),
+    "list_recorded_topics": (PLAIN(TOPICS).along("last_ts"),),
+    "find_matches": Sightings.reply.all,
+    "find_things": Things.reply.all,
+    "visits": Visits.reply.all,
 }
-"""The tools whose rows are merged."""
+"""The tools whose rows are merged, and the keys of their replies, which declare how."""
 
 SHORT_KEYS: Final[Mapping[str, tuple[str, ...]]] = {
     tool: tuple(key.name for answer in answers for key in answer.reply.short.keys)
@@ -175,21 +150,20 @@ def merged(
 
 
 def _rows(
-    rule: MergedRows, replies: Sequence[RobotReply], limit: int | None, *, oldest_first: bool
+    declared: Sequence[Key], replies: Sequence[RobotReply], limit: int | None, *, oldest_first: bool
 ) -> JsonObject:
     values = {reply.name: _as_rows(reply) for reply in replies}
-    key = next(
-        (key for key in rule.rows for value in values.values() if key in value),
-        next(iter(rule.rows)),
-    )
-    time_key = rule.rows[key]
+    times = {key.name: key.row_time for key in declared if key.row_time}
+    there = [key for key in times if any(key in value for value in values.values())]
+    key = (there or [*times])[0]
+    time_key, merging = times[key], {key.name: key.merging for key in declared if key.merging}
 
     def order(row: JsonObject) -> float:
-        is_going_on = row.get(time_key, 0) is None
-        time = math.inf if is_going_on else _number(row.get(time_key))
+        # A row whose time is null goes on.
+        time = math.inf if row.get(time_key, 0) is None else _number(row.get(time_key))
         return time if oldest_first else -time
 
-    names = {name for name, how in rule.merging.items() if how == "inherited"}
+    names = {name for name, how in merging.items() if how == "inherited"}
     inherited = {robot: _without(value, value.keys() - names) for robot, value in values.items()}
     found: list[JsonObject] = []
     for is_ahead in (False, True):
@@ -209,8 +183,8 @@ def _rows(
         return {**rows, "never": [*never]} if never else rows
     rest = {name: _without(value, {key, *names}) for name, value in values.items()}
     is_cut = len(found) > len(found[:limit]) or any(value.get("more") for value in values.values())
-    more: JsonObject = {"more": True} if rule.marks_more and is_cut else {}
-    return {**rows, **_rest(rule, replies, rest), **more}
+    marks_more = is_cut and any(key.name == "more" for key in declared)
+    return {**rows, **_rest(merging, replies, rest), **({"more": True} if marks_more else {})}
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -224,9 +198,12 @@ def _as_rows(reply: RobotReply) -> JsonObject:
 
 
 def _rest(
-    rule: MergedRows, replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
+    merging: Mapping[str, Merging], replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
 ) -> JsonObject:
-    """Returns what the replies have besides rows, and what of it is not the same for all."""
+    """Returns what the replies have besides rows, and what of it is not the same for all.
+
+    What is added up is also listed by robot.
+    """
     found: JsonObject = {}
     by_robot: dict[str, JsonObject] = {}
     # Times of robots whose clock is ahead are compared only where there are no others.
@@ -235,7 +212,7 @@ def _rest(
         if key in _LEFT_OUT:
             continue
         own = {name: value[key] for name, value in values.items() if key in value}
-        match rule.merging.get(key, "added" if key == AT_LEAST else ""):
+        match merging.get(key, "added" if key == AT_LEAST else ""):
             case "who":
                 found[key] = [name for name, is_so in own.items() if is_so]
             case "counted":
@@ -249,19 +226,14 @@ def _rest(
             case "" if len(own) == len(values) and len({*map(to_json_text, own.values())}) == 1:
                 found[key] = next(iter(own.values()))
             case how:
-                if how == "added":
-                    found |= _summed(key, own.values(), [*values.values()])
+                # Where a robot has not counted all, there is no total, but at least so many.
+                totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
+                is_counted = key != _TOTAL or not any(AT_LEAST in one for one in values.values())
+                if how == "added" and is_counted:
+                    found[key] = round(sum(map(_number, (*own.values(), *totals))), 2)
                 for name, value in own.items():
                     by_robot.setdefault(name, {})[key] = value
     return {**found, "by_robot": {**by_robot}} if by_robot else found
-
-
-def _summed(key: str, own: Iterable[JsonValue], values: Sequence[JsonObject]) -> JsonObject:
-    """Returns a key with its sum; no total where a robot has not counted all, but at least."""
-    if key == _TOTAL and any(AT_LEAST in value for value in values):
-        return {}
-    others = [value.get(_TOTAL) for value in values] if key == AT_LEAST else []
-    return {key: round(sum(map(_number, (*own, *others))), 2)}
 
 
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
@@ -299,7 +271,7 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
             every[reply.name] = [*map(dict(zip(own[1:], total, strict=True)).get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": every}
-    return table | _rest(MergedRows({}), replies, rest)
+    return table | _rest({}, replies, rest)
 
 
 def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

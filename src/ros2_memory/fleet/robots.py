@@ -208,11 +208,6 @@ class Fleet:
         """Has the robots by name; no two have one."""
         self.robots = {robot.name: robot for robot in given}
 
-    @property
-    def grows(self) -> bool:
-        """Whether robots may join."""
-        return self.join is not None
-
     def joined(self) -> Sequence[Robot]:
         """Returns the robots that were shipped to the lake for the first time since; adds them.
 
@@ -316,7 +311,10 @@ class FanOut:
                 else:
                     continue
                 del running[name]
-                _add_costs(own, call)
+                for stage, spent in [*own.stages.spent.items()]:
+                    call.stages.add(stage, spent)
+                call.used_active |= own.used_active
+                call.used_thinned |= own.used_thinned
         return {robot.name: done[robot.name] for robot in robots}
 
     def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
@@ -332,14 +330,6 @@ class FanOut:
             )
         self._is_done.pop(robot.name, None)
         return None
-
-
-def _add_costs(own: Call, call: Call) -> None:
-    """Adds what a robot's answer took to what the whole call did."""
-    for stage, spent in [*own.stages.spent.items()]:
-        call.stages.add(stage, spent)
-    call.used_active |= own.used_active
-    call.used_thinned |= own.used_thinned
 
 
 def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:

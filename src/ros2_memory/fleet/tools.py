@@ -9,7 +9,7 @@ from __future__ import annotations
 import threading
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory.core.errors import (
     EpisodicError,
@@ -107,15 +107,13 @@ def _described(tool: Tool) -> tuple[str, JsonObject]:
         needs = "Its name, or several (a, b); without it, all."
         shape = f"{{robots: [{{{ROBOT_NAME}, ...}}]}}"
         if tool.name in MERGED_ROWS:
-            key = next(iter(MERGED_ROWS[tool.name].rows))
+            key = next(key.name for key in MERGED_ROWS[tool.name] if key.row_time)
             name = f"{ROBOT_NAME}s" if key == TOPICS else ROBOT_NAME
             also = ", never: robots that never did" if key == MATCHES else ""
             shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
         text = f"{text} Of all robots: {shape}."
-    properties = tool.schema.get("properties")
-    known = properties if isinstance(properties, dict) else {}
     argument: JsonObject = {"type": "string", "description": needs}
-    return text, {**tool.schema, "properties": {ROBOT: argument, **known}}
+    return text, {**tool.schema, "properties": {ROBOT: argument, **tool.arguments}}
 
 
 def _asking(
@@ -189,7 +187,11 @@ class _FleetQuestion:
             )
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        limit, oldest_first = self._limit(), given.get("oldest_first") is True
+        wanted = given.get("limit")
+        if wanted is None:
+            wanted = self.tool.arguments.get("limit", {}).get("default")
+        limit = int(wanted) if isinstance(wanted, int | float) else None
+        oldest_first = given.get("oldest_first") is True
         page = _Page(limit, oldest_first=oldest_first)
         found = self.fan_out.ask(robots, partial(self._reply, now, page), call)
         replies = [reply for reply in found.values() if isinstance(reply, RobotReply)]
@@ -235,15 +237,6 @@ class _FleetQuestion:
         (reply, answer), lake = robot.asked(ask, call, lake_first=self.tool.name in OF_LAKE)
         begin = None if lake is None else _begin_of(self.given, answer, lake.latest)
         return replace(reply, lake=lake and lake.since(begin))
-
-    def _limit(self) -> int | None:
-        """Returns how many rows a call wants, all robots together."""
-        properties = self.tool.schema.get("properties")
-        schema = properties.get("limit") if isinstance(properties, dict) else None
-        default = schema.get("default") if isinstance(schema, dict) else None
-        given = self.given.get("limit")
-        limit = default if given is None else given
-        return int(limit) if isinstance(limit, int | float) else None
 
 
 @dataclass(eq=False)
@@ -291,10 +284,7 @@ def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None)
 def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:
     """Returns a robot's answer, in the thread that it is asked in."""
     with call.reading(memory.large):
-        answer = question(memory, call)
-    if isinstance(answer, OfRobot | OfFleet):
-        raise TypeError("a tool of one robot answered for several")
-    return answer
+        return cast("OneAnswer", question(memory, call))
 
 
 def _coordinates_in(given: Mapping[str, object]) -> str | None:

@@ -17,7 +17,7 @@ from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
-from tests.support.fleets import START_S, fleet_over, seeded, write_robot
+from tests.support.fleets import CALLS, TOOLS, fleet_over, seeded, write_robot
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -25,36 +25,6 @@ if TYPE_CHECKING:
 
 OTHER = "zq7"
 MINE = ("r1", "r3")
-AT: dict[str, object] = {"timestamp": START_S + 205, "tolerance_s": 200}
-SPAN: dict[str, object] = {"start": START_S, "end": START_S + 300}
-MUG: dict[str, object] = {"topic": "/vision/*", "condition_type": "contains", "value": "mug"}
-FRAMES: dict[str, object] = {"parent": "map", "child": "base_link"}
-ARGUMENTS: dict[str, dict[str, object]] = {
-    "get_topic_at_time": {"topic": "/is_docked", **AT},
-    "get_topic_seconds_ago": {"topic": "/is_docked", "seconds_ago": 10},
-    "get_topic_in_range": {"topic": "/is_docked", **SPAN},
-    "get_topic_in_last": {"topic": "/is_docked", "seconds": 600},
-    "get_position_at": AT,
-    "get_position_seconds_ago": {"seconds_ago": 10},
-    "get_velocity_at": AT,
-    "get_velocity_seconds_ago": {"seconds_ago": 10},
-    "get_transform_at": {**FRAMES, "timestamp": START_S + 205},
-    "get_transform_seconds_ago": {**FRAMES, "seconds_ago": 10},
-    "find_last_match": MUG,
-    "find_matches": MUG,
-    "get_value_when": {
-        "value_topic": "/odom",
-        "condition_topic": "/vision/*",
-        "condition_type": "contains",
-        "value": "mug",
-    },
-    "trajectory_summary": SPAN,
-    "recent_trajectory_summary": {"seconds": 600},
-    "recap": SPAN,
-    "compare": {**SPAN, "with_start": START_S - 300, "with_end": START_S},
-    "visits": {"where": "kitchen"},
-}
-"""Of some tools those that are answered; the others are asked without any."""
 HOSTILE: tuple[object, ...] = (
     OTHER,
     f"../{OTHER}",
@@ -132,14 +102,11 @@ def replies(
     return anyio.run(both)
 
 
-TOOLS = [each.name for each in build_tools(QuerySettings())]
-
-
 @pytest.mark.parametrize("tool", TOOLS)
 def test_a_reply_is_that_of_a_fleet_without_the_other(
     pair: tuple[Dispatcher, Dispatcher], tool: str
 ) -> None:
-    given = ARGUMENTS.get(tool, {})
+    given = CALLS.get(tool, {})
     with opened() as paths:
         for more in ({}, {"robot": "r1"}, {"robot": "r3", "limit": 1}, {"by": "hour"}):
             limited, alone = replies(pair, tool, {**given, **more})
@@ -153,7 +120,7 @@ def test_a_reply_is_that_of_a_fleet_without_the_other(
 def test_whatever_is_passed_as_robot_is_no_path_and_names_nobody(
     pair: tuple[Dispatcher, Dispatcher], tool: str
 ) -> None:
-    given = ARGUMENTS.get(tool, {})
+    given = CALLS.get(tool, {})
     with opened() as paths:
         for robot in HOSTILE:
             limited, alone = replies(pair, tool, {**given, "robot": robot})
