@@ -22,7 +22,8 @@ from ros2_memory.bag_dir.state_files import read_receipts
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.lease import holder_of
 from ros2_memory.lake.tables import NAMESPACE, TABLES
-from tests.support.lakes import START_S, location, write_bag
+from tests.support.fleets import START_S
+from tests.support.lakes import location, write_bag
 from tests.support.processes import until
 
 KILLS = 100

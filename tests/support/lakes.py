@@ -1,27 +1,39 @@
-"""A lake in a folder, and robots of a few messages whose bags are shipped into it."""
+"""A lake in a folder, and robots of a few messages: shipped into it, and asked over it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+from pyiceberg.catalog import Catalog
+from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.bag_dir.layout import LIST_FILE
+from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.store import FILE, ColumnStore
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 from ros2_memory.lake.files import Lake
+from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, lake_memory
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
-from ros2_memory.lake.warehouse import LakeLocation, location_of
+from ros2_memory.lake.upkeep import Tombstone
+from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation, location_of
+from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
-from tests.support.memories import memory_of, with_store
+from tests.support.fleets import NOW, START_S
+from tests.support.memories import extractor, memory_of, with_store
 
-START_S: Final = 1_795_161_600
 LATER: Final = (START_S + 86_400) * NS_PER_S
 
 
@@ -58,6 +70,7 @@ def shipping(
     *,
     messages: Sequence[str] = ("/chatter",),
     most_bags: int = 2,
+    tombstones: set[Tombstone] | None = None,
 ) -> Iterator[Shipper]:
     """What ships these robots' bags, two in each batch."""
     with location(folder).writable() as lake:
@@ -67,12 +80,13 @@ def shipping(
             FixedClock(LATER),
             messages=messages,
             most_bags=most_bags,
+            tombstones=tombstones or set(),
         )
 
 
-def ship(folder: Path, robots: Sequence[RobotBags], *, most_bags: int = 2) -> Shipped:
-    """One pass, as of a process that has just started."""
-    with shipping(folder, robots, most_bags=most_bags) as shipper:
+def ship(folder: Path, robots: Sequence[RobotBags], **how: Any) -> Shipped:
+    """One pass, as of a process that has just started; see `shipping`."""
+    with shipping(folder, robots, **how) as shipper:
         return shipper.run()
 
 
@@ -81,11 +95,16 @@ def ship_from(folder: Path, *names: str) -> Shipped:
     return ship(folder / "lake", [robot_bags(name, folder / name) for name in names or ("hall",)])
 
 
+def lake_rows(folder: Path, table: str) -> list[dict[str, Any]]:
+    """The rows of a table of the lake, in no order."""
+    with location(folder).writable() as lake:
+        found: list[dict[str, Any]] = lake.rows(table, AlwaysTrue()).to_pylist()
+    return found
+
+
 def lake_column(folder: Path, table: str, column: str) -> list[object]:
     """The values of a column of the lake, sorted by their text."""
-    with location(folder).writable() as lake:
-        found = lake.rows(table, AlwaysTrue(), (column,))
-    return sorted(found[column].to_pylist(), key=str)
+    return sorted((row[column] for row in lake_rows(folder, table)), key=str)
 
 
 def ship_and_ask(where: LakeLocation, folder: Path) -> None:
@@ -109,3 +128,70 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
         engine.close()
     assert [row["label"] for row in found] == ["cup", "cup"]
     assert len({row["bag_id"] for row in found}) == 2
+
+
+def lake_in(folder: Path) -> SqlCatalog:
+    """The catalogue of the lake in a folder."""
+    state_dir = location(folder).state_dir
+    state_dir.mkdir(parents=True, exist_ok=True)
+    return SqlCatalog(
+        "lake", uri=f"sqlite:///{state_dir}/{CATALOGUE_FILE}", warehouse=folder.as_uri()
+    )
+
+
+def lake_robots(
+    catalog: Catalog,
+    engine: LakeEngine,
+    names: Sequence[str],
+    stores: Path | None = None,
+    *,
+    days: int = 31,
+    most_bags: int = MOST_BAGS,
+    now: int = NOW,
+) -> dict[str, Memory]:
+    """The robots of a lake; with a folder for `stores` each has one."""
+    lake, clock, decoder = Lake(catalog, engine), FixedClock(now), McapReader()
+    return {
+        name: lake_memory(
+            LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags),
+            clock,
+            QuerySettings(),
+            extractor=extractor(),
+            decoder=decoder,
+            store=None
+            if stores is None
+            else ColumnStore([stores / name / FILE], decoder.definition),
+            large=LargeReads(),
+        )
+        for name in names
+    }
+
+
+def lake_robot(folder: Path, engine: LakeEngine, **how: Any) -> Memory:
+    """The robot `hall` of the lake in a folder; see `lake_robots`."""
+    return lake_robots(lake_in(folder), engine, ["hall"], **how)["hall"]
+
+
+def store_columns(memory: Memory) -> Filling:
+    """Fills the store of a lake's robot, as a server does; returns what filled it."""
+    bag_dir, limits = memory.index.bag_dir, StoreLimits(max_share=1.0)
+    filling = Filling(memory.columns, memory.reader, bag_dir, memory.clock, limits, are_files=False)
+    timeline = memory.index.snapshot().timeline
+    for batch in filling.batches(timeline):
+        assert filling.fill(batch, timeline) == len(batch.bags)
+    make_fragments(memory, filling.whole_since())
+    filling.thin()
+    assert filling.progress(timeline).stored == len(timeline.bags)
+    return filling
+
+
+def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False, now: int = NOW) -> Fleet:
+    """The fleet of some memories."""
+
+    def same(memory: Memory) -> Memory:
+        return memory
+
+    robots = [
+        Robot(name, Path("/") / name, partial(same, memory)) for name, memory in memories.items()
+    ]
+    return Fleet(robots, FixedClock(now), shared_map=shared_map)

@@ -13,7 +13,7 @@ from pathlib import Path
 from pyiceberg.catalog.rest import CreateTableRequest
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.exceptions import CommitFailedException, NoSuchTableError
-from pyiceberg.table import CommitTableRequest, Table
+from pyiceberg.table import CommitTableRequest
 
 
 class _Requests(BaseHTTPRequestHandler):
@@ -27,75 +27,64 @@ class _Requests(BaseHTTPRequestHandler):
         """Logs nothing."""
 
     def do_GET(self) -> None:
-        with self._lock:
-            match self._parts():
-                case ["config"]:
-                    self._reply(200, {"defaults": {}, "overrides": {}})
-                case ["namespaces", name]:
-                    known = (name,) in self._catalog.list_namespaces()
-                    self._reply(200 if known else 404, {"namespace": [name], "properties": {}})
-                case ["namespaces", name, "tables", table]:
-                    self._reply_table(name, table)
-                case _:
-                    self._reply(404, {})
+        status = 404
+        content: object = {"error": {"message": "none", "type": "NoSuch", "code": status}}
+        body = self.rfile.read(int(self.headers.get("Content-Length", 0)))
+        try:
+            with self._lock:
+                status, content = self._answer(body) or (status, content)
+        except NoSuchTableError:
+            pass
+        except CommitFailedException as error:
+            status = 409
+            content = {"error": {"message": str(error), "type": "Conflict", "code": status}}
+        data = json.dumps(content).encode()
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
 
     def do_POST(self) -> None:
-        body = self.rfile.read(int(self.headers["Content-Length"]))
-        with self._lock:
-            match self._parts():
-                case ["namespaces"]:
-                    asked = json.loads(body)["namespace"]
-                    is_new = tuple(asked) not in self._catalog.list_namespaces()
-                    self._catalog.create_namespace_if_not_exists(tuple(asked))
-                    self._reply(200 if is_new else 409, {"namespace": asked})
-                case ["namespaces", name, "tables"]:
-                    request = {"location": None, **json.loads(body)}
-                    self._create(name, CreateTableRequest.model_validate(request))
-                case ["namespaces", name, "tables", table]:
-                    self._commit(name, table, CommitTableRequest.model_validate_json(body))
-                case _:
-                    self._reply(404, {})
+        self.do_GET()
 
-    def _create(self, namespace: str, asked: CreateTableRequest) -> None:
-        if asked.partition_spec is None or asked.write_order is None:
-            self._reply(400, {})
-            return
-        self._catalog.create_table(
-            f"{namespace}.{asked.name}",
-            asked.table_schema,
-            partition_spec=asked.partition_spec,
-            sort_order=asked.write_order,
-            properties=asked.properties,
-        )
-        self._reply_table(namespace, asked.name)
+    def _answer(self, body: bytes) -> tuple[int, object] | None:
+        catalog, parts = self._catalog, self.path.partition("?")[0].split("/")[2:]
+        found: tuple[int, object] | None = None
+        match self.command, *parts:
+            case "GET", "config":
+                found = 200, {"defaults": {}, "overrides": {}}
+            case "GET", "namespaces", name if (name,) in catalog.list_namespaces():
+                found = 200, {"namespace": [name], "properties": {}}
+            case "POST", "namespaces":
+                asked = json.loads(body)["namespace"]
+                is_new = tuple(asked) not in catalog.list_namespaces()
+                catalog.create_namespace_if_not_exists(tuple(asked))
+                found = 200 if is_new else 409, {"namespace": asked}
+            case "POST", "namespaces", name, "tables":
+                new = CreateTableRequest.model_validate({"location": None, **json.loads(body)})
+                assert new.partition_spec is not None
+                assert new.write_order is not None
+                catalog.create_table(
+                    f"{name}.{new.name}",
+                    new.table_schema,
+                    partition_spec=new.partition_spec,
+                    sort_order=new.write_order,
+                    properties=new.properties,
+                )
+                found = self._table(f"{name}.{new.name}")
+            case "POST", "namespaces", name, "tables", known:
+                commit = CommitTableRequest.model_validate_json(body)
+                table = catalog.load_table(f"{name}.{known}")
+                catalog.commit_table(table, commit.requirements, commit.updates)
+                found = self._table(f"{name}.{known}")
+            case "GET", "namespaces", name, "tables", known:
+                found = self._table(f"{name}.{known}")
+        return found
 
-    def _commit(self, namespace: str, name: str, asked: CommitTableRequest) -> None:
-        table = self._catalog.load_table(f"{namespace}.{name}")
-        try:
-            self._catalog.commit_table(table, asked.requirements, asked.updates)
-        except CommitFailedException as error:
-            self._reply(409, {"error": {"message": str(error), "type": "Conflict", "code": 409}})
-            return
-        self._reply_table(namespace, name)
-
-    def _reply_table(self, namespace: str, name: str) -> None:
-        try:
-            table: Table = self._catalog.load_table(f"{namespace}.{name}")
-        except NoSuchTableError as error:
-            self._reply(404, {"error": {"message": str(error), "type": "NoSuch", "code": 404}})
-            return
+    def _table(self, name: str) -> tuple[int, object]:
+        table = self._catalog.load_table(name)
         metadata = json.loads(table.metadata.model_dump_json())
-        self._reply(200, {"metadata-location": table.metadata_location, "metadata": metadata})
-
-    def _parts(self) -> list[str]:
-        return self.path.partition("?")[0].split("/")[2:]
-
-    def _reply(self, status: int, content: object) -> None:
-        body = json.dumps(content).encode()
-        self.send_response(status)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
+        return 200, {"metadata-location": table.metadata_location, "metadata": metadata}
 
 
 @contextmanager

@@ -57,15 +57,7 @@ ROBOT: Final = "robot"
 _AHEAD_NS: Final[Ns] = 60 * NS_PER_S
 """Data that is newer than now by more was dated by a clock that runs ahead."""
 OF_LAKE: Final = frozenset(
-    {
-        "find_last_match",
-        "find_matches",
-        "find_things",
-        "visits",
-        "recap",
-        "trajectory_summary",
-        "recent_trajectory_summary",
-    }
+    {"find_last_match", "find_matches", "find_things", "visits", "recap", *TABLE_FOR_ALL}
 )
 """The tools that ask a lake first, where there is one."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})

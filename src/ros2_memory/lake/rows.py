@@ -68,7 +68,7 @@ _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
 
 
-def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
+def bag_id_of(robot: str, recording: str, file: str, first: Ns) -> str:
     """Returns the id of a bag: of its robot, its recording, its file's name and its first message.
 
     So it is the same wherever the bag is copied to, also into a saved moment, and another one for
@@ -77,11 +77,6 @@ def bag_id_of(robot: str, bag: BagFile, first: Ns) -> str:
     file, whether it counts there or in another recording. The id begins with it, so that the files
     of a table that can hold a bag are few: ids of one time lie side by side.
     """
-    return id_of_file(robot, bag.recording.name, bag.path.name, first)
-
-
-def id_of_file(robot: str, recording: str, file: str, first: Ns) -> str:
-    """Returns the id of a bag that need not be there any more; see `bag_id_of`."""
     return f"{max(first, 0):016x}{_digest([robot, recording, file, first])}"
 
 

@@ -358,7 +358,9 @@ class RobotBags:
             summary = self.reader.summarize(bag.path)
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
-            seen = _Seen(state, bag_id_of(self.name, bag, summary.start))
+            seen = _Seen(
+                state, bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
+            )
             self._seen[bag.file] = seen
         return seen
 
@@ -366,8 +368,9 @@ class RobotBags:
         """Returns whether a bag has a message that was forgotten; it is read for that once."""
         if seen.is_forgotten is None:
             seen.is_forgotten = any(
-                tombstone.forbids(self.memory.reader, self.name, bag, seen.bag_id)
+                tombstone.forbids(self.memory.reader, bag, seen.bag_id)
                 for tombstone in tombstones
+                if tombstone.robot == self.name
             )
         return seen.is_forgotten
 

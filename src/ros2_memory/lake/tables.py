@@ -121,7 +121,8 @@ class LakeTable:
         for row in rows:
             # `time` repeats the first time, in microseconds.
             more = {"time": cast("int", row[first]) // _NS_PER_US} if first else {}
-            whole.append({"topic_key": topic_key(str(row.get("topic", ""))), **more, **row})
+            key = str(row.get("topic", "")).strip("/").replace("/", ".")
+            whole.append({"topic_key": key, **more, **row})
         try:
             found = pa.Table.from_pylist(whole, self.arrow_schema)
         except UnicodeEncodeError:
@@ -189,11 +190,6 @@ class ShippedBag(NamedTuple):
     made_of: str
     start_ns: Ns
     end_ns: Ns
-
-
-def topic_key(topic: str) -> str:
-    """Returns a topic without slashes: `/vision/objects` is `vision.objects`."""
-    return topic.strip("/").replace("/", ".")
 
 
 def day_of(time_ns: Ns) -> date:

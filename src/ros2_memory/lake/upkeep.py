@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, replace
-from itertools import groupby
-from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
@@ -28,7 +26,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.files import Partitions
-from ros2_memory.lake.rows import id_of_file
+from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
@@ -85,18 +83,18 @@ def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[
         for day, files in days.items()
         if day < closed and len(files) > FEW_FILES
     )
-    for day, of_day in groupby(sizes, itemgetter(0)):
-        robots: list[str] = []
-        total = 0
-        for _, robot, size in of_day:
-            if robots and (total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS):
-                yield day, robots
-                robots, total = [], 0
-            if size <= _MOST_BYTES:
-                robots.append(robot)
-                total += size
-        if robots:
-            yield day, robots
+    robots: list[str] = []
+    of_day, total = closed, 0
+    for day, robot, size in sizes:
+        is_full = total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS
+        if robots and (day != of_day or is_full):
+            yield of_day, robots
+            robots, total = [], 0
+        if size <= _MOST_BYTES:
+            robots.append(robot)
+            of_day, total = day, total + size
+    if robots:
+        yield of_day, robots
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
@@ -184,17 +182,15 @@ class Tombstone:
     @classmethod
     def of(cls, robot: str, forgetting: Forgetting) -> Tombstone:
         """Returns what a robot's bag directory asks for."""
-        ids = [id_of_file(robot, *astuple(bag)) for bag in forgetting.bags]
+        ids = [bag_id_of(robot, *astuple(bag)) for bag in forgetting.bags]
         return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
 
-    def forbids(self, reader: BagReader, robot: str, bag: BagFile, bag_id: str) -> bool:
-        """Returns whether a bag has a message that was forgotten.
+    def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
+        """Returns whether a bag of the robot has a message that was forgotten.
 
         Raises:
             BagError: it cannot be read.
         """
-        if robot != self.robot:
-            return False
         if self.bags:
             return bag_id in self.bags
         if not self.window.overlaps(bag.start, bag.end):

@@ -167,24 +167,20 @@ class LakeLocation:
             return None if newest is None else newest.timestamp_ms * NS_PER_MS
 
 
+@dataclass(frozen=True, slots=True)
 class LakeTables:
-    """The tables of an open lake. Each call takes their newest versions.
+    """The tables of an open lake: all of `TABLES`. Each call takes their newest versions.
 
     A commit is pyiceberg's: it compares and swaps, and what it replaces is one transaction.
-
-    Args:
-        location: of the lake.
-        tables: all of `TABLES`.
     """
 
-    def __init__(self, location: LakeLocation, tables: Mapping[str, IcebergTable]) -> None:
-        self.location = location
-        self._tables = tables
+    location: LakeLocation
+    tables: Mapping[str, IcebergTable]
 
     @property
     def lake_id(self) -> str:
         """The id of the lake: another one where its tables were created again."""
-        return str(self._tables["bags"].metadata.table_uuid)
+        return str(self.tables["bags"].metadata.table_uuid)
 
     def current(self, name: str) -> IcebergTable:
         """Returns a table as it is now.
@@ -193,14 +189,14 @@ class LakeTables:
             LakeError: the lake cannot be read; so do all others.
         """
         with self.location.translated(f"reading the lake's {name}"):
-            return self._tables[name].refresh()
+            return self.tables[name].refresh()
 
     def rows(
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
     ) -> pa.Table:
         """Returns the rows of which a condition is true."""
         with self.location.translated(f"reading the lake's {name}"):
-            return self._tables[name].refresh().scan(condition, selected_fields=columns).to_arrow()
+            return self.tables[name].refresh().scan(condition, selected_fields=columns).to_arrow()
 
     def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
         """Replaces rows by others, in one transaction."""

@@ -80,43 +80,6 @@ def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> Non
     assert "total" not in found
 
 
-def test_what_is_not_in_rows_is_added_up_inherited_or_asked_of_whom() -> None:
-    def of(name: str, frame: str, count: int) -> RobotReply:
-        things: list[Any] = [{"label": "mug", "last_seen": 1.0}]
-        return RobotReply(
-            name, {"frame_id": frame, "things": things, "total": 1, "labels": {"mug": count}}
-        )
-
-    found = reply_of("find_things", [of("r1", "map", 2), of("r2", "odom", 1)])
-    assert [row["frame_id"] for row in found["things"]] == ["map", "odom"]
-    assert found["labels"] == {"mug": 3}
-    assert "frame_id" not in found
-
-    def stay(name: str, arrived: float, departed: float | None) -> RobotReply:
-        row: dict[str, Any] = {"arrived": arrived, "departed": departed}
-        value: Any = {"there_now": departed is None, "visits": [row], "total": 1, "minutes": 1.5}
-        return RobotReply(name, value)
-
-    # A stay that goes on is the newest.
-    found = reply_of("visits", [stay("r1", 8.0, 9.0), stay("r2", 1.0, None)])
-    assert [row["robot_name"] for row in found["visits"]] == ["r2", "r1"]
-    assert (found["there_now"], found["minutes"]) == (["r2"], 3)
-
-
-def test_a_topic_has_one_row_with_the_robots_that_record_it() -> None:
-    def row(topic: str, first: float, last: float, count: int) -> dict[str, Any]:
-        return {"topic": topic, "type": "x", "first_ts": first, "last_ts": last, "count": count}
-
-    replies = [
-        RobotReply("r1", [row("/odom", 1.0, 5.0, 10), row("/tf", 1.0, 4.0, 1)], latest=5),
-        RobotReply("r2", [row("/odom", 2.0, 9.0, 20)], latest=9),
-    ]
-    assert reply_of("list_recorded_topics", replies)["topics"] == [
-        {**row("/odom", 1.0, 9.0, 30), "robot_names": ["r2", "r1"]},
-        {**row("/tf", 1.0, 4.0, 1), "robot_names": ["r1"]},
-    ]
-
-
 def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
     gone = RefusedError("the disk is gone")
     failures = {"r1": gone, "r2": QueryTimeoutError("too slow"), "r3": gone}

@@ -5,6 +5,7 @@ The oracle is a server of each robot alone.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -107,22 +108,20 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
             assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
 
 
-@pytest.mark.parametrize("tool", ["find_matches", "find_things", "visits"])
 def test_a_robot_that_recorded_nothing_then_is_named_and_the_others_answer(
-    tmp_path: Path, tool: str
+    tmp_path: Path,
 ) -> None:
     for name, shift_s in (("early", 0), ("late", 300)):
         write_robot(replace(seeded(name), start_s=START_S + shift_s), tmp_path / name)
     fleet = fleet_over(tmp_path, ("early", "late"), shared_map=True)
-    asked_of: dict[str, dict[str, object]] = {"find_matches": MUG, "visits": {"x": 1, "y": 2}}
-    given = asked_of.get(tool, {})
-    window = {"start": START_S, "end": START_S + LENGTH_S}
-    found = reply(fleet, tool, {**given, **window})
-    assert "error" not in found
-    [note] = [each for each in found["notes"] if each.startswith("no answer of")]
-    assert note.startswith("no answer of late: nothing was recorded between")
-    nobody = reply(fleet, tool, {**given, "start": START_S + 200, "end": START_S + 250})
-    assert (nobody["error"], nobody["reason"]) == ("no_data", "outside_range")
+    span = {"start": START_S, "end": START_S + LENGTH_S}
+    for tool in ("find_matches", "find_things", "visits"):
+        given = CALLS.get(tool, {})
+        found = reply(fleet, tool, {**given, **span})
+        [note] = [note for note in found["notes"] if note.startswith("no answer of")]
+        assert note.startswith("no answer of late: nothing was recorded between")
+        nobody = reply(fleet, tool, {**given, "start": START_S + 200, "end": START_S + 250})
+        assert (nobody["error"], nobody["reason"]) == ("no_data", "outside_range")
 
 
 def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(folder: Path) -> None:
@@ -151,15 +150,41 @@ def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(folder: Pa
 def test_rows_of_all_are_the_newest_of_the_rows_of_each(
     folder: Path, name: str, rows: str, newest: Callable[[Any], float], limit: int
 ) -> None:
-    fleet = fleet_over(folder, NAMES, shared_map=True)
-    found = reply(fleet, name, CALLS.get(name, {}))
-    each = {robot: alone(folder, robot, name, CALLS.get(name, {})) for robot in NAMES}
-    times = sorted((newest(row) for one in each.values() for row in one[rows]), reverse=True)
+    given = CALLS.get(name, {})
+    found = reply(fleet_over(folder, NAMES, shared_map=True), name, given)
+    own = {robot: alone(folder, robot, name, given) for robot in NAMES}
+    times = sorted((newest(row) for one in own.values() for row in one[rows]), reverse=True)
     assert [newest(row) for row in found[rows]] == times[:limit]
-    assert found["total"] == sum(one["total"] for one in each.values())
+    for key in {"total", "minutes"} & found.keys():
+        assert found[key] == pytest.approx(sum(one[key] for one in own.values()))
+    labels = sum((Counter(one.get("labels", {})) for one in own.values()), Counter[str]())
+    assert found.get("labels", {}) == labels
+    there = {robot for robot, one in own.items() if one.get("there_now")}
+    assert {*found.get("there_now", ())} == there
     for row in found[rows]:
-        own = {key: value for key, value in row.items() if key not in {"robot_name", "frame_id"}}
-        assert own in each[row["robot_name"]][rows]
+        one = own[row.pop("robot_name")]
+        assert row.pop("frame_id", None) == one.get("frame_id")
+        assert row in one[rows]
+
+
+def test_a_topic_has_one_row_with_the_robots_that_record_it(folder: Path) -> None:
+    found = reply(fleet_over(folder, NAMES), "list_recorded_topics", {})["topics"]
+    own = {name: alone(folder, name, "list_recorded_topics", {}) for name in NAMES}
+    assert {row["topic"] for row in found} == {
+        row["topic"] for rows in own.values() for row in rows
+    }
+    assert [row["last_ts"] for row in found] == sorted(
+        (row["last_ts"] for row in found), reverse=True
+    )
+    for row in found:
+        assert {*row.pop("robot_names")} == {*NAMES}
+        theirs = [one for rows in own.values() for one in rows if one["topic"] == row["topic"]]
+        assert row == {
+            **theirs[0],
+            "first_ts": min(one["first_ts"] for one in theirs),
+            "last_ts": max(one["last_ts"] for one in theirs),
+            "count": sum(one["count"] for one in theirs),
+        }
 
 
 @pytest.mark.parametrize("oldest_first", [False, True])

@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.packed_messages import unpacked_messages
-from ros2_memory.lake.shipper import Shipped, Shipper
+from ros2_memory.lake.shipper import Shipped
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import (
     TOMBSTONES_FILE,
@@ -30,14 +30,12 @@ from ros2_memory.lake.upkeep import (
     forget_in_lake,
     read_tombstones,
 )
-from ros2_memory.lake.warehouse import WRITTEN, LakeTables
+from ros2_memory.lake.warehouse import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
-from tests.support.clocks import FixedClock
+from tests.support.fleets import START_S
 from tests.support.housekeepers import own_all
 from tests.support.lakes import (
-    LATER,
-    START_S,
     lake_column,
     location,
     robot_bags,
@@ -71,16 +69,10 @@ def forget(lake: Path, what: Tombstone) -> Forgotten:
         return forget_in_lake(tables, what)
 
 
-def ship_with_tombstones(lake: Path, bag_dir: Path) -> Shipped:
-    where = location(lake)
-    with where.writable() as tables:
-        return Shipper(
-            tables,
-            [robot_bags("hall", bag_dir)],
-            FixedClock(LATER),
-            messages=("/chatter",),
-            tombstones={*read_tombstones(where.state_dir)},
-        ).run()
+def ship_again(lake: Path) -> Shipped:
+    """One pass of a process that knows what was forgotten."""
+    known = {*read_tombstones(location(lake).state_dir)}
+    return ship(lake, [robot_bags("hall", lake.parent / "hall")], tombstones=known)
 
 
 def files_with(lake: Path, secret: str) -> list[Path]:
@@ -118,13 +110,13 @@ def test_what_is_forgotten_is_in_no_byte_of_the_lake_and_comes_back_with_no_copy
     assert files_with(lake, MARKER) == []
     assert len(lake_column(lake, "messages", "texts")) == 3
     shutil.copy(late, kept)
-    done = ship_with_tombstones(lake, bag_dir)
+    done = ship_again(lake)
     assert done.bags == 0
     assert "forgotten" in done.problems[0]
     assert files_with(lake, MARKER) == []
     # Without the messages it comes again.
     write_mcap(kept, [text((START_S + 76) * NS_PER_S, "after")])
-    assert ship_with_tombstones(lake, bag_dir).bags == 1
+    assert ship_again(lake).bags == 1
 
 
 @pytest.fixture
@@ -162,40 +154,31 @@ def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
     assert len(lake_column(lake, "bags", "bag_id")) == 2
     (bag_dir / "rec").mkdir(exist_ok=True)
     shutil.copy(late, bag_dir / "rec" / "rec_7.mcap")
-    done = ship_with_tombstones(lake, bag_dir)
+    done = ship_again(lake)
     assert (done.forgotten, done.bags, len(done.problems)) == (0, 0, 1)
     assert files_with(lake, MARKER) == []
     # A bag of the same time that stayed is another one.
     write_bag(bag_dir, 8, at_s=START_S + 70)
-    assert ship_with_tombstones(lake, bag_dir).bags == 1
+    assert ship_again(lake).bags == 1
 
 
 def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_comes_again(
     shipped_robot: tuple[Path, Path, Path],
 ) -> None:
     bag_dir, lake, late = shipped_robot
-    topics = sorted({str(each) for each in lake_column(lake, "sightings", "topic")})
-    assert forget_on_robot("--topic", "/chatter", "--topic", topics[0]) == 0
+    [topic] = {str(topic) for topic in lake_column(lake, "sightings", "topic")}
+    assert forget_on_robot("--topic", "/chatter", "--topic", topic) == 0
     done = ship_from(lake.parent)
     assert (done.forgotten, done.bags, done.problems) == (1, 1, [])
     assert len(lake_column(lake, "bags", "bag_id")) == 3
     assert files_with(lake, MARKER) == []
     shutil.copy(late, bag_dir / "rec" / "rec_7.mcap")
-    assert any("rec_7" in each for each in ship_with_tombstones(lake, bag_dir).problems)
+    assert any("rec_7" in problem for problem in ship_again(lake).problems)
     assert files_with(lake, MARKER) == []
-
-
-def test_topics_are_forgotten_only_in_bags_that_hold_them(tmp_path: Path) -> None:
-    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
-    secret_bag(bag_dir)
-    start = (START_S + 70) * NS_PER_S
-    write_mcap(bag_dir / "other" / "other_0.mcap", [text(start, "kept")])
-    ship_from(tmp_path)
-    seen = str(lake_column(lake, "sightings", "topic")[0])
-    assert forget(lake, Tombstone("hall", start, start + NS_PER_S, (seen,))).bags == 1
-    assert files_with(lake, MARKER) == []
-    assert len(lake_column(lake, "bags", "bag_id")) == 1
-    assert len(lake_column(lake, "messages", "texts")) == 1
+    # Bags of that time without such a topic stay.
+    cup = (START_S + 60) * NS_PER_S
+    assert forget(lake, Tombstone("hall", cup, cup + 20 * NS_PER_S, (topic,))).bags == 1
+    assert len(lake_column(lake, "bags", "bag_id")) == 2
 
 
 def test_where_the_robot_cannot_write_it_down_the_lake_keeps_it_and_the_command_is_named(
@@ -225,52 +208,36 @@ def test_a_list_of_what_was_forgotten_that_cannot_be_read_keeps_its_robot_from_b
     assert "forgotten.jsonl: line 1" in done.problems[0]
 
 
-def test_killed_while_forgetting_it_is_finished_later(
+def test_killed_while_shipping_and_while_forgetting_it_is_finished_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
-    secret_bag(bag_dir)
     write_bag(bag_dir, 0)
     ship_from(tmp_path)
-    commit, calls = SqlCatalog.commit_table, 0
+    secret_bag(bag_dir)
+    commit = SqlCatalog.commit_table
+    left = len(TABLES) - 1
 
     def failing(*given: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == 4:
+        nonlocal left
+        left -= 1
+        if left < 0:
             raise OSError(28, "No space left on device")
         return commit(*given)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(SqlCatalog, "commit_table", failing)
-    with pytest.raises(LakeError, match="No space left"):
-        forget(lake, tombstone())
     where = location(lake)
+    with monkeypatch.context() as patched:
+        patched.setattr(SqlCatalog, "commit_table", failing)
+        with pytest.raises(LakeError, match="No space left"):
+            ship_from(tmp_path)
+        # Its rows are there, but in `bags`.
+        assert files_with(lake, MARKER)
+        left = 3
+        with pytest.raises(LakeError, match="No space left"):
+            forget(lake, tombstone())
     assert read_tombstones(where.state_dir) == {tombstone(): False}
     assert forget(lake, tombstone()).bags == 1
     assert read_tombstones(where.state_dir) == {tombstone(): True}
-    assert files_with(lake, MARKER) == []
-
-
-def test_rows_that_a_killed_process_left_without_their_bag_are_forgotten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag_dir, lake = tmp_path / "hall", tmp_path / "lake"
-    write_bag(bag_dir, 0)
-    ship_from(tmp_path)
-    secret_bag(bag_dir)
-    replace = LakeTables.replace
-
-    def killed(self: LakeTables, name: str, *given: object) -> None:
-        if name == "bags":
-            raise LakeError("killed")
-        replace(self, name, *given)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patched:
-        patched.setattr(LakeTables, "replace", killed)
-        with pytest.raises(LakeError):
-            ship_from(tmp_path)
-    assert files_with(lake, MARKER)
-    assert forget(lake, tombstone()).bags == 1
     assert files_with(lake, MARKER) == []
 
 

@@ -24,40 +24,44 @@ from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
-from tests.support.fleets import SEEN, reply
-from tests.support.lakes import START_S, ship_from, write_bag
+from tests.support.fleets import SEEN, START_S, reply
+from tests.support.lakes import ship_from, write_bag
 
 CUP: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
 
 
-def overrides(folder: Path, engine: str) -> list[str]:
+def overrides(folder: Path) -> list[str]:
     robots = ", ".join(f"{name}: {folder / name}" for name in ("hall", "attic"))
     return [
         "deployment=fleet",
         f"fleet.robots={{{robots}}}",
-        f"lake={engine}",
+        "lake=duckdb",
         f"lake.warehouse={folder / 'lake'}",
     ]
 
 
 def served(folder: Path) -> Fleet:
     """The fleet of a server with a lake."""
-    fleet = build_fleet(load_settings(overrides(folder, "duckdb"), {}))
+    fleet = build_fleet(load_settings(overrides(folder), {}))
     assert fleet is not None
     return fleet
 
 
-def test_a_robot_whose_bags_are_gone_is_answered_from_the_lake(tmp_path: Path) -> None:
+def test_robots_whose_bags_are_gone_or_were_never_shipped_are_answered_from_where_they_are(
+    tmp_path: Path,
+) -> None:
     for name in ("hall", "attic"):
         write_bag(tmp_path / name, 0)
-    ship_from(tmp_path, "hall", "attic")
+    ship_from(tmp_path)
     shutil.rmtree(tmp_path / "hall")
     fleet = served(tmp_path)
+    assert [robot.is_mounted for robot in fleet.robots.values()] == [False, True]
     found = reply(fleet, "find_last_match", CUP)
     assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
-    assert found["notes"][-1].startswith("from the lake, which has what was shipped: ")
-    assert fleet.robots["attic"].is_mounted
-    assert not fleet.robots["hall"].is_mounted
+    [note] = found["notes"]
+    assert note.startswith("from the lake, which has what was shipped: hall up to ")
+    assert "attic" not in note
+    assert reply(fleet, "find_things", {"robot": "attic"})["robot_name"] == "attic"
 
 
 @pytest.mark.parametrize("left", [0, 1], ids=["none", "the newest"])
@@ -107,24 +111,12 @@ def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path:
     ship_from(tmp_path)
     for bag in (tmp_path / "hall").rglob("*.mcap"):
         bag.unlink()
-    fleet = served(tmp_path)
-    asked = {"robot": "hall", "topic": "/camera", "timestamp": START_S + 5}
-    assert reply(fleet, "get_topic_at_time", asked)["error"] == "not_in_lake"
-    asked = {"robot": "hall", "topic": "/camera", "condition_type": "contains", "value": "x"}
-    assert reply(fleet, "find_last_match", asked)["error"] == "not_in_lake"
-
-
-def test_a_mounted_robot_that_was_never_shipped_is_answered_from_its_bags(tmp_path: Path) -> None:
-    for name in ("hall", "attic"):
-        write_bag(tmp_path / name, 0)
-    ship_from(tmp_path)
-    fleet = served(tmp_path)
-    found = reply(fleet, "find_last_match", CUP)
-    assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
-    [note] = found["notes"]
-    assert note.startswith("from the lake, which has what was shipped: hall up to ")
-    assert "attic" not in note
-    assert reply(fleet, "find_things", {"robot": "attic"})["robot_name"] == "attic"
+    fleet, of_camera = served(tmp_path), {"robot": "hall", "topic": "/camera"}
+    for tool, given in (
+        ("get_topic_at_time", {"timestamp": START_S + 5}),
+        ("find_last_match", CUP),
+    ):
+        assert reply(fleet, tool, {**given, **of_camera})["error"] == "not_in_lake"
 
 
 def test_a_lake_without_a_bag_is_reported(tmp_path: Path) -> None:
@@ -137,7 +129,7 @@ def test_a_lake_without_a_bag_is_reported(tmp_path: Path) -> None:
     ]
     ship_from(tmp_path)
     with structlog.testing.capture_logs() as logs:
-        build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+        build_fleet(load_settings(overrides(tmp_path), {}))
     assert "lake_empty" not in {each["event"] for each in logs}
 
 
@@ -148,7 +140,7 @@ def test_the_command_line_asks_a_lake(
     write_bag(tmp_path / "hall", 0)
     ship_from(tmp_path)
     shutil.rmtree(tmp_path / "hall")
-    settings = [*overrides(tmp_path, "duckdb"), "+lake.properties={x.y: z}"]
+    settings = [*overrides(tmp_path), "+lake.properties={x.y: z}"]
     question = [f"{key}={value}" for key, value in CUP.items()]
     capsys.readouterr()
     assert cli.main(["ask", "--json", "find_last_match", *settings, *question]) == 0
@@ -156,76 +148,67 @@ def test_the_command_line_asks_a_lake(
     assert match["robot_name"] == "hall"
 
 
-def test_a_robot_that_only_the_lake_knows_is_asked_unless_a_token_forbids_it(
-    tmp_path: Path,
-) -> None:
-    names = ("attic", "cellar", "hall")
-    for name in names:
-        write_bag(tmp_path / name, 0)
-    ship_from(tmp_path, *names)
-    fleet = served(tmp_path)
-    assert [*fleet.robots] == ["hall", "attic", "cellar"]
-    found = reply(fleet, "find_last_match", CUP)
-    assert {row["robot_name"] for row in found["matches"]} == set(names)
-    told = reply(fleet, "data_time_range", {"robot": "cellar"})
-    assert "error" not in told
-    limited = Call(robots=frozenset({"hall"}))
-    assert [each.name for each in fleet.allowed(limited)] == ["hall"]
-    with pytest.raises(InvalidArgumentsError, match='there is no robot "cellar"'):
-        fleet.named("cellar", limited)
+def _with_a_later_robot(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:
+    """The fleet of a server that was started before a robot was shipped for the first time."""
+    monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
+    for name in ("hall", "cellar", "roof"):
+        write_bag(folder / name, 0)
+    ship_from(folder, "hall", "roof")
+    fleet = served(folder)
+    ship_from(folder, "cellar")
+    return fleet
 
 
-def test_a_robot_that_is_first_shipped_later_is_known_when_it_is_asked_for(
+def test_robots_that_only_the_lake_knows_are_asked_unless_a_token_forbids_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
-    fleet = _with_a_later_robot(tmp_path)
-    assert [*fleet.robots] == ["hall", "attic"]
+    fleet = _with_a_later_robot(tmp_path, monkeypatch)
+    assert [*fleet.robots] == ["hall", "attic", "roof"]
     limited = Call(robots=frozenset({"hall"}))
-    with pytest.raises(InvalidArgumentsError, match=r"cellar.*there is hall"):
-        fleet.named("cellar", limited)
+    for name in ("cellar", "roof"):
+        with pytest.raises(
+            InvalidArgumentsError, match=f'there is no robot "{name}"; there is hall'
+        ):
+            fleet.named(name, limited)
+    assert [robot.name for robot in fleet.allowed(limited)] == ["hall"]
+    # One that was shipped later is known when it is asked for.
     assert "cellar" not in fleet.robots
     found = reply(fleet, "find_last_match", {**CUP, "robot": "cellar"})
-    assert found["robot_name"] == "cellar"
-    assert found["topic"] == SEEN
-    with pytest.raises(InvalidArgumentsError, match="there are hall, attic, cellar"):
+    assert (found["robot_name"], found["topic"]) == ("cellar", SEEN)
+    found = reply(fleet, "find_last_match", CUP)
+    assert {row["robot_name"] for row in found["matches"]} == {"hall", "cellar", "roof"}
+    with pytest.raises(InvalidArgumentsError, match="there are hall, attic, roof, cellar"):
         fleet.named("garden", Call())
 
 
 async def test_a_server_looks_at_what_was_shipped_before_it_is_asked_and_for_later_robots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.bootstrap_fleet._JOINED_AGAIN_S", 0.0)
-    fleet = _with_a_later_robot(tmp_path)
+    fleet = _with_a_later_robot(tmp_path, monkeypatch)
 
     def published() -> list[Snapshot | None]:
         lakes = [robot.lake for robot in fleet.robots.values() if robot.lake is not None]
         return [lake.index.published for lake in lakes]
 
-    assert published() == [None, None]
+    assert published() == [None] * 3
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(keep_fleet_fresh, fleet, 1.0, 0.01)
             while "cellar" not in fleet.robots or None in published():
                 await anyio.sleep(0.01)
             tasks.cancel_scope.cancel()
-    robots = [robot.memory().index for robot in fleet.robots.values()]
-    latest = [index.snapshot().latest for index in robots]
-    assert [each.latest for each in published() if each is not None] == latest
+    latest = {
+        name: snapshot and snapshot.latest
+        for name, snapshot in zip(fleet.robots, published(), strict=True)
+    }
+    last = (START_S + 2) * NS_PER_S
+    assert latest == {"hall": last, "attic": None, "roof": last, "cellar": last}
 
 
-def _with_a_later_robot(folder: Path) -> Fleet:
-    """The fleet of a server that was started before a robot was shipped for the first time."""
-    for name in ("hall", "attic", "cellar"):
-        write_bag(folder / name, 0)
-    ship_from(folder, "hall", "attic")
-    fleet = served(folder)
-    ship_from(folder, "cellar")
-    return fleet
-
-
-def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:
-    given = [*overrides(tmp_path, "duckdb"), "lake.engine.memory_mb=64", "lake.engine.threads=1"]
+def test_an_engine_has_the_settings_of_its_group_and_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = [*overrides(tmp_path), "lake.engine.memory_mb=64", "lake.engine.threads=1"]
     node = load_settings(given, {}).lake.engine
     assert isinstance(node, DuckdbNode)
     engine = engine_of(node)
@@ -240,15 +223,10 @@ def test_an_engine_has_the_settings_of_its_group(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"^lake\.engine\.address: unknown key; use one of: _tar"):
         load_settings([*given, "lake.engine.address=auto"], {})
     assert load_settings(["deployment=fleet", "fleet.robots={r: /r}"], {}).lake.engine is None
-
-
-def test_an_engine_that_is_not_installed_is_named_with_its_extra(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
     known = importlib.util.find_spec
     monkeypatch.setattr(
         "ros2_memory.bootstrap_fleet.find_spec",
         lambda name: None if name == "duckdb" else known(name),
     )
     with pytest.raises(ConfigError, match=r"lake: .*pip install '\.\[lake\]"):
-        build_fleet(load_settings(overrides(tmp_path, "duckdb"), {}))
+        served(tmp_path)

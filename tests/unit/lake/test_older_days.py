@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,19 +18,20 @@ from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
-from tests.support.lake_rows import fill, lake_in, lake_robots
-from tests.support.memories import memory_of, with_store
+from tests.support.lakes import lake_robot, robot_bags, ship
 
 DAY_S = 86_400
 DAYS = 7
 """Days ago that the first bag is of; from then on there are two of a day, and none of the third."""
 
 
-def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> Memory:
+@pytest.fixture(scope="module")
+def memory(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.
     """
+    folder = tmp_path_factory.mktemp("old")
     labels = {DAYS: "mug", DAYS - 1: "fork"}
     for ago in (7, 6, 4, 3, 1, 0):
         at = (START_S - ago * DAY_S) * NS_PER_S
@@ -40,99 +40,68 @@ def old_robot(engine: LakeEngine, folder: Path, topics: Sequence[str] = ()) -> M
         if ago == DAYS:
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
         write_mcap(folder / "bags" / "rec" / f"rec_{DAYS - ago}.mcap", messages)
-    memory = with_store(memory_of(folder / "bags"), folder / "bags")
-    catalog = lake_in(folder)
-    fill(catalog, {"hall": memory}, topics)
-    return lake_robots(catalog, engine, ["hall"], days=1, most_bags=1)["hall"]
+    ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
+    return lake_robot(folder / "lake", engine, days=1, most_bags=1)
 
 
-def asked(robot: Memory, label: str, topic: str = SEEN, **more: object) -> dict[str, Any]:
-    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot, lake=robot)], FixedClock(NOW))
+@pytest.fixture
+def robot(memory: Memory) -> Robot:
+    return Robot("hall", Path("/hall"), lambda: memory, lake=memory)
+
+
+def asked(of: Robot, tool: str, label: str, topic: str = SEEN, **more: object) -> Any:
     given = {"topic": topic, "condition_type": "contains", "value": label, **more}
-    found: dict[str, Any] = reply(fleet, "find_last_match", given)
-    return found
+    return reply(Fleet([of], FixedClock(NOW)), tool, given)
 
 
-def test_what_was_seen_before_the_newest_days_is_found(tmp_path: Path, engine: LakeEngine) -> None:
-    robot = old_robot(engine, tmp_path)
-    for label, ago in (("cup", 0), ("fork", 6), ("mug", 7)):
-        found = asked(robot, label)
-        [match] = found["matches"]
-        assert match["timestamp"] == START_S - ago * DAY_S
+def test_what_was_seen_before_the_newest_days_is_found_and_never_is_of_all(robot: Robot) -> None:
+    for label, ago in (("cup", 0), ("fork", 6), ("mug", 7), ("elephant", None)):
+        found = asked(robot, "find_last_match", label)
+        times = [row["timestamp"] for row in found["matches"]]
+        assert times == ([] if ago is None else [START_S - ago * DAY_S])
+        assert ("never" in found) is (ago is None)
         assert "not looked at" not in str(found)
-    before = asked(robot, "mug", before=START_S - 2 * DAY_S)
-    assert "never" not in before
+    before = START_S - 2 * DAY_S
+    assert "never" not in asked(robot, "find_last_match", "mug", before=before)
+    # A topic of old days alone.
+    assert len(asked(robot, "find_last_match", "spoon", "/vision/old")["matches"]) == 1
+    assert asked(robot, "find_last_match", "cup", "/vision/old")["never"] == ["hall"]
 
 
-@pytest.mark.parametrize(
-    ("more", "is_noted"),
-    [
+def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) -> None:
+    spans: tuple[tuple[dict[str, Any], bool], ...] = (
         ({}, True),
         ({"start": START_S - DAY_S}, True),
         ({"start": START_S}, False),
         ({"last_s": 60}, False),
         ({"end": START_S - 2 * DAY_S}, True),
-    ],
-)
-def test_days_before_are_named_only_where_the_answer_is_of_them(
-    tmp_path: Path, engine: LakeEngine, more: dict[str, object], *, is_noted: bool
-) -> None:
-    robot = old_robot(engine, tmp_path)
-    fleet = Fleet([Robot("hall", Path("/hall"), lambda: robot, lake=robot)], FixedClock(NOW))
-    given = {"topic": SEEN, "condition_type": "contains", "value": "cup", **more}
-    for robot_name in ({}, {"robot": "hall"}):
-        found = reply(fleet, "find_matches", {**given, **robot_name})
-        assert ("not looked at" in str(found)) is is_noted
+    )
+    for span, is_noted in spans:
+        for name in ({}, {"robot": "hall"}):
+            found = asked(robot, "find_matches", "cup", **span, **name)
+            assert ("not looked at" in str(found)) is is_noted, span
 
 
-def test_never_is_of_all_days(tmp_path: Path, engine: LakeEngine) -> None:
-    found = asked(old_robot(engine, tmp_path), "elephant")
-    assert found["never"] == ["hall"]
-    assert "not looked at" not in str(found)
-
-
-def test_a_topic_of_old_days_alone_is_searched(tmp_path: Path, engine: LakeEngine) -> None:
-    robot = old_robot(engine, tmp_path)
-    assert len(asked(robot, "spoon", topic="/vision/old")["matches"]) == 1
-    assert asked(robot, "cup", topic="/vision/old")["never"] == ["hall"]
-
-
-def test_a_value_at_a_match_of_old_days_is_found(tmp_path: Path, engine: LakeEngine) -> None:
-    robot = old_robot(engine, tmp_path, ["/chatter"])
-    ask = partial(value_when, robot, Call(), "/chatter", SEEN, condition_type="contains")
+def test_a_value_at_a_match_of_old_days_is_found(memory: Memory) -> None:
+    ask = partial(value_when, memory, Call(), "/chatter", SEEN, condition_type="contains")
     found = ask(value="fork")
     assert found.matched is not None
     assert found.matched.sample.time == (START_S - 6 * DAY_S) * NS_PER_S
 
 
 def test_where_the_time_is_short_it_says_how_far_it_looked(
-    tmp_path: Path, engine: LakeEngine, monkeypatch: pytest.MonkeyPatch
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    robot = old_robot(engine, tmp_path)
     monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
+
+    def ask(topic: str, memory: Memory, call: Call) -> Match:
+        return find_last_match(memory, call, topic, "contains", "mug")
+
     call = Call(Deadline.after(60))
-
-    def ask(memory: Memory, call: Call) -> Match:
-        return find_last_match(memory, call, SEEN, "contains", "mug")
-
-    found, lake = Robot("hall", Path("/hall"), lambda: robot, lake=robot).asked(
-        ask, call, lake_first=True
-    )
+    found, lake = robot.asked(partial(ask, SEEN), call, lake_first=True)
     assert found.found is None
     assert lake is not None
     [note] = lake.notes
     assert note.startswith("the lake has days before ")
-
-
-def test_what_fails_says_which_days_it_is_of(
-    tmp_path: Path, engine: LakeEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    robot = old_robot(engine, tmp_path)
-    monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
-
-    def ask(memory: Memory, call: Call) -> Match:
-        return find_last_match(memory, call, "/none", "contains", "mug")
-
-    of_lake = Robot("hall", Path("/hall"), lambda: robot, lake=robot)
     with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
-        of_lake.asked(ask, Call(Deadline.after(60)), lake_first=True)
+        robot.asked(partial(ask, "/none"), Call(Deadline.after(60)), lake_first=True)

@@ -9,27 +9,32 @@ from random import Random
 import numpy as np
 import pytest
 
-from ros2_memory.core.errors import BagVanishedError, NotInLakeError
+from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
-from ros2_memory.lake.rows import bag_id_of
-from ros2_memory.lake.tables import TABLES, open_tables
+from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import BagReader, Channel, Schema
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
-from tests.support.lake_rows import fill, fleet_of, lake_in, lake_robots, store_columns
-from tests.support.memories import memory_of, with_store
+from tests.support.lakes import fleet_of, lake_robot, location, robot_bags, ship, store_columns
 
 AT = START_S * NS_PER_S
 EVERYTHING = TimeWindow.everything()
 CHANNEL = Channel("/any", "cdr", Schema("any"))
 
 
+def shipped(folder: Path, engine: LakeEngine) -> tuple[Memory, Memory]:
+    """The memory over a robot's bags, and over the lake that they were shipped into."""
+    robot = robot_bags("hall", folder / "bags")
+    assert ship(folder / "lake", [robot]).bags == 2
+    return robot.memory, lake_robot(folder / "lake", engine, stores=folder / "cache")
+
+
 @pytest.fixture
-def bags(tmp_path: Path) -> Memory:
+def both(engine: LakeEngine, tmp_path: Path) -> tuple[Memory, Memory]:
     """Two recordings whose messages are of equal and of unlike sizes, and images."""
     draw = Random(3)
     for recording in range(2):
@@ -42,17 +47,11 @@ def bags(tmp_path: Path) -> Memory:
             image = draw.randbytes(5_000)
             messages.append(Msg("/camera", "sensor_msgs/msg/Image", at + 3, image, at - 5))
         write_mcap(tmp_path / "bags" / f"r{recording}" / "one_0.mcap", messages)
-    return with_store(memory_of(tmp_path / "bags"), tmp_path / "bags")
+    return shipped(tmp_path, engine)
 
 
-@pytest.fixture
-def robot(bags: Memory, engine: LakeEngine, tmp_path: Path) -> Memory:
-    catalog = lake_in(tmp_path)
-    fill(catalog, {"hall": bags})
-    return lake_robots(catalog, engine, ["hall"], stores=tmp_path / "cache")["hall"]
-
-
-def test_bags_and_their_messages_are_those_of_the_robot(bags: Memory, robot: Memory) -> None:
+def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memory]) -> None:
+    bags, robot = both
     theirs, own = bags.index.snapshot().bags, robot.index.snapshot().bags
     folder = str(bags.index.bag_dir)
     assert [bag.file for bag in own] == [bag.file.replace(folder, "/hall") for bag in theirs]
@@ -76,12 +75,12 @@ def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> l
 
 
 def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
-    bags: Memory, robot: Memory
+    both: tuple[Memory, Memory],
 ) -> None:
-    over_lake, over_bags = fleet_of({"hall": robot}), fleet_of({"hall": bags})
+    over_bags, over_lake = (fleet_of({"hall": memory}) for memory in both)
     at: dict[str, object] = {"topic": "/camera", "timestamp": START_S + 5, "tolerance_s": 9}
     refused = reply(over_lake, "get_topic_at_time", at)
-    assert refused["error"] == NotInLakeError.code == "not_in_lake"
+    assert refused["error"] == "not_in_lake"
     assert "only the times of /camera" in refused["detail"]
     assert "lake.messages" in refused["detail"]
     span: dict[str, object] = {"start": START_S, "end": START_S + 99}
@@ -106,37 +105,30 @@ def test_copies_among_images_are_told_by_their_publish_times(
             image = Msg("/camera", "sensor_msgs/msg/Image", sent + recording, b"%06d" % n, sent)
             messages += [said, image]
         write_mcap(tmp_path / "bags" / f"r{recording}" / f"r{recording}_0.mcap", messages)
-    bags = with_store(memory_of(tmp_path / "bags"), tmp_path / "bags")
-    catalog = lake_in(tmp_path)
-    fill(catalog, {"hall": bags})
-    robot = lake_robots(catalog, engine, ["hall"], stores=tmp_path / "cache")["hall"]
+    bags, robot = shipped(tmp_path, engine)
+    span: dict[str, object] = {"start": START_S - 1, "end": START_S + 99, "by": "day"}
     for is_stored in (False, True):
         if is_stored:
-            assert len(store_columns(robot).store.paths()) == 2
+            store_columns(robot)
         for topic in ("/camera", "/chatter"):
-            given: dict[str, object] = {
-                "topic": topic,
-                "start": START_S - 1,
-                "end": START_S + 99,
-                "by": "day",
-            }
+            given = {"topic": topic, **span}
             expected = reply(fleet_of({"hall": bags}), "get_topic_in_range", given)
             assert expected["rows"][0][2] == 30
             assert reply(fleet_of({"hall": robot}), "get_topic_in_range", given) == expected
 
 
-@pytest.mark.filterwarnings("ignore:Delete operation did not match")
 def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
-    bags: Memory, robot: Memory, tmp_path: Path
+    both: tuple[Memory, Memory], tmp_path: Path
 ) -> None:
+    bags, robot = both
     filling = store_columns(robot)
     assert filling.store.paths() == ["r0/one_0.mcap", "r1/one_0.mcap"]
     given: dict[str, object] = {"topic": SEEN, "condition_type": "contains", "value": "cup"}
     over_lake, over_bags = fleet_of({"hall": robot}), fleet_of({"hall": bags})
     assert reply(over_lake, "find_matches", given) == reply(over_bags, "find_matches", given)
     first, second = robot.index.snapshot().bags
-    for table in open_tables(lake_in(tmp_path), TABLES).values():
-        table.delete(f"bag_id = '{bag_id_of('hall', first, first.start)}'")
+    with location(tmp_path / "lake").writable() as tables:
+        assert forget_in_lake(tables, Tombstone("hall", first.start, first.end)).bags == 1
     assert robot.index.refresh().bags == (second,)
     with pytest.raises(BagVanishedError):
         [*robot.reader.records(first.path, ["/even"], EVERYTHING)]

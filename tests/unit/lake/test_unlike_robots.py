@@ -14,13 +14,12 @@ import pytest
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.shipper import Shipped, Shipper
+from ros2_memory.lake.shipper import Shipped
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
 from tests.support.lake_questions import Question, every_question
-from tests.support.lake_rows import fleet_of, lake_robots, store_columns
-from tests.support.lakes import LATER, location, robot_bags
+from tests.support.lakes import fleet_of, lake_robots, location, robot_bags, ship, store_columns
 from tests.support.memories import ROOT, memory_of, with_store
 from tests.support.moving_map import BEGIN, S
 from tests.support.unlike_robots import DAMAGED, LENGTH_S, ROBOTS, SEEN, YEAR_NS
@@ -41,10 +40,10 @@ class World(NamedTuple):
     shipped: Shipped
     folder: Path
 
-    def both(self, *, is_mounted: bool = True) -> Fleet:
-        """The fleet of a server with a lake, and with or without the robots' own memories."""
+    def both(self) -> Fleet:
+        """The fleet of a server with a lake."""
         robots = [
-            Robot(name, Path("/") / name, robot.memory, lake=of_lake, is_mounted=is_mounted)
+            Robot(name, Path("/") / name, robot.memory, lake=of_lake)
             for name, robot in self.mounted.robots.items()
             for of_lake in [self.lake.robots[name].memory()]
         ]
@@ -55,8 +54,7 @@ class World(NamedTuple):
 def world(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
     of_robots = [robot_bags(name, write(folder / name)) for name, write in ROBOTS.items()]
-    with location(lake).writable() as tables:
-        shipped = Shipper(tables, of_robots, FixedClock(LATER), messages=MESSAGES).run()
+    shipped = ship(lake, of_robots, messages=MESSAGES, most_bags=100)
     for number in DAMAGED:
         (folder / "damaged" / "rec" / f"rec_{number}.mcap").unlink()
     memories = {
@@ -123,9 +121,7 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     times = [f"{name} up to {iso_local(latest[name] or 0)}" for name in sorted(latest, key=str)]
     assert note.startswith("from the lake, which has what was shipped: behind up to ")
     assert sorted(note.partition(": ")[2].split(", ")) == times
-
-
-def test_what_a_robot_does_now_is_not_asked_of_a_lake(world: World) -> None:
+    # What a robot does now is not asked of a lake.
     status = reply(world.mounted, "memory_status", {})
     assert reply(world.both(), "memory_status", {}) == status
 
