@@ -66,19 +66,3 @@ def test_what_a_clock_skipped_is_no_time_that_passed(
     ordered = sorted(times)
     for start, stop in pairwise(ordered):
         assert elapsed.between(shown(start), shown(stop)) == stop - start
-
-
-@given(
-    spans=st.lists(st.tuples(st.integers(0, 100), st.integers(-20, 20)), max_size=4),
-    cuts=st.lists(st.integers(-10, 150), min_size=2, max_size=6),
-)
-def test_durations_that_adjoin_add_up(spans: list[tuple[int, int]], cuts: list[int]) -> None:
-    free = 0
-    steps = []
-    for gap, by in spans:
-        steps.append(ClockStep(free + gap, by))
-        free += gap + max(by, 0)
-    elapsed = Elapsed(steps)
-    parts = [elapsed.between(start, stop) for start, stop in pairwise(sorted(cuts))]
-    assert sum(parts) == elapsed.between(min(cuts), max(cuts))
-    assert all(each >= 0 for each in parts)

@@ -178,10 +178,6 @@ def test_of_two_messages_for_one_time_the_later_received_is_used() -> None:
         assert shift(Tree(order), "a", "b", 5) == 2.0
 
 
-def test_of_two_transforms_in_one_message_the_last_is_used() -> None:
-    assert shift(Tree([edge("a", "b", 5, 1.0), edge("a", "b", 5, 2.0)]), "a", "b", 5) == 2.0
-
-
 # Parents that change
 
 
@@ -229,12 +225,6 @@ def test_a_loop_is_an_answer_and_not_an_endless_walk(static: bool) -> None:
 
 
 # Static transforms
-
-
-@pytest.mark.parametrize("time", [0, 10**18, 2**62])
-def test_a_static_transform_is_valid_at_all_times(time: int) -> None:
-    tree = Tree([edge("base", "laser", 500 * S, 0.3, static=True)])
-    assert shift(tree, "base", "laser", time) == 0.3
 
 
 def test_a_child_published_both_ways_is_dynamic_where_its_messages_reach() -> None:
@@ -420,14 +410,6 @@ def test_lookups_on_public_bags_are_those_of_independent_tools(
 )
 def test_the_clock_of_a_replayed_robot_is_log_time(name: str, clock: str) -> None:
     assert Tree(stamped_transforms(FILES[name]), "auto").frames("map").clock == clock
-
-
-def test_a_yaw_between_two_messages_turns_the_shorter_way() -> None:
-    turns = [(0.0, 0.0, math.sin(half), math.cos(half)) for half in (1.5, -1.5)]
-    ends = [Transform((0.0, 0.0, 0.0), turn) for turn in turns]
-    tree = Tree([edge("a", "b", 0, ends[0]), edge("a", "b", 2, ends[1])])
-    turned = Rotation.from_quat(tree.lookup("a", "b", 1).rotation)
-    assert abs(turned.as_euler("xyz")[2]) == pytest.approx(math.pi)
 
 
 # Many times at once

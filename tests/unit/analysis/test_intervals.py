@@ -148,12 +148,6 @@ def test_the_longest_intervals_remain_in_order_with_the_labels_that_they_need() 
     assert seen.most_lasting(3) is seen
 
 
-def test_intervals_without_some_labels_are_those_of_the_others() -> None:
-    seen = watched([(0, ("a", "b")), (20 * NS_PER_S, ("a",))]).visible
-    assert seen.without({"a", "x"}).intervals() == (VisibleInterval("b", 0, 0),)
-    assert seen.without({"x"}) is seen
-
-
 def each_s(begin: float, end: float, period: float, *labels: str) -> Messages:
     return [
         (round((begin + n * period) * NS_PER_S), labels) for n in range(int((end - begin) / period))
@@ -184,15 +178,6 @@ def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
     half = len(messages) // 2 or 1
     parts = [watched(part) for part in (messages[:half], messages[half:]) if part]
     assert ("a" in joined(parts).visible.throughout(0, 65 * NS_PER_S)) is is_seen
-
-
-def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
-    messages = each_s(0, 20, 0.2, "a")
-    last = messages[-1][0]
-    seen = watched(messages).visible
-    assert seen.at_end(last, last + NS_PER_S) == ["a"]
-    assert seen.at_end(last, last + 2 * NS_PER_S) == []
-    assert seen.at_end(last - 1, last) == []
 
 
 @given(histories())

@@ -39,10 +39,6 @@ def seeing(*labels: str) -> State:
     return State(tuple((Word(LABEL, label), math.nan) for label in labels))
 
 
-def each_second(*states: State) -> Messages:
-    return [(nth * NS_PER_S, state) for nth, state in enumerate(states)]
-
-
 def some_of(*words: Word, values: tuple[float, ...] = (math.nan,)) -> st.SearchStrategy[list[Fact]]:
     """Some facts, each of another name."""
     fact = st.tuples(st.sampled_from(words), st.sampled_from(values))
@@ -123,15 +119,6 @@ def test_messages_of_tables_that_overlap_are_taken_as_those_of_one(
     ]
     stated = [stated_by(*([*each] for each in zip(*part, strict=True))) for part in parts if part]
     assert _comparable(events_of_stated(joined_stated(stated))) == _comparable(events_of(messages))
-
-
-def test_what_is_beyond_the_limit_is_counted() -> None:
-    blinking = [seeing("cup") if nth % 4 == 0 else seeing() for nth in range(40)]
-    whole = events_of(each_second(*blinking))
-    assert whole is not None
-    events = whole.limited(3, 3)
-    assert [each.first for each in events.visible.intervals()] == [0, 4 * NS_PER_S, 8 * NS_PER_S]
-    assert events.left_out == 7
 
 
 def test_a_week_of_changes_is_counted_beyond_what_memory_may_hold(

@@ -5,28 +5,20 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from random import Random
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.path import count_path
 from ros2_memory.history import driven_path
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.counting import pick
-from ros2_memory.history.view import TimeRange, View
+from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import Msg, boolean, detections, odom, write_mcap
-from tests.support.clocks import FixedClock
-from tests.support.examples import examples
-from tests.support.memories import asked, assert_same_counts, memory_of, with_store
-from tests.support.random_histories import write_history
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -256,35 +248,6 @@ def test_bags_without_a_digest_are_read_for_seconds_only(
     assert whole(count_path(memory, Call(), span, "day"), "metres") == 36.0
 
 
-@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), by=st.sampled_from(BYS), part=st.sampled_from([0.5, 1.0]))
-def test_no_count_depends_on_the_catalogue(seed: int, by: str, part: float) -> None:
-    with TemporaryDirectory() as folder:
-        bags = Path(folder)
-        written = write_history(bags, Random(seed))
-        memory = memory_of(bags, clock=FixedClock(max(written.moments) + S))
-        known = with_store(memory, bags, part=part)
-        for each in (memory, known, known):
-            assert all(counted == read for counted, read in _counts_by_topic(each))
-        start, end = min(written.moments) / S - 1, max(written.moments) / S + 1
-        questions: list[tuple[str, dict[str, object]]] = [
-            ("find_matches", {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}),
-            ("find_matches", {"topic": "/bumper", "condition_type": "equals", "value": True}),
-            ("trajectory_summary", {}),
-            ("get_topic_in_range", {"topic": "/odom", "fields": ["position.x", "position.z"]}),
-            ("get_topic_in_range", {"topic": OBJECTS, "fields": ["objects.score"]}),
-            (
-                "get_topic_in_range",
-                {"topic": "/battery_state", "fields": ["percentage", "voltage"]},
-            ),
-        ]
-        for name, question in questions:
-            given_ = {**question, "start": start, "end": end, "by": by}
-            plain = asked(memory, bags, name, **given_)
-            assert_same_counts(asked(known, bags, name, **given_), plain)
-            assert_same_counts(asked(known, bags, name, **given_), plain)
-
-
 def test_messages_that_two_recordings_hold_count_once(tmp_path: Path) -> None:
     for number in range(3):
         begin = BEGIN + number * 10 * S
@@ -323,16 +286,6 @@ def test_recordings_that_follow_each_other_at_a_full_hour_count_a_copy_once(
     assert ask(known, "pose.pose.position.x").rows == numbers.rows
 
 
-def _counts_by_topic(memory: Memory) -> Iterator[tuple[int, int]]:
-    """How many messages each topic has, as they are counted, and as they are read."""
-    view, everything = View(memory, Call()), TimeWindow.everything()
-    for topic in view.snapshot.timeline.topics():
-        counted, _ = pick(view, topic, everything, 1)
-        read = sum(1 for _ in view.stream.messages([topic], everything))
-        if view.notes.complete:
-            yield counted, read
-
-
 def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:
     seen = [(0, 0.9), (1, 0.3), (30, 0.3), (31, 0.3), (60, 0.9)]
     messages = [detections(BEGIN + at * S, ["cup"], score=score) for at, score in seen]
@@ -366,49 +319,3 @@ def test_by_refuses_what_it_does_not_take_and_ignores_how_much_is_shown(
     assert "fields" in refused["detail"]
     shown = asked(memories[0], Path(), "find_matches", **question, limit=1, oldest_first=True)
     assert shown == asked(memories[0], Path(), "find_matches", **question)
-
-
-def test_bags_that_cannot_have_a_label_are_not_read(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(6):
-        # More labels than a digest holds, but for the bag with the cat.
-        seen = ["cat", "dog"] if number == 3 else [f"thing {each}" for each in range(70)]
-        begin = BEGIN + number * 60 * S
-        messages = [detections(begin + second * S, seen) for second in range(20)]
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-    plain = memory_of(tmp_path, limits=LATEST)
-    known = with_store(plain, tmp_path)
-    for label, times in (("cat", 1), ("elephant", 0), ("thing 7", 5)):
-        answer = count_matches(plain, Call(), OBJECTS, "contains", label, by="day")
-        assert whole(answer, "count") == times
-        if label.startswith("thing"):
-            assert count_matches(known, Call(), OBJECTS, "contains", label, by="day") == answer
-            continue
-        hasty = Call(deadline=Deadline.after(600))
-        assert count_matches(known, hasty, OBJECTS, "contains", label, by="day") == answer
-
-
-@settings(max_examples=examples(20), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    labels=st.lists(st.sets(st.sampled_from(["cat", "cattle", "dog"])), min_size=2, max_size=8),
-    busy=st.integers(0, 255),
-    part=st.sampled_from([0.5, 1.0]),
-)
-def test_a_label_counts_the_same_where_bags_without_it_are_left_unread(
-    labels: list[set[str]], busy: int, part: float
-) -> None:
-    with TemporaryDirectory() as folder:
-        bags = Path(folder)
-        for number, some in enumerate(labels):
-            many = [f"thing {each}" for each in range(66)] if busy >> number & 1 else []
-            begin = BEGIN + number * 4 * S
-            messages = [detections(begin + at * S, [*sorted(some), *many]) for at in range(4)]
-            write_mcap(bags / f"rec_{number // 3}" / f"rec_{number}.mcap", messages)
-        plain = memory_of(bags, limits=LATEST)
-        known = with_store(plain, bags, part=part)
-        for label in ("cat", "dog", "thing 1", "rec"):
-            for by in ("day", "hour"):
-                answer = count_matches(plain, Call(), OBJECTS, "contains", label, by=by)
-                again = count_matches(known, Call(), OBJECTS, "contains", label, by=by)
-                assert again == answer

@@ -126,18 +126,6 @@ def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
     assert not any(note.startswith("no rows") for note in part.notes)
 
 
-def test_the_error_of_a_column_is_that_of_a_mean(tmp_path: Path) -> None:
-    write(tmp_path, noisy(Random(3)))
-    plain = memory_of(tmp_path, limits=LATEST)
-    stored = storing(plain, tmp_path, Random(3))
-    answers = [
-        count_range(memory, Call(), "/odom", span(), "day", fields=["position.x"])
-        for memory in (plain, stored)
-    ]
-    first, again = (cells(answer, "position.x.mean")[-1] for answer in answers)
-    assert again == pytest.approx(first, abs=1e-4)
-
-
 class Limited(Deadline):
     """A deadline that is over after so many looks at it."""
 

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.places.visits import visits
-from tests.support.examples import examples
-from tests.support.memories import asked, assert_same_counts, memory_of, with_store
+from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
-from tests.support.random_histories import write_history
 
 WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
 EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))
@@ -135,33 +129,3 @@ def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path)
     assert "give where in place of x and y" in two["detail"]
     none = asked(in_places(memory), world, "visits", by="day")
     assert "no place is named" in none["detail"]
-
-
-@settings(max_examples=examples(15), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    seed=st.integers(0, 10_000),
-    part=st.sampled_from([0.4, 1.0]),
-    split_s=st.sampled_from([3.0, 25.0]),
-    moving=st.booleans(),
-)
-def test_counts_by_place_are_the_same_whatever_the_catalogue_knows(
-    seed: int, part: float, split_s: float, moving: bool
-) -> None:
-    with TemporaryDirectory() as folder:
-        bags = Path(folder)
-        if moving:
-            write_moving_map(bags, seed, seconds=40, split_s=split_s)
-        else:
-            write_history(bags, random.Random(seed))
-        memory = in_places(memory_of(bags), WEST, EAST, START)
-        known = with_store(memory, bags, part=part)
-        everything = {"start": 0, "end": 4e9, "by": "place"}
-        for name, question in (
-            ("visits", {"by": "place"}),
-            ("visits", {"by": "hour", "where": "start"}),
-            ("find_matches", {**CUP, "by": "place"}),
-            ("trajectory_summary", everything),
-            ("get_topic_in_range", {**everything, "topic": "/odom", "fields": ["position.x"]}),
-        ):
-            plain = asked(memory, bags, name, **question)
-            assert_same_counts(asked(known, bags, name, **question), plain)

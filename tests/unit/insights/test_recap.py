@@ -13,19 +13,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import FLAG, LABEL, MOST
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.demo import robot as demo_robot
-from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
-from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     STATUS_FLAGS,
@@ -40,12 +35,9 @@ from tests.support.bags import (
     transform,
     write_mcap,
 )
-from tests.support.clocks import FixedClock, SettableClock
 from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
-from tests.support.moving_map import write_moving_map
-from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
 S = 10**9
@@ -89,46 +81,6 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: 
             assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
 
 
-@each_way
-def test_the_demos_robot_stood_where_and_as_long_as_its_lap_says(
-    tmp_path: Path, recalls: bool
-) -> None:
-    now = BEGIN + 110 * S
-    recorder = DemoRecorder(tmp_path / "flat", MessageSchedule(BEGIN, BEGIN), clock=FixedClock(now))
-    recorder.write_until(now)
-    recorder.stop()
-    memory = memory_of(tmp_path, clock=SettableClock(now), recalls=recalls)
-    span = TimeRange(start_s=BEGIN / S + 5.0, end_s=BEGIN / S + 95.0)
-    answer = recap(memory, Call(), span, frame_id="odom")
-    assert answer.frame_id == "odom"
-    standing = [
-        (max(start, 5.0), min(end, 95.0)) for start, end in _standing(0.0, 110.0) if 5 < end < 95
-    ]
-    found = [each for each in answer.events if each.kind == "stop"]
-    assert len(found) == len(standing)
-    for stop, (began, ended) in zip(found, standing, strict=True):
-        assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.2)
-        assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.2)
-        here = demo_robot.pose((began + ended) / 2)
-        x, y = (float(part.split()[-1]) for part in stop.text.split(","))
-        assert math.dist((x, y), (here.x, here.y)) < 0.02
-
-
-def _standing(begin: float, end: float) -> list[tuple[float, float]]:
-    """When the demo's robot moves slower than 5 mm/s for at least 3 s, from its closed form."""
-    step = 0.02
-    spans: list[tuple[float, float]] = []
-    t = begin
-    while t < end:
-        start = t
-        while t < end and abs(demo_robot.twist(t)[0]) < 0.005:
-            t += step
-        if t - start >= 3.0:
-            spans.append((start, t))
-        t += step
-    return spans
-
-
 def _drive(
     bag_dir: Path, legs: list[tuple[float, float]], *, begin: float = 0.0, hz: int = 50
 ) -> list[tuple[float, float]]:
@@ -162,16 +114,6 @@ def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> N
     assert reply["shortest_stop_s"] == 3.0
     assert reply["stood_s"] == pytest.approx(8.0, abs=0.0401)
     assert reply["events"][0]["duration_s"] == reply["stood_s"]
-
-
-@each_way
-def test_a_window_that_ends_in_a_stop_counts_what_it_holds_of_it(
-    tmp_path: Path, recalls: bool
-) -> None:
-    _drive(tmp_path, [(6.0, 0.5), (10.0, 0.0), (6.0, 0.5)], begin=0.37)
-    memory = memory_of(tmp_path, recalls=recalls)
-    for begin, end, stood in [(13.27, 20, 3.1), (14.37, 22, 2.0), (0.4, 8.37, 2.0), (9, 9.5, 0.5)]:
-        assert (over(memory, begin, end).stood or 0) / S == pytest.approx(stood, abs=0.0201)
 
 
 def test_the_last_moment_of_a_stop_is_no_stop_of_the_window_that_begins_there(
@@ -219,36 +161,6 @@ def test_a_stop_goes_on_where_it_does_after_the_window_or_up_to_the_newest_pose(
     assert goes_on(ended) == [False]
     assert goes_on(ended + 3) == [False]
     assert goes_on(ended + 20) == [False, True]
-
-
-@each_way
-@pytest.mark.parametrize(("hz", "noise", "toggle"), [(10, 0.02, 0.0), (50, 0.0, 0.05)])
-def test_stops_under_noise_do_not_last_longer_than_the_window(
-    tmp_path: Path, recalls: bool, hz: int, noise: float, toggle: float
-) -> None:
-    draw = random.Random(11)
-    messages = [
-        odom(
-            BEGIN + nth * S // hz,
-            draw.gauss(0, noise) + draw.choice([0.0, toggle]),
-            draw.gauss(0, noise),
-            0.0,
-        )
-        for nth in range(180 * hz)
-    ]
-    for nth, at in enumerate(range(0, len(messages), 9 * hz)):
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 9 * hz])
-    memory = memory_of(tmp_path, recalls=recalls)
-    whole = over(memory, 0, 180)
-    parts = [over(memory, at, at + 30) for at in range(0, 180, 30)]
-    for answer in (whole, *parts):
-        assert answer.stood is not None
-        assert answer.stood <= answer.end - answer.start
-        stops = [each for each in answer.events if each.kind == "stop"]
-        assert all((one.end or 0) <= other.start for one, other in pairwise(stops))
-    assert sum(answer.stood or 0 for answer in parts) == pytest.approx(
-        whole.stood or 0, abs=0.2 * S
-    )
 
 
 def test_a_window_between_two_poses_of_a_stop_is_a_stop(tmp_path: Path) -> None:
@@ -497,14 +409,6 @@ def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
     assert event.text.endswith("…")
 
 
-def test_a_thing_that_was_missed_for_a_moment_did_not_leave(tmp_path: Path) -> None:
-    seen = [(1, "cup"), (2, ""), (3, "cup"), (4, ""), (5, ""), (8, "cup"), (9, "")]
-    messages = [detections(BEGIN + at * S, names.split()) for at, names in seen]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    answer = over(memory_of(tmp_path), 0, 10)
-    assert times(answer.events, "thing") == [("cup in view", 1.0), ("cup in view", 8.0)]
-
-
 @each_way
 def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     tmp_path: Path, recalls: bool
@@ -558,30 +462,6 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     assert len(reply) < 3_500
     keys = {"timestamp", "ago_s", "text", "duration_s", "score"}
     assert set(json.loads(reply)["events"][0]) == keys
-
-
-@settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
-def test_a_recap_is_the_same_whatever_the_catalogue_knows(seed: int, part: float) -> None:
-    draw = random.Random(seed)
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        moments = write_history(bag_dir, draw).moments
-        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()))
-        memory = with_store(plain, bag_dir, part=part)
-        everything = (min(moments) - S, max(moments) + S)
-        parts = [sorted(draw.choices(moments, k=2)) for _ in range(3)]
-        # What was joined of everything serves when it is asked for again.
-        for first, last in (*parts, everything, everything):
-            span = TimeRange(start_s=first / S, end_s=last / S)
-            assert _answer(memory, span) == _answer(plain, span)
-
-
-def _answer(memory: Memory, span: TimeRange) -> str:
-    try:
-        return repr(recap(memory, Call(), span))
-    except EpisodicError as error:
-        return repr(error)
 
 
 def test_a_stop_a_hair_below_0_is_reported_without_a_sign(tmp_path: Path) -> None:
@@ -704,29 +584,6 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
     assert refused["error"] == "invalid_arguments"
     robot = asked(memory, tmp_path, "recap", around=BEGIN / S + 20)["robot"]
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    seed=st.integers(0, 10_000),
-    part=st.sampled_from([0.3, 1.0]),
-    split_s=st.sampled_from([4.0, 10.0]),
-)
-def test_a_recap_of_a_place_is_the_same_whatever_the_catalogue_knows(
-    seed: int, part: float, split_s: float
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        if seed % 2:
-            write_moving_map(bag_dir, seed, seconds=60, split_s=split_s)
-        else:
-            write_history(bag_dir, random.Random(seed))
-        memory = in_places(memory_of(bag_dir))
-        known = with_store(memory, bag_dir, part=part)
-        for given in ({}, {"where": "room"}, {"where": {"x": [-1, 1], "y": [-1, 1]}}):
-            arguments = {"start": 0, "end": 4e9, **given}
-            one = asked(memory, bag_dir, "recap", **arguments)
-            assert one == asked(known, bag_dir, "recap", **arguments)
 
 
 @each_way

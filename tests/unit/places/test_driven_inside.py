@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import math
-import random
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Place, Rectangle
@@ -20,10 +16,8 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
-from tests.support.random_histories import write_history
 
 LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
@@ -124,28 +118,6 @@ def test_the_metres_of_a_stop_are_none_and_speeds_are_those_inside(tmp_path: Pat
     assert between(2, 6) == pytest.approx((4.0, 1.0), abs=0.02)
     assert between(10, 11) == pytest.approx((1.0, 0.2), abs=0.05)
     assert between(9, 12) == pytest.approx((2.98, 1.0), abs=0.05)
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
-# Of three poses within 0.2 s the middle one alone is a place.
-@example(seed=598, part=1.0, moving=False)
-def test_what_was_driven_inside_is_the_same_whatever_the_catalogue_knows(
-    seed: int, part: float, moving: bool
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        if moving:
-            write_moving_map(bag_dir, seed, seconds=60)
-        else:
-            write_history(bag_dir, random.Random(seed))
-        memory = in_places(memory_of(bag_dir))
-        known = with_store(memory, bag_dir, part=part)
-        for frame in ({}, {"frame_id": "map"}):
-            arguments = {"start": 0, "end": 4e9, "where": {"x": [-1, 1], "y": [-1, 1]}, **frame}
-            assert asked(memory, bag_dir, "trajectory_summary", **arguments) == asked(
-                known, bag_dir, "trajectory_summary", **arguments
-            )
 
 
 def test_a_jump_out_of_a_place_and_back_adds_nothing_to_what_few_poses_drove_inside(

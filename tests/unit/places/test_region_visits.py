@@ -3,28 +3,21 @@
 from __future__ import annotations
 
 import math
-import random
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory import queries
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import odom, tf, transform, write_mcap
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
-from tests.support.random_histories import write_history
 
 PLACES = (
     Place("corner", "map", Circle(4.0, 3.0, 0.5)),
@@ -100,20 +93,6 @@ def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(tmp_pat
     assert "dock" in str(asked(memory, tmp_path, "visits", by="day", **window))
 
 
-def test_a_window_cuts_visits(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 2, seconds=200)
-    memory = in_places(memory_of(tmp_path))
-    begin = BEGIN / S
-    whole = visits(memory, Call(), where="start", limit=100)
-    parts = [
-        visits(memory, Call(), where="start", start_s=begin + a, end_s=begin + b, limit=100)
-        for a, b in ((0, 2), (2, 90), (90, 400))
-    ]
-    assert sum(each.duration for each in parts) / S == pytest.approx(whole.duration / S, abs=0.01)
-    [first] = parts[0].visits
-    assert first.duration / S == pytest.approx(2.0, abs=0.3)
-
-
 @pytest.mark.parametrize(
     ("given", "reason"),
     [
@@ -177,42 +156,6 @@ def test_visits_in_the_poses_own_frame_are_those_of_the_recorded_poses(
         assert one.duration / S == pytest.approx(other.duration / S, abs=0.5)
         # Between two poses the robot may have been nearer than at either.
         assert (one.closest_m or 0.0) <= (other.closest_m or 0.0) + 0.06
-
-
-def answer(memory: Memory, given: dict[str, Any]) -> str:
-    replies = Replies(Path("/bags"), 24_000)
-    try:
-        return replies.answer(visits(memory, Call(), **given), from_active=False).text
-    except EpisodicError as error:
-        return replies.error(error).text
-
-
-@settings(max_examples=examples(15), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(
-    seed=st.integers(0, 10_000),
-    part=st.sampled_from([0.3, 1.0]),
-    split_s=st.sampled_from([4.0, 10.0, 25.0]),
-    moving=st.booleans(),
-)
-def test_visits_are_the_same_whatever_the_catalogue_knows(
-    seed: int, part: float, split_s: float, moving: bool
-) -> None:
-    with TemporaryDirectory() as folder:
-        if moving:
-            write_moving_map(Path(folder), seed, seconds=40, split_s=split_s)
-        else:
-            write_history(Path(folder), random.Random(seed))
-        memory = in_places(memory_of(Path(folder)))
-        known = with_store(memory, Path(folder), part=part)
-        for given in (
-            {},
-            {"where": "start"},
-            {"where": {"x": [-1, 1], "y": [-2, 2]}},
-            {"x": 0.5, "y": 0.0, "radius_m": 1.0},
-            {"where": {"x": 0, "y": 0, "radius_m": 1.0}, "frame_id": "odom"},
-            {"x": 0.5, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"},
-        ):
-            assert answer(memory, given) == answer(known, given)
 
 
 def test_the_poses_that_are_reported_in_a_place_are_visited(tmp_path: Path) -> None:

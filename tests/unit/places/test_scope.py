@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import random
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, NoDataError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
@@ -22,10 +18,8 @@ from ros2_memory.places.visits import visits
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.queries import position
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
-from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
-from tests.support.random_histories import write_history
 
 CUPS = "/vision/scene/scene_objects"
 PLACES = (
@@ -89,19 +83,6 @@ def test_matches_of_a_topic_with_two_types_count_whichever_came_last(
     assert found.last == BEGIN + 5 * S
 
 
-def test_a_topic_that_was_never_recorded_bounds_nothing(tmp_path: Path) -> None:
-    never = WhileCondition("/never", "equals", False)
-    with pytest.raises(NoDataError, match="/never"):
-        find_matches(
-            docking(tmp_path, changes=False),
-            Call(),
-            "/chatter",
-            "contains",
-            "hello",
-            during=(never,),
-        )
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_matches_count_while_the_robot_is_in_a_place(tmp_path: Path, seed: int) -> None:
     write_moving_map(tmp_path, seed, seconds=300)
@@ -151,55 +132,6 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
     assert reply["in"] == "room"
     with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         position(memory, Call(), AtTime(at_s=at / S), frame_id="moon")
-
-
-@pytest.mark.parametrize(
-    ("condition", "reason"),
-    [
-        ({"topic": "/is_docked"}, "needs a valid condition_type and value"),
-        ({"topic": "/is_docked", "condition_type": "equals", "value": 1, "x": 2}, 'has no "x"'),
-        (5, "not an object"),
-    ],
-)
-def test_what_is_no_condition_is_refused(tmp_path: Path, condition: object, reason: str) -> None:
-    given: dict[str, object] = {
-        "topic": "/chatter",
-        "condition_type": "contains",
-        "value": "hello",
-        "while": condition,
-    }
-    memory = docking(tmp_path, changes=True)
-    reply = asked(memory, tmp_path, "find_matches", **given)
-    assert reply["error"] == "invalid_arguments"
-    assert reason in reply["detail"]
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 10_000), part=st.sampled_from([0.3, 1.0]), moving=st.booleans())
-def test_scopes_are_the_same_whatever_the_catalogue_knows(
-    seed: int, part: float, moving: bool
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        if moving:
-            write_moving_map(bag_dir, seed, seconds=60)
-        else:
-            write_history(bag_dir, random.Random(seed))
-        memory = in_places(memory_of(bag_dir))
-        known = with_store(memory, bag_dir, part=part)
-        topic, word = (CUPS, "cup") if moving else ("/chatter", "cup")
-        for given in (
-            {"where": "room"},
-            {"where": {"x": [-1, 1], "y": [-1, 1]}},
-            {"while": {"topic": "/bumper", "condition_type": "equals", "value": True}},
-            {"while": {"topic": "/dock", "condition_type": "contains", "value": "un"}},
-        ):
-            arguments = {"topic": topic, "condition_type": "contains", "value": word, **given}
-            try:
-                one = asked(memory, bag_dir, "find_matches", **arguments)
-            except EpisodicError as error:
-                one = str(error)
-            assert one == asked(known, bag_dir, "find_matches", **arguments)
 
 
 @pytest.mark.parametrize("tool", ["find_matches", "find_last_match"])

@@ -72,18 +72,6 @@ def test_the_farthest_point_is_as_far_as_any_laid_along_the_way(
         assert np.hypot(*(other - here).T).min() == pytest.approx(point.away_m, abs=0.03)
 
 
-def test_a_detour_is_far_from_the_straight_way_and_not_the_other_way_round() -> None:
-    straight = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)])
-    detour = track([(0, 0, 0), (4, 4, 0), (6, 4, 2), (8, 6, 2), (10, 6, 0), (14, 10, 0)])
-    far, back = farthest_apart((detour, EVER), (straight, EVER))
-    assert far is not None
-    assert back is not None
-    assert (far.y, far.away_m) == (2.0, 2.0)
-    assert 4.0 <= far.x <= 6.0
-    assert far.time == pytest.approx((6 + far.x - 4) * S, abs=0.1 * S)
-    assert back.away_m == pytest.approx(1.0, abs=0.05)  # half of the way under the detour
-
-
 def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap() -> None:
     way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)], [(30.0, 10.0, 5.0), (40.0, 0.0, 5.0)])
     still = track([(0.0, 0.0, 0.0)])

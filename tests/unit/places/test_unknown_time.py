@@ -87,25 +87,6 @@ def test_visits_say_for_how_long_no_pose_is_known(tmp_path: Path, stored: bool) 
     assert table["placed_s"] + table["unknown_s"] == pytest.approx(table["recorded_s"], abs=0.2)
 
 
-@each_way
-@pytest.mark.parametrize(
-    ("start", "end", "unknown"),
-    [(0, 50, 0), (50, 70, 10.2), (100, 103, 3), (155, 170, 5), (159.9, 200, 0.1), (0, 219, 100.2)],
-)
-def test_the_unknown_time_of_a_window_is_what_lies_in_it(
-    tmp_path: Path, start: float, end: float, unknown: float, stored: bool
-) -> None:
-    memory = world(tmp_path, life(220, {"/odom": [(60, 160)]}), stored=stored)
-    window = {"start": T0 + start, "end": T0 + end}
-    for tool, asks in (("visits", FAR), ("find_matches", {**PRESSED, "where": FAR})):
-        reply = asked(memory, tmp_path, tool, **asks, **window)
-        assert reply["total"] == 0
-        assert reply.get("unknown_s", 0) == pytest.approx(unknown, abs=1e-3)
-        assert ("unknown_s" in reply) is (unknown > 0)
-        table = cells(asked(memory, tmp_path, tool, **asks, **window, by="hour"))
-        assert table.get("unknown_s", 0) == pytest.approx(unknown, abs=0.06)
-
-
 def test_a_window_without_any_pose_says_that_all_of_it_is_unknown(tmp_path: Path) -> None:
     memory = world(tmp_path, life(220, {"/odom": [(60, 160)], "/mood": [(60, 160)]}))
     window = {"start": T0 + 80, "end": T0 + 120}
@@ -239,6 +220,11 @@ def test_unknown_time_is_what_brute_force_says(seed: int, split_s: int, stored: 
             found = asked(memory, bag_dir, "find_matches", **PRESSED, **given, **window)
             expected = brute(times[name], *bounds) / S
             assert found.get("unknown_s", 0) == pytest.approx(expected, abs=1e-3)
+            assert ("unknown_s" in found) is (expected > 0)
+            by_hour = asked(
+                memory, bag_dir, "find_matches", **PRESSED, **given, **window, by="hour"
+            )
+            assert cells(by_hour).get("unknown_s", 0) == pytest.approx(expected, abs=0.06)
             if name == "/odom":
                 visited = asked(memory, bag_dir, "visits", **HERE, **window)
                 assert visited.get("unknown_s", 0) == found.get("unknown_s", 0)

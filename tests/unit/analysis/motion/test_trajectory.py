@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.odometry import MotionTotals
-from ros2_memory.analysis.motion.trajectory import TOLERANCE_M, Trajectory
+from ros2_memory.analysis.motion.trajectory import Trajectory
 from ros2_memory.analysis.poses import Poses
 from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import Pose, Vector3
@@ -107,10 +107,6 @@ def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
     assert found.max_speed == pytest.approx(5.0)
 
 
-def test_height_counts_in_the_length() -> None:
-    assert summarise(driven([(0, 0, 0), (0, 3, 4)]), LIMIT_MPS).totals.distance_m == 5.0
-
-
 # Of these none is at the origin, where odometry may have begun anew.
 elsewhere = points.map(lambda point: (abs(point[0]) + 10, point[1], point[2]))
 
@@ -125,17 +121,6 @@ def test_of_few_poses_the_distance_is_the_plain_length(
     assert found.max_speed is not None
     assert found.avg_speed is not None
     assert found.max_speed >= found.avg_speed
-
-
-@given(st.lists(elsewhere, min_size=1, max_size=7), st.lists(elsewhere, max_size=7))
-def test_distances_of_two_parts_that_share_a_pose_add_up(
-    before: list[Vector3], after: list[Vector3]
-) -> None:
-    whole = summarise(driven([*before, *after]), 1e9).totals.distance_m
-    parts = [
-        summarise(driven(part), 1e9).totals.distance_m for part in (before, [before[-1], *after])
-    ]
-    assert whole == pytest.approx(sum(parts), rel=1e-9, abs=1e-9)
 
 
 def test_no_pose_makes_an_empty_trajectory() -> None:
@@ -258,11 +243,6 @@ def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], c
     ] or not drawable
 
 
-def test_a_path_in_very_many_pieces_is_drawn_with_few() -> None:
-    found = summarise(driven((100.0 * (n % 3), 0.0, 0.0) for n in range(6000)), LIMIT_MPS)
-    assert (found.totals.jumps, len(found.waypoints) <= 50) == (5999, True)
-
-
 def test_exactly_the_plausible_speed_is_no_jump() -> None:
     found = summarise(driven(along_x(*(0.1 * i for i in range(50))), 10 * MS * 10), 1.0)
     assert found.totals.jumps == 0
@@ -284,11 +264,6 @@ def test_a_pose_that_is_no_place_is_left_out_and_counted(bad: float, axis: int) 
     assert all(math.isfinite(part) for point in found.waypoints for part in point.position)
 
 
-def test_only_invalid_poses_make_an_empty_trajectory() -> None:
-    found = summarise(driven([(math.nan, 0.0, 0.0)] * 3), LIMIT_MPS)
-    assert (found.poses, found.invalid, found.waypoints) == (0, 3, ())
-
-
 # Waypoints
 
 
@@ -302,13 +277,6 @@ def test_no_pose_is_farther_from_the_waypoints_than_the_stated_error(
     assert found.waypoint_error_m <= 0.05 or len(found.waypoints) == at_most or found.totals.jumps
 
 
-@given(st.lists(points, min_size=1, max_size=60))
-def test_enough_waypoints_stay_within_the_tolerance(positions: list[Vector3]) -> None:
-    found = summarise(driven(positions), LIMIT_MPS, 1000)
-    assert found.waypoint_error_m <= TOLERANCE_M * (1 + 1e-9)
-    assert farthest_off(positions, found) <= TOLERANCE_M + 1e-7
-
-
 @given(st.lists(points, min_size=2, max_size=60))
 def test_waypoints_are_recorded_poses_from_the_first_to_the_last(positions: list[Vector3]) -> None:
     poses = driven(positions)
@@ -320,11 +288,6 @@ def test_waypoints_are_recorded_poses_from_the_first_to_the_last(positions: list
     assert (times[0], times[-1]) == (poses[0][0], poses[-1][0])
 
 
-def test_a_straight_way_needs_its_ends_only() -> None:
-    found = summarise(driven(along_x(*range(100))), LIMIT_MPS)
-    assert [waypoint.position[0] for waypoint in found.waypoints] == [0, 99]
-
-
 def test_a_waypoint_carries_its_heading_where_the_pose_has_one() -> None:
     x, y, z, w = 0.0, 0.0, math.sin(0.25), math.cos(0.25)
     poses = [
@@ -334,11 +297,6 @@ def test_a_waypoint_carries_its_heading_where_the_pose_has_one() -> None:
     ]
     headings = [waypoint.yaw_rad for waypoint in summarise(poses, LIMIT_MPS).waypoints]
     assert headings == [pytest.approx(0.5), None, None]
-
-
-def test_the_end_of_a_long_stand_is_the_last_waypoint() -> None:
-    poses = driven([*along_x(0, 1), *[(1.0, 0.001 * (i % 3), 0.0) for i in range(50)]])
-    assert summarise(poses, LIMIT_MPS).waypoints[-1].time == poses[-1][0]
 
 
 # Long ways
