@@ -98,9 +98,10 @@ class ThingsBetween:
             if after.stay.place in known:
                 return False
         frame = self.known.frames[instance.epoch]
-        return any(
-            seen is not None and self._is_in(frame, seen.part.place) for seen in (before, after)
-        )
+        places = [seen.part.place for seen in (before, after) if seen is not None]
+        if self.where is None:
+            return bool(places)
+        return any(self.where.contains(frame, x, y) for x, y, _ in places)
 
     def _differs(
         self, instance: Instance, before: _Seen | None, after: _Seen | None
@@ -129,20 +130,9 @@ class ThingsBetween:
         for stay in reversed(instance.stays):
             rows = estimate.seen_in(stay.spots, window, before)
             if len(rows):
-                x, y, z = estimate.place_of(stay, rows)
-                spots = estimate.sights.spots[rows]
-                part = ThingStay(
-                    start=int(spots[:, Spot.FIRST].min()),
-                    end=int(spots[:, Spot.LAST].max()),
-                    place=(x, y, z),
-                    count=int(estimate.counts[rows].sum()),
-                    inside=places_at(self.places, frame, x, y),
-                )
-                return _Seen(stay, part)
+                place = estimate.place_of(stay, rows)
+                return _Seen(stay, self.known.stay(rows, place, frame, self.places))
         return None
-
-    def _is_in(self, frame: str, place: tuple[float, float, float]) -> bool:
-        return self.where is None or self.where.contains(frame, place[0], place[1])
 
     def _movers(self) -> Iterator[ComparedMover]:
         """Yields what moves by itself and was not seen alike in both windows."""
@@ -166,15 +156,7 @@ class ThingsBetween:
 
     def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
         estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
-        rows = estimate.seen_in(mover.spots, window, before)
-        if self.where is not None:
-            spots = estimate.sights.spots[rows]
-            rows = rows[
-                [
-                    self._is_in(frame, (x / 1000, y / 1000, 0))
-                    for x, y in spots[:, [Spot.X, Spot.Y]].tolist()
-                ]
-            ]
+        rows = self.known.seen_there(mover, window, self.where, before)
         if not len(rows):
             return None
         seen = estimate.sights.spots[rows]

@@ -216,12 +216,12 @@ class _Finder:
         if not parts:
             return
         last, newest = parts[-1]
-        if not self._is_there(self.known.frames[instance.epoch], last.x, last.y):
+        place, frame = _place(last), self.known.frames[instance.epoch]
+        if self.where is not None and not self.where.contains(frame, place[0], place[1]):
             return
         seen_last = max(int(result.sights.spots[rows, Spot.LAST].max()) for _, rows in parts)
         at_once = self._side_by_side(newest)
         describe = partial(self._described, instance, parts, at_once)
-        place = _place(last)
         is_vague = result.is_vague(np.concatenate([rows for _, rows in parts]))
         yield _Found(instance.label, names, seen_last, place, at_once, is_vague, describe, instance)
 
@@ -311,10 +311,7 @@ class _Finder:
     def _mover(self, mover: Mover, names: Collection[str]) -> Iterator[_Found]:
         """Yields a mover: where it was last seen, inside the region if one is given."""
         result, frame = self.known.estimate, self.known.frames[mover.epoch]
-        rows = result.seen_in(mover.spots, self.window)
-        if self.where is not None:
-            places = result.sights.spots[rows][:, [Spot.X, Spot.Y]].tolist()
-            rows = rows[[self._is_there(frame, x, y) for x, y in places]]
+        rows = self.known.seen_there(mover, self.window, self.where)
         if not len(rows):
             return
         spots = result.sights.spots[rows]
@@ -350,21 +347,11 @@ class _Finder:
             replace(one, inside=places_at(self.places, frame, *one.place[:2])) for one in found
         )
 
-    def _is_there(self, frame: str, x_mm: float, y_mm: float) -> bool:
-        return self.where is None or self.where.contains(frame, x_mm / _MM, y_mm / _MM)
-
     def _stay(self, frame: str, parts: Sequence[tuple[PlacedStay, Ints]]) -> ThingStay:
         """Returns the stays at one place in a row, as one."""
         last, _ = parts[-1]
         rows = np.concatenate([rows for _, rows in parts])
-        spots = self.known.estimate.sights.spots[rows]
-        return ThingStay(
-            start=int(spots[:, Spot.FIRST].min()),
-            end=int(spots[:, Spot.LAST].max()),
-            place=_place(last),
-            count=int(self.known.estimate.counts[rows].sum()),
-            inside=places_at(self.places, frame, last.x / _MM, last.y / _MM),
-        )
+        return self.known.stay(rows, _place(last), frame, self.places)
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
         """Returns the best score of some spots, and their median to 0.05, the width of a bin.

@@ -15,7 +15,17 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Hit, Ints, Score, Sights, Spot, Unplaced
+from ros2_memory.analysis.sights import (
+    SCORE_BINS,
+    Flags,
+    Floats,
+    Hit,
+    Ints,
+    Score,
+    Sights,
+    Spot,
+    Unplaced,
+)
 from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
@@ -38,12 +48,8 @@ from ros2_memory.things.synonyms import with_synonyms
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from numpy.typing import NDArray
-
     from ros2_memory.core.model import TimeWindow
 
-    Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 _FEWEST: Final = 3
 """Fewer detections are no thing: a detector sees what is not there."""

@@ -14,12 +14,15 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.sights import Ints, Spot
 from ros2_memory.columns.sights import joined
 from ros2_memory.core.errors import QueryTimeoutError
+from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.things.instances import Estimate, estimate
+from ros2_memory.results import ThingStay
+from ros2_memory.things.instances import Estimate, Mover, estimate
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import SIGHTS_NS, Stretch, Watching
 
@@ -78,6 +81,30 @@ class KnownThings:
     def reaches_back(self, window: TimeWindow) -> bool:
         """Returns whether the things of a whole window are known."""
         return self.since is None or self.since <= window.start
+
+    def seen_there(
+        self, mover: Mover, window: TimeWindow, where: Where | None, before: Ns = MAX_NS
+    ) -> Ints:
+        """Returns the spots of a mover in a region, of slices as `Estimate.seen_in` takes them."""
+        rows = self.estimate.seen_in(mover.spots, window, before)
+        if where is None:
+            return rows
+        frame = self.frames[mover.epoch]
+        places = (self.estimate.sights.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
+        return rows[[where.contains(frame, x, y) for x, y in places]]
+
+    def stay(
+        self, rows: Ints, place: tuple[float, float, float], frame: str, places: Sequence[Place]
+    ) -> ThingStay:
+        """Returns some spots as the stay of a thing at a place (m) of a frame."""
+        spots = self.estimate.sights.spots[rows]
+        return ThingStay(
+            start=int(spots[:, Spot.FIRST].min()),
+            end=int(spots[:, Spot.LAST].max()),
+            place=place,
+            count=int(self.estimate.counts[rows].sum()),
+            inside=places_at(places, frame, place[0], place[1]),
+        )
 
 
 def known_things(

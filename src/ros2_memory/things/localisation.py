@@ -6,17 +6,12 @@ odometry, which shows that it had been off.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
-from ros2_memory.analysis.sights import AHEAD_MM, Fix, Ints, Look, Sights, Spot
+from ros2_memory.analysis.sights import AHEAD_MM, Fix, Flags, Ints, Look, Sights, Spot
 from ros2_memory.core.timebase import NS_PER_S
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    Flags = NDArray[np.bool_]
 
 _POOR_MM: Final = 600
 """Standard deviation of a point 2 m before the robot."""

@@ -18,11 +18,8 @@ from ros2_memory.core.timebase import NS_PER_S
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
+    from ros2_memory.analysis.sights import Floats, Ints
 
-    from ros2_memory.analysis.sights import Ints
-
-    Floats = NDArray[np.float64]
 
 _PAUSE_NS: Final = 60 * NS_PER_S
 """A visit ends where nothing is seen for longer."""

@@ -14,11 +14,8 @@ import numpy as np
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from ros2_memory.analysis.sights import Floats, Ints
 
-    from ros2_memory.analysis.sights import Ints
-
-    Floats = NDArray[np.float64]
 
 _CELL_MM: Final = 100
 _PEAK_MM: Final = 300

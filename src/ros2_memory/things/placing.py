@@ -17,7 +17,16 @@ import numpy as np
 from ros2_memory.analysis.frames import Frames, Rotations
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
-from ros2_memory.analysis.sights import AHEAD_MM, SLICE_NS, Seen, Sights, fixes_of, sights_of
+from ros2_memory.analysis.sights import (
+    AHEAD_MM,
+    SLICE_NS,
+    Floats,
+    Ints,
+    Seen,
+    Sights,
+    fixes_of,
+    sights_of,
+)
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.model import TimeWindow
@@ -28,14 +37,10 @@ from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.transforms import frames_over, sessions_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
-    Ints = NDArray[np.int64]
-    Floats = NDArray[np.float64]
 
 LOCALISER: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 _NEAR_NS: Final[Ns] = NS_PER_S

@@ -15,16 +15,21 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import CELL_DECIDEG, CELL_MM, Hit, Ints, Look, Sights
+from ros2_memory.analysis.sights import (
+    CELL_DECIDEG,
+    CELL_MM,
+    Flags,
+    Floats,
+    Hit,
+    Ints,
+    Look,
+    Sights,
+)
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ros2_memory.core.timebase import Ns
 
-    Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 _FALSE_RATE: Final = 0.01
 """How often a message has a label at a place where there is no such thing."""

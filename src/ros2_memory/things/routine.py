@@ -21,11 +21,10 @@ from ros2_memory.results import UsualPlace
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    from ros2_memory.analysis.sights import Ints
+    from ros2_memory.analysis.sights import Floats, Ints
 
-    Floats = NDArray[np.float64]
 
 _HOUR_NS: Final = 3600 * NS_PER_S
 _DAY_H: Final = 24

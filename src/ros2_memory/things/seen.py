@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import static_in
-from ros2_memory.analysis.sights import SLICE_NS
+from ros2_memory.analysis.sights import SLICE_NS, Flags, Ints
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
 from ros2_memory.columns.sights import packed
@@ -31,15 +31,10 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
-    Ints = NDArray[np.int64]
-    Floats = NDArray[np.float64]
-    Flags = NDArray[np.bool_]
 
 VERSION: Final = 2
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
