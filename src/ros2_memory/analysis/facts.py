@@ -24,10 +24,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
 
-    Ints: TypeAlias = "NDArray[np.int64]"
     Floats: TypeAlias = "NDArray[np.float64]"
 
 LOG: Final = "rcl_interfaces/msg/Log"
@@ -139,7 +139,7 @@ def charge_levels(charges: Floats) -> Ints:
         return np.where((charges >= 0) & (charges <= _PERCENT), levels, -1)
 
 
-def is_still(numbers: Floats, error: float = 0.0) -> NDArray[np.bool_]:
+def is_still(numbers: Floats, error: float = 0.0) -> Flags:
     """Returns which numbers of a command are zero even if they are off by `error`."""
     with np.errstate(invalid="ignore"):
         return np.abs(numbers) + error < _STILL
@@ -283,7 +283,7 @@ class Facts(NamedTuple):
         kept[kept] = rows[place[kept]] == self.rows[kept]
         return self._replace(rows=place)._chosen(kept)
 
-    def _chosen(self, kept: NDArray[np.bool_]) -> Facts:
+    def _chosen(self, kept: Flags) -> Facts:
         return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)
 
 

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Flags, Ints
+
 SILENCE_NS: Final[Ns] = 10 * NS_PER_S
 """After so long without a message an object counts as gone: many detectors publish only what
 they see."""
@@ -54,9 +56,7 @@ _FROM_START: Final = 1
 _TO_END: Final = 2
 
 
-def pieces_of(
-    starts: NDArray[np.int64], stops: NDArray[np.int64], silence_ns: Ns = SILENCE_NS
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pieces_of(starts: Ints, stops: Ints, silence_ns: Ns = SILENCE_NS) -> tuple[Ints, Ints]:
     """Returns when the pieces of spans begin and end, in order. A silence parts them."""
     order = np.argsort(starts, kind="stable")
     starts, stops = starts[order], stops[order]
@@ -108,7 +108,7 @@ class IntervalTable(NamedTuple):
             for first, last, label, *_, best in rows
         )
 
-    def spans(self) -> dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    def spans(self) -> dict[str, tuple[Ints, Ints]]:
         """Returns by label the first and the last time of each of its intervals, in order."""
         rows = _rows(self.rows)
         of = [rows[rows["label"] == place] for place in range(len(self.labels))]
@@ -184,9 +184,9 @@ class IntervalPart(NamedTuple):
 
 
 def visible_in(
-    times: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    codes: NDArray[np.int64],
+    times: Ints,
+    rows: Ints,
+    codes: Ints,
     scores: NDArray[np.float64],
     labels: Sequence[str],
 ) -> IntervalTable:
@@ -220,7 +220,7 @@ def visible_in(
     return IntervalTable(tuple(sorted(names)), _continued(seen, at, goes_on))
 
 
-def _stored_scores(scores: NDArray[np.float64]) -> NDArray[np.int64]:
+def _stored_scores(scores: NDArray[np.float64]) -> Ints:
     # The least number stands for no score.
     most = -_NO_SCORE - 1
     with np.errstate(invalid="ignore"):
@@ -240,7 +240,7 @@ def united(tables: Sequence[IntervalTable]) -> IntervalTable:
     return _merged(tables, np.zeros(len(tables), np.bool_))
 
 
-def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> IntervalTable:
+def _merged(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTable:
     """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
     rows = _rows(b"".join([each.rows for each in tables]))
     if not rows.size:
@@ -259,7 +259,7 @@ def _merged(tables: Sequence[IntervalTable], follow: NDArray[np.bool_]) -> Inter
     return IntervalTable(labels, _continued(rows, reach, goes_on))
 
 
-def _continued(rows: Rows, reach: NDArray[np.int64], goes_on: NDArray[np.bool_]) -> bytes:
+def _continued(rows: Rows, reach: Ints, goes_on: Flags) -> bytes:
     """Returns rows, sorted by label, as those of an `IntervalTable`: some go on in the next one.
 
     `reach` is the latest end of each and of those of its label before it.
@@ -293,7 +293,7 @@ def _shared_labels(
     return labels, np.array(places, np.intp)[begin[part] + label]
 
 
-def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64]:
+def _reach(label: NDArray[np.intp], last: Ints) -> Ints:
     """Returns the latest end of each row and of those before it of its label; sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last
@@ -302,17 +302,17 @@ def _reach(label: NDArray[np.intp], last: NDArray[np.int64]) -> NDArray[np.int64
     rank[by_time] = np.arange(len(last))
     # Labels are whole tables apart, so that the running maximum starts again at each label.
     far = label * len(last)
-    latest: NDArray[np.int64] = last[by_time[np.maximum.accumulate(rank + far) - far]]
+    latest: Ints = last[by_time[np.maximum.accumulate(rank + far) - far]]
     return latest
 
 
-def _longest_pause(rows: Rows) -> NDArray[np.int64]:
+def _longest_pause(rows: Rows) -> Ints:
     """Returns, for each row, the longest pause between messages at the detector's usual rate."""
     spans = rows["last"] - rows["first"]
     # An object seen once has no known rate: it may have been missed for a moment, at most.
     usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
     pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
-    longest: NDArray[np.int64] = np.minimum(pause, SILENCE_NS)
+    longest: Ints = np.minimum(pause, SILENCE_NS)
     return longest
 
 

@@ -19,7 +19,8 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from ros2_memory.analysis.facts import Ints, Stated, Word
+    from ros2_memory.analysis.facts import Stated, Word
+    from ros2_memory.core.arrays import Ints
 
 MAX_PER_BAG: Final = 64
 """Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="DataclassInstance")
 Scalar = TypeVar("Scalar", bound="np.generic[object]")
 Ints: TypeAlias = NDArray[np.int64]
+Flags: TypeAlias = NDArray[np.bool_]
 
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 

@@ -34,8 +34,9 @@ from ros2_memory.results import BinColumn, Bins, Usual
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
 
@@ -149,13 +150,13 @@ class BinnedWindow:
         self.add("last", "time", last, max(stops.tolist(), default=None))
         self.usual = self.usual_of(begins)
 
-    def add_first(self, column: str, times: NDArray[np.int64]) -> None:
+    def add_first(self, column: str, times: Ints) -> None:
         """Adds the first of these times in each bin."""
         among = self.bins.among(times)
         first = [int(times[each].min()) if each.any() else None for each in among.T]
         self.add(column, "time", first, min(times.tolist(), default=None))
 
-    def _last_held(self, starts: NDArray[np.int64], stops: NDArray[np.int64]) -> Values:
+    def _last_held(self, starts: Ints, stops: Ints) -> Values:
         """Returns for each bin when something held there for the last time."""
         found: list[float | None] = [None] * len(self.bins.names)
         begin, end = self.bins.pieces(starts), self.bins.pieces(stops)
@@ -169,7 +170,7 @@ class BinnedWindow:
             found[number] = None if latest == MIN_NS else latest
         return found
 
-    def usual_of(self, times: NDArray[np.int64]) -> Usual | None:
+    def usual_of(self, times: Ints) -> Usual | None:
         """Returns the usual time of day of the first of these times in each day."""
         firsts = first_of_days(self.bins, times)
         return usual_time(firsts, self._days_recorded()) if firsts else None
@@ -186,7 +187,7 @@ class BinnedWindow:
                 found.add(day)
         return len(found)
 
-    def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.int64]:
+    def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
         """Returns how much time (ns) of half-open spans passed in each bin."""
         starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._ends)
         lengths = self.bins.lengths(starts, stops)

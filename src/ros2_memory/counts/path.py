@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.motion.trajectory import Line
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.robot_tracks import Inside
@@ -70,7 +71,7 @@ def count_path(
     return binned.answer()
 
 
-def _upto(line: Line, inside: Sequence[Inside], edges: NDArray[np.int64]) -> NDArray[np.float64]:
+def _upto(line: Line, inside: Sequence[Inside], edges: Ints) -> NDArray[np.float64]:
     """Returns how many metres were driven in some times before each edge."""
     metres = np.zeros(len(edges))
     for one in inside:

@@ -23,8 +23,7 @@ from ros2_memory.places.where import Where, places_setting
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import NDArray
-
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.history.view import View
 
@@ -71,7 +70,7 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
     return TimeBins(names, edges, member, None)
 
 
-def _covered(edges: NDArray[np.int64], spans: Sequence[tuple[Ns, Ns]]) -> NDArray[np.bool_]:
+def _covered(edges: Ints, spans: Sequence[tuple[Ns, Ns]]) -> Flags:
     """Returns for each piece between two edges whether it lies in one of some half-open spans."""
     starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
     begun = np.searchsorted(starts, edges[:-1], side="right")

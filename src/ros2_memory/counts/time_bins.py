@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import TimeWindow
 
 ClockBin: TypeAlias = Literal["day", "hour", "weekday"]
@@ -70,20 +71,20 @@ class TimeBins:
     """
 
     names: tuple[str, ...]
-    edges: NDArray[np.int64]
-    member: NDArray[np.bool_]
-    day_of: NDArray[np.int64] | None
+    edges: Ints
+    member: Flags
+    day_of: Ints | None
 
     def pieces(self, times: ArrayLike) -> NDArray[np.intp]:
         """Returns the piece of each time; times outside of the window count to its ends."""
         found = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
         return np.clip(found, 0, len(self.member) - 1)
 
-    def among(self, times: ArrayLike) -> NDArray[np.bool_]:
+    def among(self, times: ArrayLike) -> Flags:
         """Returns for each time and each bin whether it is in the bin; as `pieces` for others."""
         return self.member[self.pieces(times)]
 
-    def lengths(self, starts: ArrayLike, stops: ArrayLike) -> NDArray[np.int64]:
+    def lengths(self, starts: ArrayLike, stops: ArrayLike) -> Ints:
         """Returns how much (ns) of half-open spans falls into each bin, all spans together.
 
         What lies outside of the window does not count.
@@ -95,7 +96,7 @@ class TimeBins:
         return np.diff(until) @ self.member.astype(np.int64)
 
 
-def _passed(edges: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:
+def _passed(edges: Ints, times: Ints) -> Ints:
     """Returns for each edge how long ago the times before it were, added up.
 
     Sums may wrap around; so do their differences, which are what is wanted.
@@ -195,9 +196,9 @@ class TrueIntervals:
         begun: whether it is known that each began then; else it held before, or that is not known.
     """
 
-    starts: NDArray[np.int64]
-    stops: NDArray[np.int64]
-    begun: NDArray[np.bool_]
+    starts: Ints
+    stops: Ints
+    begun: Flags
 
     @classmethod
     def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> TrueIntervals:

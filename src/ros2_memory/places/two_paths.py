@@ -17,9 +17,8 @@ from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from numpy.typing import NDArray
-
     from ros2_memory.analysis.frames import Floats, Times
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.regions import Region
     from ros2_memory.core.timebase import Ns
@@ -196,7 +195,7 @@ def placed_standstills(
             yield PlacedStandstill(here, there, start, stop - start)
 
 
-def _is_known(track: RobotTrack, at: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_known(track: RobotTrack, at: Ints) -> Flags:
     """Returns whether a track covers some times."""
     last = np.searchsorted(track.times, at, side="right") - 1
     following = np.minimum(last + 1, len(track.times) - 1)

@@ -45,11 +45,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.analysis.poses import Floats, Poses, Vectors
+    from ros2_memory.core.arrays import Flags, Ints
     from ros2_memory.core.model import Vector3
 
-    Ints: TypeAlias = NDArray[np.int64]
-    Marks: TypeAlias = NDArray[np.bool_]
-    Corners: TypeAlias = NDArray[np.int32] | NDArray[np.int64]
+    Corners: TypeAlias = NDArray[np.int32] | Ints
 
 SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
@@ -158,10 +157,10 @@ class Blocks:
         """Returns the lower and the upper corners (m)."""
         return self.lows / PER_METRE, self.highs / PER_METRE
 
-    def are_still(self) -> Marks:
+    def are_still(self) -> Flags:
         """Returns whether drift and noise explain the boxes."""
         lows, highs = self.corners()
-        found: Marks = _lengths(highs - lows) <= np.minimum(
+        found: Flags = _lengths(highs - lows) <= np.minimum(
             np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64)), LARGEST_M
         )
         return found
@@ -318,7 +317,7 @@ class _Slots:
         bends, begins, stops = self._bends
         return _noises(bends, begins, stops)
 
-    def links(self) -> Marks:
+    def links(self) -> Flags:
         """Returns whether the robot may have stood still from each slot to the next with poses."""
         follows = self.firsts[1:] - self.lasts[:-1] <= SILENCE_NS
         apart_m = _lengths(np.diff(self.means, axis=0))
@@ -332,7 +331,7 @@ class _Slots:
             factor = _NOISE_FACTOR * (1 + 4 / many) * spread
             noise = _noises(bends, begins[unsure], stops[unsure + 1])
             allowed_m[unsure] = np.maximum(allowed_m[unsure], factor * noise)
-        linked: Marks = follows & (apart_m <= allowed_m)
+        linked: Flags = follows & (apart_m <= allowed_m)
         return linked
 
     def edge(self, at: int, other: int, step: int) -> Ns:
@@ -436,7 +435,7 @@ def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Itera
         yield Box3((a, b, c), (d, e, f))
 
 
-def _runs(marks: Marks, chain: Ints) -> tuple[Ints, Ints]:
+def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
     """Returns where the ranges in one chain in which marks are set begin, and where they stop."""
     is_new = np.r_[True, (np.diff(chain) != 0) | ~marks[:-1]]
     is_over = np.r_[(np.diff(chain) != 0) | ~marks[1:], True]
@@ -474,7 +473,7 @@ def _in_run(
             start = until
 
 
-def _creeping(blocks: Blocks, chain: Ints, still: Marks) -> Marks:
+def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
     run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
     low, high = blocks.corners()

@@ -27,9 +27,8 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from numpy.typing import NDArray
-
     from ros2_memory.analysis.poses import Floats, Poses, Vectors
+    from ros2_memory.core.arrays import Flags
     from ros2_memory.core.model import Vector3
     from ros2_memory.storage.base import IntArray
 
@@ -131,7 +130,7 @@ class Line:
     metres: Floats
     places: Vectors
     headings: Floats
-    jumps: NDArray[np.bool_]
+    jumps: Flags
 
     def __len__(self) -> int:
         """Returns the number of vertices."""
