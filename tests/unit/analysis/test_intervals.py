@@ -180,6 +180,15 @@ def test_a_thing_is_seen_throughout_where_it_is_seen_at_the_usual_rate(
     assert ("a" in joined(parts).visible.throughout(0, 65 * NS_PER_S)) is is_seen
 
 
+def test_a_thing_that_is_not_seen_any_more_is_not_there_still() -> None:
+    messages = each_s(0, 20, 0.2, "a")
+    last = messages[-1][0]
+    seen = watched(messages).visible
+    assert seen.at_end(last, last + NS_PER_S) == ["a"]
+    assert seen.at_end(last, last + 2 * NS_PER_S) == []
+    assert seen.at_end(last - 1, last) == []
+
+
 @given(histories())
 def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
     messages: Messages,
