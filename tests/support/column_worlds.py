@@ -25,7 +25,7 @@ from tests.support.leaves import Comparison
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from pathlib import Path
 
     from ros2_memory.columns.table import Table
@@ -139,9 +139,26 @@ def check_rows(
         except UndecodableError:
             decoded = None
         expected[message.record.log_time, message.record.channel.type].append(decoded)
-    for key in found.keys() | expected.keys():
-        _check_one_time(f"{topic} at {key}", found[key], expected[key])
+    alone: dict[int, tuple[Table, list[int], list[object]]] = {}
+    for key in sorted(found.keys() | expected.keys()):
+        rows_then, messages = found[key], expected[key]
+        if len(rows_then) != 1 or len(messages) != 1 or messages[0] is None:
+            _check_one_time(f"{topic} at {key}", rows_then, messages)
+            continue
+        [(table, row)] = rows_then
+        if "" not in table.left_out:
+            _, indices, of_table = alone.setdefault(id(table), (table, [], []))
+            indices.append(row)
+            of_table.append(messages[0])
+    for table, indices, of_table in alone.values():
+        comparison = Comparison(_error_of(table))
+        comparison.table(table.rows(np.array(indices)), of_table)
+        assert comparison.wrong == [], f"{topic}: {comparison.wrong[:3]}"
     return sum(map(len, found.values()))
+
+
+def _error_of(table: Table) -> Callable[[str], float]:
+    return table.error if isinstance(table, StoredTable) else lambda _: 0.0
 
 
 def _check_one_time(where: str, rows: list[tuple[Table, int]], messages: list[object]) -> None:
@@ -152,10 +169,9 @@ def _check_one_time(where: str, rows: list[tuple[Table, int]], messages: list[ob
             messages = messages[1:]
             left = left[1:]
             continue
-        error = table.error if isinstance(table, StoredTable) else lambda _: 0.0
         wrong: list[str] = []
         for nth, message in enumerate(left):
-            comparison = Comparison(error)
+            comparison = Comparison(_error_of(table))
             comparison.table(table.rows(np.array([row])), [message])
             if not comparison.wrong:
                 del left[nth]

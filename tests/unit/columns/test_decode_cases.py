@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -22,7 +21,6 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,
     Msg,
-    boolean,
     detections,
     header,
     make,
@@ -49,10 +47,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from mcap.writer import Writer
-
-    from ros2_memory.storage.base import Channel
-
-EVERYTHING: Final = TimeWindow.everything()
 
 
 def path_message(ns: int, points: int) -> Msg:
@@ -183,14 +177,6 @@ def test_a_hostile_payload_changes_no_other_message(tmp_path: Path, bad: bytes) 
     assert table.log_times.tolist() == [0, 2, 3, 4]
 
 
-def test_big_endian_messages_are_decoded(tmp_path: Path) -> None:
-    table = strings(
-        tmp_path / "a.mcap",
-        [text(0, "little").payload, struct.pack(">4sI", b"\0\0\0\0", 4) + b"big\0"],
-    )
-    assert texts(table, "data") == ["little", "big"]
-
-
 def test_a_definition_that_changes_between_bags_is_read_with_that_of_each(tmp_path: Path) -> None:
     old = DrawnTypes((("State", (DrawnField("level", "int8"),)),))
     new = DrawnTypes((("State", (DrawnField("name", "string"), DrawnField("level", "float64"))),))
@@ -203,15 +189,6 @@ def test_a_definition_that_changes_between_bags_is_read_with_that_of_each(tmp_pa
         [table] = tables_of(reader, bag_of(tmp_path / f"{nth}.mcap", types, [payload]))
         assert set(table.columns) == ({"level"} if types is old else {"name", "level"})
         assert numbers(table, "level") == [7 if types is old else 7.5]
-
-
-def test_two_types_on_one_topic_are_two_tables(tmp_path: Path) -> None:
-    messages = [text(1, "one", "/t"), boolean(2, True, "/t"), text(3, "three", "/t")]
-    tables = tables_of(McapReader(), write_mcap(tmp_path / "a.mcap", messages))
-    assert {table.channel.type: table.log_times.tolist() for table in tables} == {
-        "std_msgs/msg/String": [1, 3],
-        "std_msgs/msg/Bool": [2],
-    }
 
 
 def two_publishers(path: Path) -> Path:
@@ -229,11 +206,6 @@ def two_publishers(path: Path) -> Path:
     return raw_mcap(path, fill, profile="ros2")
 
 
-def test_two_publishers_of_one_topic_are_one_table(tmp_path: Path) -> None:
-    [[table]] = groups_of(two_publishers(tmp_path / "a.mcap"))
-    assert numbers(table, "level") == list(range(9))
-
-
 def test_bags_that_are_decoded_together_have_the_rows_that_they_have_alone(
     tmp_path: Path, fallbacks: list[str]
 ) -> None:
@@ -246,14 +218,6 @@ def test_bags_that_are_decoded_together_have_the_rows_that_they_have_alone(
     paths.append(two_publishers(tmp_path / "two.mcap"))
     decoded_together_alike(McapReader(), paths)
     assert set(fallbacks) == {"/chatter"}
-
-
-def test_every_one_of_649_topics_has_its_table(tmp_path: Path) -> None:
-    messages = [text(nth, f"of {nth % 649}", f"/topic_{nth % 649:03}") for nth in range(1400)]
-    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=5000))
-    [tables] = groups_of(path)
-    assert len(tables) == 649
-    assert compared(McapReader(), path, tables).wrong == []
 
 
 def mixed(count: int) -> list[Msg]:
@@ -292,48 +256,11 @@ def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
     assert {len(table) for table in tables} == {len(table) for table in whole}
 
 
-def test_rows_of_a_table_keep_their_elements_and_words(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", mixed(12))
-    reader = McapReader()
-    everything = TimeWindow.everything()
-    for table in tables_of(reader, path):
-        messages = [
-            reader.decode(record)
-            for record in reader.records(path, [table.channel.topic], everything)
-        ]
-        chosen = [9, 2, 2, 0, 11]
-        comparison = Comparison()
-        comparison.table(table.rows(np.array(chosen)), [messages[nth] for nth in chosen])
-        assert comparison.wrong == []
-        for column in table.rows(np.array([3])).columns.values():
-            assert not isinstance(column, Texts) or len(column.words) == 1
-
-
 def test_only_the_window_and_the_topics_asked_for_are_decoded(tmp_path: Path) -> None:
     path, reader = write_mcap(tmp_path / "a.mcap", mixed(12)), McapReader()
     [[table]] = decoded(reader, pieces(reader, path, TimeWindow(20, 60), topics=["/chatter"]))
     assert table.channel.topic == "/chatter"
     assert table.log_times.tolist() == [22, 32, 42, 52]
-
-
-def test_payloads_are_hashed_where_that_is_asked_for(tmp_path: Path) -> None:
-    messages = mixed(4)
-    path = write_mcap(tmp_path / "a.mcap", messages)
-
-    def chatter(channel: Channel) -> bool:
-        return channel.topic == "/chatter"
-
-    reader = McapReader()
-    [tables] = decoded(reader, pieces(reader, path, hashed=chatter))
-    for table in tables:
-        expected = [
-            zlib.crc32(each.payload) for each in messages if each.topic == table.channel.topic
-        ]
-        if table.channel.topic == "/chatter":
-            assert table.payload_hashes is not None
-            assert table.payload_hashes.tolist() == expected
-        else:
-            assert table.payload_hashes is None
 
 
 def image(ns: int, size: int = 3000) -> Msg:
@@ -438,10 +365,6 @@ def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) ->
     groups = groups_of(tmp_path / "gone.mcap")
     with pytest.raises(BagVanishedError):
         next(groups)
-
-
-def test_an_empty_bag_has_no_group(tmp_path: Path) -> None:
-    assert list(groups_of(write_mcap(tmp_path / "a.mcap", []))) == []
 
 
 def test_messages_that_count_elsewhere_have_no_row(tmp_path: Path) -> None:

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
-from ros2_memory.columns.pack import pack, unpack
-from ros2_memory.columns.steps import MOST_RELATIVE, step_of
-from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.table import Table
 from ros2_memory.messages.detections import Detection, detections_of
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.support.shared_bags import needs_real, needs_recorded, shared_samples
-from tests.unit.columns.drawn_tables import Drawn, drawn_of, drawn_tables, rounded, store, stored
+from tests.unit.columns.drawn_tables import Drawn, drawn_tables, rounded, stored
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -102,19 +99,6 @@ def test_detections_of_common_types_need_no_reading(drawn: Drawn) -> None:
 @given(drawn_tables(SETTLED), st.sampled_from([0.0, 1e-6]))
 def test_stored_columns_detect_the_same_but_for_rounding(drawn: Drawn, step: float) -> None:
     compared(stored(drawn.table, step), drawn.messages, step)
-
-
-def test_a_small_score_is_compared_as_its_column_was_rounded() -> None:
-    """A step of a millionth leaves three digits of it; a store rounds scores to more of them."""
-    build = store().types["own_msgs/msg/Label"]
-    drawn = drawn_of("own_msgs/msg/Label", [build("cup", 0.00013342, 0.5, -0.00013342)])
-    for step in (0.0, 1e-6):
-        assert compared(stored(drawn.table, step), drawn.messages, step)
-    scores = np.array([0.00013342, 0.7], np.float32)
-    packed = pack(scores, step_of("score", drawn.table.definition))
-    kept = unpack(packed.codec, packed.count, packed.zone.least, packed.data)
-    assert not isinstance(kept, Texts)
-    assert kept.tolist() == pytest.approx(scores.tolist(), rel=MOST_RELATIVE)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.columns.fragments import Fragment, FragmentKey, Fragments, Kind
-from ros2_memory.columns.motion import PATHS, STANDS
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -167,20 +166,6 @@ def test_a_damaged_fragment_is_made_again(world: World, tmp_path: Path) -> None:
     view = View(again.memory, Call())
     slices = [*slices_of_path(view, "/odom", EVERYTHING, [])]
     assert sum(path.poses for _, path in slices) == 3000
-
-
-@pytest.mark.parametrize("kind", [PATHS, STANDS], ids=lambda kind: kind.name)
-def test_filling_makes_the_slices_of_a_drive_that_a_question_would(
-    world: World, tmp_path: Path, kind: Kind[Words]
-) -> None:
-    with closing(sqlite3.connect(store_file(tmp_path))) as base:
-        like = f"{kind.name} %"
-        rows = base.execute("SELECT data FROM fragment WHERE kind LIKE ?", (like,)).fetchall()
-    assert rows
-    for (data,) in rows:
-        loaded = kind.load(Fragment.from_bytes(data))
-        stored = kind.store(loaded)
-        assert stored.to_bytes() == data
 
 
 def test_stored_slices_of_a_path_are_those_that_are_measured_now(world: World) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import random
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -147,34 +146,6 @@ def test_extreme_integers_come_back_as_they_were(column: Values) -> None:
     assert unpacked(pack(column)).tolist() == column.tolist()
 
 
-@pytest.mark.parametrize("step", STEPS, ids=str)
-@pytest.mark.parametrize(
-    "values",
-    [
-        [5e-324, 1e-310, 0.0],
-        [1e308, -1e308, 1.7976931348623157e308],
-        [math.inf, 1.0, -math.inf],
-        [math.nan, 1.0, -0.0, 3.3],
-        [2.0**53 + 2, 1.0, 2.0**60],
-        [1e-3, 1e6 + 1e-9, -1e6],
-    ],
-)
-def test_floats_without_a_step_are_exact_or_relatively_near(
-    values: list[float], step: Step
-) -> None:
-    column = np.array(values)
-    packed = pack(column, step)
-    most = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-    assert packed.error <= max(MOST_RELATIVE * most * step.relative, 0.5e-4)
-    rest = ~np.isfinite(column)
-    assert np.array_equal(unpacked(packed)[rest], column[rest], equal_nan=True)
-
-
-def test_values_of_a_step_come_back_as_its_nearest_multiples() -> None:
-    column = np.array([1.23456789, -0.1, 0.30004999, 7.0])
-    assert unpacked(pack(column, METRES)).tolist() == [1.2346, -0.1, 0.3, 7.0]
-
-
 def test_decimals_in_single_precision_are_exact_and_small() -> None:
     speeds = np.round(np.sin(np.arange(500) / 30), 3).astype(np.float32)
     packed = pack(speeds, RELATIVE)
@@ -216,11 +187,6 @@ def test_words_that_no_row_has_are_not_packed() -> None:
     assert unpacked(packed).values() == ["table", "cup", "table"]
 
 
-def test_words_of_a_zone_are_casefolded_and_distinct() -> None:
-    zone = pack(Texts.of(["Cup", "cup", "STRASSE", "Straße"])).zone
-    assert zone.words == "cup\nstrasse"
-
-
 def test_a_zone_of_too_many_texts_keeps_the_letters_in_them() -> None:
     texts = [f'{{"label": "Größe {number}", "score": 0.{number}}}' for number in range(1000)]
     zone = pack(Texts.of(texts)).zone
@@ -245,20 +211,6 @@ def test_a_zone_rules_out_only_texts_that_are_in_no_value(values: list[str], tex
         zone = pack(Texts.of([*values, *padding])).zone
         if any(asked in value.casefold() for value in values):
             assert Zones.of([1], [zone]).may_have(asked).all()
-
-
-def test_two_threads_unpack_at_once() -> None:
-    column = np.cumsum(np.sin(np.arange(30_000) / 900))
-    packed = pack(column, METRES)
-    blob = compressed(packed.data)
-    expected = unpacked(packed).tolist()
-
-    def again(_: int) -> bool:
-        back: Any = unpack(packed.codec, packed.count, packed.zone.least, decompressed(blob))
-        return bool(np.array_equal(back, expected))
-
-    with ThreadPoolExecutor(2) as threads:
-        assert all(threads.map(again, range(20)))
 
 
 def test_damaged_bytes_are_refused() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import weakref
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from ros2_memory.columns.stored import StoredTable, Topic
 from ros2_memory.columns.table import Column, Elements, Table, Texts, column_bytes, joined
 from ros2_memory.core.errors import BagError
 from ros2_memory.storage.base import Channel, Schema
-from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.shared_bags import BAGS, needs_real
 
@@ -161,19 +159,9 @@ def test_a_table_is_freed_when_nobody_holds_it_without_the_garbage_collector() -
         gc.enable()
 
 
-def test_an_unknown_column_has_no_zone() -> None:
-    assert part(table()).zone("colour") is None
-    with pytest.raises(KeyError):
-        part(table()).columns["colour"]
-
-
 def test_a_part_of_several_tables_is_that_of_all_their_rows() -> None:
     given = [table(40), table(60, 40), table(1, 99)]
     check_part(joined(given), part(*given))
-
-
-def test_a_part_of_one_row_comes_back() -> None:
-    check_part(table(1), part(table(1)))
 
 
 def test_a_table_of_another_layout_is_refused() -> None:
@@ -197,29 +185,6 @@ def test_columns_are_unpacked_once_by_whoever_asks_first() -> None:
     for path, column in found[0].items():
         assert all(differences(column, other[path]) == 0.0 for other in found)
     assert back.columns["speed"] is back.columns["speed"]
-
-
-def test_what_is_made_of_a_part_is_made_once() -> None:
-    made: list[int] = []
-
-    def rows(of: Table) -> int:
-        def make() -> int:
-            made.append(len(of))
-            return len(of)
-
-        return of.remember("rows", make, lambda _: 100)
-
-    memory: ByteLru[object] = ByteLru(250)
-    one = replace(part(table(20)), memory=memory, number=1)
-    other = replace(part(table(30)), memory=memory, number=2)
-    assert [rows(one), rows(one), rows(other), rows(other)] == [20, 20, 30, 30]
-    assert made == [20, 30]
-    memory.put("more", "", 100)
-    assert rows(one) == 20
-    assert made == [20, 30, 20], "it was dropped for something else"
-    plain = table(20)
-    assert rows(plain) == rows(plain) == 20
-    assert made[3:] == [20, 20], "a table that is not stored remembers nothing"
 
 
 @needs_real

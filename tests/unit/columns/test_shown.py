@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.columns.numbers import numbers
 from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values, seconds
+from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values, seconds
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.column_numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
@@ -23,8 +23,6 @@ from tests.support.bags import make
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import (
-    MAPPED,
-    OTHERS,
     Drawn,
     drawn_of,
     drawn_tables,
@@ -128,17 +126,6 @@ def test_numbers_of_a_field_are_those_of_each_message(drawn: Drawn, random: Rand
             assert own == pytest.approx(expected, abs=found.error, rel=0.0), field
 
 
-def test_numbers_are_found_by_both_their_paths() -> None:
-    drawn = drawn_of(ODOMETRY, [message(ODOMETRY, Random(seed), is_odd=False) for seed in range(3)])
-    short = numbers(drawn.table, "position.x", EXTRACTOR)
-    full = numbers(drawn.table, "pose.pose.position.x", EXTRACTOR)
-    assert short is not None
-    assert full is not None
-    assert short.numbers.tolist() == full.numbers.tolist()
-    assert short.rows.tolist() == [0, 1, 2]
-    assert short.error == 0.0
-
-
 def test_numbers_state_the_error_of_rounded_columns() -> None:
     random = Random(7)
     drawn = drawn_of(ODOMETRY, [message(ODOMETRY, random, is_odd=False) for _ in range(20)])
@@ -163,19 +150,6 @@ def test_numbers_of_arrays_that_are_not_held_are_left_to_the_bag() -> None:
     assert found.numbers.tolist() == [0.0, 1.0, 2.0]
     joints.position = np.arange(12.0)  # type: ignore[attr-defined]
     assert numbers(drawn_of(kind, [joints]).table, "positions", EXTRACTOR) is None
-
-
-def test_numbers_of_integers_are_integers_and_booleans_are_none() -> None:
-    whole = "std_msgs/msg/Int64"
-    drawn = drawn_of(whole, [make(whole, data=2**53 + 1), make(whole, data=-1)])
-    found = numbers(drawn.table, "value", EXTRACTOR)
-    assert found is not None
-    assert found.numbers.dtype == np.int64
-    assert found.numbers.tolist() == [2**53 + 1, -1]
-    flag = "std_msgs/msg/Bool"
-    none = numbers(drawn_of(flag, [make(flag, data=True)]).table, "value", EXTRACTOR)
-    assert none is not None
-    assert not none.numbers.size
 
 
 @given(st.lists(st.integers(MIN_NS, MAX_NS) | st.integers(-(2**54), 2**54), min_size=1))
@@ -229,22 +203,7 @@ def test_angles_of_rounded_quaternions_are_off_by_less_than_they_say(
                 assert abs(value - angles[name]) <= off
 
 
-def test_every_type_of_the_map_has_a_shape() -> None:
-    for kind in (*MAPPED, *OTHERS):
-        drawn = drawn_of(kind, [message(kind, Random(1))])
-        assert drawn.table.definition is not None
-        shape = Shape(drawn.table.definition, kind, EXTRACTOR)
-        assert [*leaves_below(Spot(shape.value))]
-
-
 def test_a_mapped_path_that_leads_into_times_is_left_to_the_bag() -> None:
     extractor = SchemaExtractor({ODOMETRY: {"second": "header.stamp.sec"}}, 50)
     table = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))]).table
     assert numbers(table, "second", extractor) is None
-
-
-def test_the_full_path_of_a_level_names_its_columns() -> None:
-    results = Level(Level(ROWS, "detections"), "results")
-    assert results.full("hypothesis.score") == "detections.results.hypothesis.score"
-    assert results.full("") == "detections.results"
-    assert ROWS.full("position.x") == "position.x"

@@ -102,13 +102,6 @@ def test_rotations_come_back_within_a_tenth_of_a_milliradian() -> None:
     assert 4 * math.asin(float(apart.max()) / 2) <= 1e-4
 
 
-def test_steps_read_what_they_write() -> None:
-    for step in (Step(), RELATIVE, METRES, QUATERNION, DEGREES):
-        assert Step.parse(str(step)) == step
-    with pytest.raises(ValueError, match="no step"):
-        Step.parse("coarse")
-
-
 def test_what_a_number_means_changes_with_the_format_alone() -> None:
     steps = [step.per_unit for step in (METRES, RADIANS, VELOCITY, QUATERNION, DEGREES)]
     limits = (MOST_RELATIVE, MAX_NUMBERS, MAX_RANGED_BYTES)

@@ -165,72 +165,6 @@ def test_integers_are_compared_exactly(
     assert met(Condition(condition, "value"), kind, make(kind, data=value)) == [expected]
 
 
-def test_a_float32_equals_the_number_that_was_meant() -> None:
-    kind = "std_msgs/msg/Float32"
-    messages = [make(kind, data=number) for number in (0.1, 0.2, math.nan, math.inf)]
-    assert met(Condition(Equals(0.1)), kind, *messages) == [True, False, False, False]
-    above = Condition(Beyond(float(np.float32(0.1)), above=True), "value")
-    assert met(above, kind, *messages) == [False, True, False, True]
-
-
-def test_texts_are_found_without_regard_to_case() -> None:
-    messages = [make(STRING, data=text) for text in ("Die STRASSE", "die Gasse", "")]
-    assert met(Condition(Contains("straße")), STRING, *messages) == [True, False, False]
-
-
-def test_detections_below_a_score_do_not_count() -> None:
-    messages = [detections(("cup", 0.9)), detections(("cup", 0.2), ("fork", 0.9)), detections()]
-    field = "detections.label"
-    assert met(Condition(Equals("cup"), field), VISION, *messages) == [True, True, False]
-    assert met(Condition(Equals("cup"), field, 0.5), VISION, *messages) == [True, False, False]
-    near = NearPosition(1.0, 2.0, 0.0, 0.0)
-    assert met(Condition(near, min_score=0.95), VISION, *messages) == [False, False, False]
-    assert met(Condition(near, min_score=0.9), VISION, *messages) == [True, True, False]
-
-
-def test_a_place_in_a_list_selects_one_element_from_either_end() -> None:
-    messages = [detections(("cup", 0.9), ("fork", 0.8)), detections(("fork", 0.7))]
-    for place, expected in (("0", [False, True]), ("-1", [True, True]), ("1", [True, False])):
-        condition = Condition(Equals("fork"), f"detections.{place}.label")
-        assert met(condition, VISION, *messages) == expected
-
-
-def test_detections_below_a_score_do_not_count_in_texts_that_are_json() -> None:
-    texts = (
-        '[{"label": "cup", "score": 0.2}]',
-        '[{"label": "cup", "score": 0.8}]',
-        '[{"label": "fork", "score": 0.2}]',
-        "a cup",
-    )
-    messages = [make(STRING, data=text) for text in texts]
-    condition = Condition(Contains("cup"), min_score=0.5)
-    assert met(condition, STRING, *messages) == [False, True, False, True]
-    # The text that is left has a null, which the message never had.
-    assert met(Condition(Contains("null"), min_score=0.5), STRING, *messages) == [False] * 4
-
-
-def test_the_best_of_several_hypotheses_names_a_detection() -> None:
-    kind = "vision_msgs/msg/Detection2DArray"
-    random = Random(1)
-    whole = message(kind, random, is_odd=False)
-    while not getattr(whole, "detections") or len(whole.detections[0].results) < 2:  # type: ignore[attr-defined]  # noqa: B009
-        whole = message(kind, random, is_odd=False)
-    del whole.detections[1:], whole.detections[0].results[2:]  # type: ignore[attr-defined]
-    for result, label, score in zip(
-        whole.detections[0].results,  # type: ignore[attr-defined]
-        ("cup", "fork"),
-        (0.3, 0.8),
-        strict=True,
-    ):
-        result.hypothesis.class_id, result.hypothesis.score = label, score
-    for least, expected in ((0.1, [True, True]), (0.5, [False, True]), (0.9, [False, False])):
-        found = [
-            met(Condition(Contains(label), "detections.results", least), kind, whole)[0]
-            for label in ("cup", "fork")
-        ]
-        assert found == expected
-
-
 def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
     kind = "vision_msgs/msg/Detection2DArray"
     random = Random(2)
@@ -300,13 +234,6 @@ def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
         .truth(table)
         .unsure.all()
     )
-
-
-def test_one_tester_answers_for_tables_of_several_types() -> None:
-    tester = ColumnCondition(Condition(Contains("cup")), EXTRACTOR)
-    assert tester.truth(drawn_of(VISION, [detections(("cup", 1.0))]).table).surely.all()
-    assert tester.truth(drawn_of(STRING, [make(STRING, data="Cup")]).table).surely.all()
-    assert tester.truth(drawn_of(VISION, [detections(("fork", 1.0))]).table).is_none
 
 
 def test_a_table_without_a_definition_is_unsure() -> None:

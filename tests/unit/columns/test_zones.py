@@ -8,7 +8,6 @@ import re
 import sys
 from typing import TYPE_CHECKING
 
-import numpy as np
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -66,28 +65,6 @@ def test_zones_rule_out_what_the_zone_of_each_part_does(
                 assert among_others == alone
         assert together.may_have(text)[nth] == zone.may_have(text)
         assert together.may_be_json[nth] == zone.may_be_json
-
-
-@given(st.lists(zones(), min_size=1, max_size=8), st.data())
-def test_zones_of_newer_parts_are_added_and_some_are_taken(
-    given_zones: list[Zone], data: st.DataObject
-) -> None:
-    numbers = [3 * nth + 1 for nth in range(len(given_zones))]
-    cut = data.draw(st.integers(0, len(numbers)))
-    older = Zones.of(numbers[:cut], given_zones[:cut])
-    whole = older.joined(Zones.of(numbers[cut:], given_zones[cut:]))
-    asked = np.array(data.draw(st.permutations([*numbers, 2, 10**6])), np.int64)
-    some = whole.among(asked)
-    expected = Zones.of(numbers, given_zones)
-    for nth, number in enumerate(asked.tolist()):
-        if number in numbers:
-            at = numbers.index(number)
-            assert some.low[nth] == expected.low[at]
-            assert some.high[nth] == expected.high[at]
-            assert some.may_have("a")[nth] == given_zones[at].may_have("a")
-        else:
-            assert (some.low[nth], some.high[nth]) == (-math.inf, math.inf)
-            assert some.may_have("anything")[nth]
 
 
 def test_known_files_are_the_bags_as_they_were_indexed(tmp_path: Path) -> None:
