@@ -134,13 +134,6 @@ class TestDefaults:
             },
         }
 
-    def test_are_frozen(self) -> None:
-        settings = load_settings((), {})
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            settings.server.port = 1  # type: ignore[misc]
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            settings.server = settings.server  # type: ignore[misc]
-
     def test_leave_no_trace_in_hydra_or_in_the_working_directory(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -368,19 +361,6 @@ class TestPresets:
         settings = load_settings(robots, {"MEMORY_DEPLOYMENT": preset})
         assert (settings.storage.target, settings.recorder.target) == (storage, recorder)
         assert (settings.server.transport, settings.data.now) == (transport, now)
-
-    def test_each_shipped_one_is_tested_here(self) -> None:
-        shipped = {path.stem for path in (ROOT / "config/deployment").iterdir()}
-        assert shipped == {
-            "robot",
-            "robot_live",
-            "spec",
-            "query_only",
-            "replay",
-            "fleet",
-            "lake",
-            "local",
-        }
 
     def test_spec_offers_what_the_specification_has_and_no_more(self) -> None:
         server = load_settings((), {"MEMORY_DEPLOYMENT": "spec"}).server

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from functools import cache
 from typing import TYPE_CHECKING
 
 import pytest
@@ -38,13 +39,16 @@ def store_of(name: str, text: str) -> Typestore:
     return store
 
 
-def messages(folder: Path) -> Iterator[tuple[str, str, object]]:
+@cache
+def messages(folder: Path) -> list[tuple[str, str, object]]:
     """Topic, type and message of everything in a folder's bags."""
     stores: dict[tuple[str, str], Typestore] = {}
+    found: list[tuple[str, str, object]] = []
     for topic, name, text, payload in (*mcap_rows(folder), *sqlite_rows(folder)):
         if (name, text) not in stores:
             stores[name, text] = store_of(name, text)
-        yield topic, name, stores[name, text].deserialize_cdr(payload, name)
+        found.append((topic, name, stores[name, text].deserialize_cdr(payload, name)))
+    return found
 
 
 def mcap_rows(folder: Path) -> Iterator[tuple[str, str, str, bytes]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import random
+from collections import defaultdict
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -83,22 +84,21 @@ def spanned(memory: Memory, session: Session) -> tuple[float, float]:
     return session.since(unix_from_ns(first)), session.since(unix_from_ns(last))
 
 
-def log_times(session: Session, topic: str) -> list[int]:
-    """By plain rosbags, over all files of the session."""
-    times: list[int] = []
-    paths = [session.folder] if (session.folder / "metadata.yaml").exists() else []
-    for path in paths:
-        with Reader(path) as reader:
-            wanted = [each for each in reader.connections if each.topic == topic]
-            times.extend(stamp for _, stamp, _ in reader.messages(wanted))
-    return sorted(times)
+@cache
+def log_times(folder: Path) -> dict[str, list[int]]:
+    """Those of each topic by plain rosbags, over all files of a session."""
+    times: defaultdict[str, list[int]] = defaultdict(list)
+    with Reader(folder) as reader:
+        for connection, stamp, _ in reader.messages():
+            times[connection.topic].append(stamp)
+    return {topic: sorted(each) for topic, each in times.items()}
 
 
 def test_the_position_is_the_closed_form_at_the_replys_own_timestamp(
     memory: Memory, session: Session
 ) -> None:
     begin, end = spanned(memory, session)
-    known = log_times(session, "/odom")
+    known = log_times(session.folder)["/odom"]
     rng = random.Random(50)
     for _ in range(50):
         asked = session.at(rng.uniform(begin + 0.2, end))
@@ -211,7 +211,7 @@ def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> Non
         topic: count for topic, count in expected.items() if count
     }
     for topic, row in rows.items():
-        times = log_times(session, topic)
+        times = log_times(session.folder)[topic]
         assert (row.first, row.last) == (times[0], times[-1])
 
 

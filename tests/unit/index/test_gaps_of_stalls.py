@@ -106,11 +106,3 @@ def test_stalls_of_0_6_s_are_gaps_and_nothing_else_is(seed: int, split: float) -
     period = 2 / sorted(rates, reverse=True)[1]
     for (start, end), (before, after) in zip(found, expected, strict=True):
         assert abs((end - start) - (after - before)) <= period
-
-
-@settings(max_examples=examples(3), deadline=None)
-@given(seed=st.integers(0, 2**32), split=st.sampled_from([10.0, 60.0, HOUR_S]))
-def test_an_hour_of_a_busy_publisher_has_no_gap(seed: int, split: float) -> None:
-    draw = Random(seed)
-    topics = [published(hz, HOUR_S, draw) for hz in (200.0, 50.0, 10.0, 5.0)]
-    assert gaps(split_up(topics, split, HOUR_S)) == []

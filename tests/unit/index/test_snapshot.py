@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import random
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.index import timeline as timelines
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import SEGMENT_BAGS, Timeline
 
@@ -50,28 +52,35 @@ def test_what_bags_take_is_that_of_the_recorded_ones_where_there_are_any() -> No
 bag_times = st.tuples(st.integers(0, 3000), st.integers(0, 200))
 
 
-@given(seed=st.integers(0, 2**32), rounds=st.integers(1, 4), windows=st.lists(bag_times))
+@given(
+    seed=st.integers(0, 2**32),
+    size=st.sampled_from([4, 16]),
+    rounds=st.integers(1, 4),
+    windows=st.lists(bag_times),
+)
 def test_a_timeline_that_changed_is_the_timeline_of_what_it_holds(
-    seed: int, rounds: int, windows: list[tuple[int, int]]
+    seed: int, size: int, rounds: int, windows: list[tuple[int, int]]
 ) -> None:
     chance = random.Random(seed)
-    pool = [_random_bag(chance, number) for number in range(3 * SEGMENT_BAGS)]
-    present = set(chance.sample(range(len(pool)), chance.choice([0, 1, 40, 2 * SEGMENT_BAGS])))
-    timeline = Timeline.of(pool[number] for number in present)
-    for _ in range(rounds):
-        assert all(timeline.extents("/odom", TimeWindow.everything()))
-        chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 5, 2 * SEGMENT_BAGS])))
-        removed, added = present & chosen, chosen - present
-        present = (present - removed) | added
-        timeline = timeline.changed(
-            [pool[number] for number in removed], [pool[number] for number in added]
-        )
-    _assert_holds(timeline, [pool[number] for number in present], windows)
+    pool = [_random_bag(chance, number) for number in range(3 * size)]
+    present = set(chance.sample(range(len(pool)), chance.choice([0, 1, size, 2 * size])))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timelines, "SEGMENT_BAGS", size)
+        timeline = Timeline.of(pool[number] for number in present)
+        for _ in range(rounds):
+            assert all(timeline.extents("/odom", TimeWindow.everything()))
+            chosen = set(chance.sample(range(len(pool)), chance.choice([0, 1, 3, 2 * size])))
+            removed, added = present & chosen, chosen - present
+            present = (present - removed) | added
+            timeline = timeline.changed(
+                [pool[number] for number in removed], [pool[number] for number in added]
+            )
+        _assert_holds(timeline, [pool[number] for number in present], windows)
 
 
 def _random_bag(chance: random.Random, number: int) -> BagFile:
     start = chance.randrange(3000)
-    long = chance.random() < 0.01
+    long = chance.random() < 0.05
     topics = chance.sample(["/odom", "/tf", "/tf_static", "/scan"], chance.randint(1, 3))
     spans = [(topic, start, start + chance.randrange(2000 if long else 20)) for topic in topics]
     type_name = chance.choice([ODOM, "std_msgs/msg/String"])
