@@ -80,6 +80,15 @@ def test_a_total_that_one_robot_did_not_count_is_not_that_of_the_others() -> Non
     assert "total" not in found
 
 
+def test_a_stay_that_goes_on_is_the_newest() -> None:
+    replies = [
+        RobotReply(name, {"visits": [{"arrived": arrived, "departed": departed}], "total": 1})
+        for name, arrived, departed in (("r1", 8.0, 9.0), ("r2", 1.0, None))
+    ]
+    found = reply_of("visits", replies)["visits"]
+    assert [row["robot_name"] for row in found] == ["r2", "r1"]
+
+
 def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
     gone = RefusedError("the disk is gone")
     failures = {"r1": gone, "r2": QueryTimeoutError("too slow"), "r3": gone}

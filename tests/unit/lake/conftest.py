@@ -1,4 +1,4 @@
-"""The engines of a lake: each test that asks one is run with all of them."""
+"""The engine of a lake, which tests that ask one share."""
 
 from __future__ import annotations
 
@@ -10,12 +10,8 @@ from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 
 
-def duckdb_engine() -> Iterator[LakeEngine]:
+@pytest.fixture(scope="session")
+def engine() -> Iterator[LakeEngine]:
     engine = DuckdbEngine(memory_mb=256, threads=1)
     yield engine
     engine.close()
-
-
-@pytest.fixture(scope="session", params=[pytest.param(duckdb_engine, id="duckdb")])
-def engine(request: pytest.FixtureRequest) -> Iterator[LakeEngine]:
-    yield from request.param()

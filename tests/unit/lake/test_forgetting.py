@@ -276,11 +276,11 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
 def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) -> None:
     """That of all robots in one transaction; the day of one with few files stays as it is."""
     lake = tmp_path / "lake"
-    robots = {"hall": 4, "roof": 1, "yard": 4}
+    robots = {"hall": (4, 0), "roof": (1, 0), "wing": (4, 1), "yard": (4, 0)}
     for number in range(4):
-        for robot, bags in robots.items():
+        for robot, (bags, day) in robots.items():
             if number < bags:
-                write_bag(tmp_path / robot, number)
+                write_bag(tmp_path / robot, number, at_s=START_S + 86_400 * day + 10 * number)
         ship(lake, [robot_bags(robot, tmp_path / robot) for robot in robots])
     before = {name: lake_column(lake, name, "bag_id") for name in TABLES}
     values = lake_column(lake, "messages", "texts")
@@ -290,9 +290,9 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) ->
         assert compact(tables, (START_S + 3600) * NS_PER_S) == 0
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
         files = Counter(task.file.partition[0] for task in messages.refresh().scan().plan_files())
-        assert files == {"hall": 1, "roof": 1, "yard": 1}
-        # What was deleted, and what was written instead.
-        assert len(messages.snapshots()) == versions + 2
+        assert files == dict.fromkeys(robots, 1)
+        # Of each day what was deleted, and what was written instead.
+        assert len(messages.snapshots()) == versions + 4
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values

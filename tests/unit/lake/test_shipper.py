@@ -185,9 +185,12 @@ def test_read_only_bags_are_shipped_and_reported_and_nothing_is_written_beside_t
     assert "Read-only file system" in problem
     assert "hall" in problem
     (own / "recordings.jsonl").unlink()
-    done = ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "hall")], messages=())
     # With other settings its rows are others.
-    assert (done.bags, done.problems, values(tmp_path / "lake")) == (1, [], [])
+    robot = robot_bags("hall", tmp_path / "hall")
+    for config in ("test", "other"):
+        robot.config = config
+        done = ship(tmp_path / "lake", [robot], messages=())
+        assert (done.bags, done.problems, values(tmp_path / "lake")) == (1, [], [])
     assert not (own / "shipped.jsonl").exists()
 
 
