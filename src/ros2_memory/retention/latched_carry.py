@@ -35,7 +35,12 @@ import structlog
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_thinned
 from ros2_memory.bag_dir.moment_file import HardLinks
-from ros2_memory.core.errors import BagError, BagVanishedError, UndecodableError
+from ros2_memory.core.errors import (
+    BagError,
+    BagUnreachableError,
+    BagVanishedError,
+    UndecodableError,
+)
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
@@ -282,11 +287,14 @@ class Carrier:
         Raises:
             BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
                 it must not be replaced by a bag without them.
+            BagUnreachableError: the disk fails: the bag may be whole.
         """
         try:
             yield from self._reader.records(path, topics, TimeWindow.everything())
         except BagVanishedError:
             return
+        except BagUnreachableError:
+            raise
         except BagError as error:
             if path == self.path:
                 reason = f"{error.reason}; move it away to give up its messages"

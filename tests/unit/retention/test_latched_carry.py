@@ -8,7 +8,7 @@ from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.core.errors import BagError, NoDataError
+from ros2_memory.core.errors import BagError, BagUnreachableError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -260,6 +260,27 @@ class TestTheBagOfCarriedMessages:
         keep_only(tmp_path, "session_mcap/session_mcap_6.mcap")
         assert [looked_up(memory, moment) for moment in moments] == before
         assert held(memory, "/tf_static", latest)[0] < latest - 50 * S  # type: ignore[operator]
+
+    def test_a_bag_stays_while_the_disk_fails_to_give_its_latched_messages(
+        self, tmp_path: Path
+    ) -> None:
+        class Unlucky(McapReader):
+            def records(
+                self,
+                path: Path,
+                topics: Collection[str],
+                window: TimeWindow,
+                *,
+                newest_first: bool = False,
+            ) -> Iterator[Record]:
+                if path.name == "rec_0.mcap":
+                    raise BagUnreachableError(str(path), "it cannot be opened: Too many open files")
+                return super().records(path, topics, window, newest_first=newest_first)
+
+        at_home(tmp_path, splits=4)
+        keeper = keeper_of(tmp_path, reader=Unlucky(), max_bytes=1)
+        keeper.apply()
+        assert (tmp_path / "rec" / "rec_0.mcap").exists()
 
     def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(self, tmp_path: Path) -> None:
         class Unlucky(McapReader):

@@ -35,7 +35,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
-from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
@@ -166,10 +166,10 @@ class MemoryDays:
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
         """Makes durable what stays of some bags, which may be deleted then.
 
-        What stays already is not written twice. What cannot be read of a bag does not stay.
+        What stays already is not written twice. What is damaged in a bag does not stay.
 
         Raises:
-            BagError: a day cannot be written.
+            BagError: a day cannot be written, or the disk fails while a bag is read.
             OSError: likewise, or the list of the recorder's own bags cannot be read.
         """
         if (self._folder.parent / ERASING_FILE).exists():
@@ -476,7 +476,11 @@ def _is_named(topic: str, globs: Sequence[str]) -> bool:
 
 
 def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
-    """Yields the messages of a bag as tables; what is lost of it is left out."""
+    """Yields the messages of a bag as tables; what is lost of it is left out.
+
+    Raises:
+        BagUnreachableError: the disk fails: the bag may be whole.
+    """
     groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
     while True:
         try:
@@ -484,6 +488,8 @@ def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
             if tables is None:
                 return
             yield from tables
+        except BagUnreachableError:
+            raise
         except BagError as error:
             _log.warning("memory_not_read", path=str(path), reason=error.reason)
             if error.lost is None:
@@ -491,11 +497,13 @@ def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
 
 
 def _readable(reader: BagReader, path: Path, topics: Sequence[str]) -> Iterator[Record]:
-    """Yields the messages of a bag that can be read."""
+    """Yields the messages of a bag that can be read; raises as `_tables` does."""
     records = reader.records(path, topics, _EVERYTHING)
     while True:
         try:
             yield from records
+        except BagUnreachableError:
+            raise
         except BagError as error:
             if error.lost is None:
                 return

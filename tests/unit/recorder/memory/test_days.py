@@ -7,7 +7,7 @@ import operator
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
-from ros2_memory.core.errors import BagError
+from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
@@ -35,7 +35,7 @@ from ros2_memory.retention.delete import remove_bag
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
 from ros2_memory.serving.page.span import span_shown
-from ros2_memory.storage.base import BagWriter, Record
+from ros2_memory.storage.base import BagReader, BagWriter, Batch, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.reply_size import to_json_text
@@ -85,6 +85,7 @@ def split(
 def days_of(
     bag_dir: Path,
     *,
+    reader: BagReader | None = None,
     writer: BagWriter | None = None,
     limits: MemoryLimits | None = None,
     keeps: bool = True,
@@ -92,7 +93,7 @@ def days_of(
 ) -> MemoryDays:
     return MemoryDays(
         bag_dir,
-        BagDirReader(McapReader()),
+        BagDirReader(reader or McapReader()),
         writer or McapWriter(),
         OwnRecordings(bag_dir),
         shipped_extractor(),
@@ -638,6 +639,56 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
     monotonic.at = 90_000 * S
     keeper.apply()
     assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 40
+
+
+class Unreachable(McapReader):
+    """Of `rec_A` one of two ways of reading fails for a while, as for want of descriptors."""
+
+    def __init__(self, way: str) -> None:
+        super().__init__()
+        self.way = way
+
+    def _require(self, path: Path, way: str) -> None:
+        if self.way == way and path.parent.name == "rec_A":
+            raise BagUnreachableError(str(path), "it cannot be opened: Too many open files")
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        self._require(path, "records")
+        return super().records(path, topics, window, newest_first=newest_first)
+
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        self._require(path, "batches")
+        return super().batches(path, topics, window, bare=bare)
+
+
+@pytest.mark.parametrize("way", ["records", "batches"])
+def test_age_waits_while_the_disk_fails_and_then_all_of_it_stays(bag_dir: Path, way: str) -> None:
+    split(bag_dir, 0)
+    split(bag_dir, 72_000, name="rec_B")
+    own_all(bag_dir)
+    reader = Unreachable(way)
+    keeper = house(bag_dir, T0 + 72_100 * S, max_age_h=12, memory=days_of(bag_dir, reader=reader))
+    keeper.apply()
+    assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 1
+    assert not [*bag_dir.glob("memory/*.mcap")]
+    reader.way = ""
+    keeper.apply()
+    assert not [*bag_dir.glob("rec_A/*.mcap")]
+    assert len([*bag_dir.glob("memory/*.mcap")]) == 1
 
 
 def test_forgetting_takes_it_out_of_days_to_the_byte(
