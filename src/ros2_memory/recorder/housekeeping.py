@@ -115,7 +115,7 @@ class Housekeeping(Housekeeper):
         collector = GarbageCollector(
             bag_dir,
             limits,
-            Carrier(bag_dir, reader, writer, static_topics, self._own),
+            Carrier(bag_dir, reader, writer, static_topics, self._own, monotonic=monotonic),
             self._own,
             recorded=self._recorded,
             is_synchronised=is_synchronised,

@@ -7,11 +7,14 @@ of the disk below it, mostly the system disk, which recordings would fill.
 from __future__ import annotations
 
 import shutil
-from typing import TYPE_CHECKING
+import time
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
+
+_DAY_S: Final = 86_400.0
 
 
 def free_bytes(directory: Path) -> int:
@@ -80,3 +83,22 @@ class HomeDisk:
             return self.away
         self.away = device != self._device
         return self.away
+
+
+class Patience:
+    """Waits for files that the disk does not give, a day for each: then they count as damaged.
+
+    A sector that is bad for good would hold the files behind it for ever.
+
+    Args:
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._monotonic = monotonic
+        self._failing_since: dict[Path, float] = {}
+
+    def is_left(self, path: Path) -> bool:
+        """Returns whether a file that fails now has failed for less than a day."""
+        now = self._monotonic()
+        return now - self._failing_since.setdefault(path, now) < _DAY_S

@@ -23,6 +23,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import time
 from bisect import bisect_left
 from collections import defaultdict
 from contextlib import suppress
@@ -43,6 +44,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.retention.disk import Patience
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -166,6 +168,7 @@ class Carrier:
         writer: writes the one of carried messages.
         static_topics: carried though no publisher is known to have offered them as transient local.
         own: lists the bag.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
@@ -175,12 +178,15 @@ class Carrier:
         writer: BagWriter,
         static_topics: Collection[str],
         own: OwnRecordings,
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = bag_dir / CARRY_FOLDER / CARRY_FILE
         self._reader = reader
         self._writer = writer
         self._static_topics = frozenset(static_topics)
         self._own = own
+        self._patience = Patience(monotonic)
         self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
@@ -287,15 +293,15 @@ class Carrier:
         Raises:
             BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
                 it must not be replaced by a bag without them.
-            BagUnreachableError: the disk fails: the bag may be whole.
+            BagUnreachableError: the disk has failed to give the bag for less than a day.
         """
         try:
             yield from self._reader.records(path, topics, TimeWindow.everything())
         except BagVanishedError:
             return
-        except BagUnreachableError:
-            raise
         except BagError as error:
+            if isinstance(error, BagUnreachableError) and self._patience.is_left(path):
+                raise
             if path == self.path:
                 reason = f"{error.reason}; move it away to give up its messages"
                 raise BagError(str(path), reason) from error

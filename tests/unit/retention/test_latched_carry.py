@@ -16,6 +16,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
+from tests.support.clocks import SettableClock
 from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
 from tests.support.memories import memory_of
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -278,9 +279,13 @@ class TestTheBagOfCarriedMessages:
                 return super().records(path, topics, window, newest_first=newest_first)
 
         at_home(tmp_path, splits=4)
-        keeper = keeper_of(tmp_path, reader=Unlucky(), max_bytes=1)
+        now = SettableClock(0)
+        keeper = keeper_of(tmp_path, reader=Unlucky(), max_bytes=1, monotonic=lambda: now.now() / S)
         keeper.apply()
         assert (tmp_path / "rec" / "rec_0.mcap").exists()
+        now.at = 86_401 * S
+        keeper.apply()
+        assert not (tmp_path / "rec" / "rec_0.mcap").exists()
 
     def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(self, tmp_path: Path) -> None:
         class Unlucky(McapReader):

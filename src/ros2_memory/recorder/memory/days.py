@@ -48,6 +48,7 @@ from ros2_memory.recorder.memory.thinning import (
     is_sampled,
     rounded,
 )
+from ros2_memory.retention.disk import Patience
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -161,6 +162,7 @@ class MemoryDays:
         self._static_topics = frozenset(static_topics)
         self._minutes: set[Path] = set()
         self._monotonic = monotonic
+        self._patience = Patience(monotonic)
         self._leaving_since: float | None = None
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
@@ -236,7 +238,7 @@ class MemoryDays:
         """Writes a day anew in which numbers have one message a minute, and their extremes."""
         detections = DetectionColumns(self._extractor)
         numbers: dict[tuple[str, str], TopicThinning] = {}
-        for table in _tables(self._reader, path):
+        for table in self._tables(path):
             if has_numbers(table) and not table.channel.latched:
                 key = (table.channel.topic, table.channel.type)
                 numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
@@ -293,7 +295,7 @@ class MemoryDays:
         chosen = _Chosen()
         thinned: dict[tuple[str, str], TopicThinning] = {}
         detections = DetectionColumns(self._extractor)
-        for table in chain.from_iterable(_tables(self._reader, bag.path) for bag in bags):
+        for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             topic, kind = table.channel.topic, table.channel.type
             if "" in table.left_out:
                 chosen.left_out[topic] = table.left_out[""]
@@ -324,7 +326,7 @@ class MemoryDays:
         """Yields the messages that stay, without people whose label may not."""
         topics = [*{topic for (topic, _), times in chosen.times.items() if times}]
         for bag in bags:
-            for record in _readable(self._reader, bag.path, topics):
+            for record in self._readable(bag.path, topics):
                 channel = record.channel
                 if record.log_time not in chosen.times.get((channel.topic, channel.type), ()):
                     continue
@@ -338,6 +340,43 @@ class MemoryDays:
                         yield stays
                 elif (smaller := self._smaller(stays)) is not None:
                     yield smaller
+
+    def _tables(self, path: Path) -> Iterator[Table]:
+        """Yields the messages of a bag as tables; what is damaged of it is left out.
+
+        Raises:
+            BagUnreachableError: the disk has failed to give the bag for less than a day.
+        """
+        groups = decoded(self._reader, pieces(self._reader, path), skip_undecodable=True)
+        while True:
+            try:
+                tables = next(groups, None)
+                if tables is None:
+                    return
+                yield from tables
+            except BagError as error:
+                self._require_patience(path, error)
+                _log.warning("memory_not_read", path=str(path), reason=error.reason)
+                if error.lost is None:
+                    return
+
+    def _readable(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
+        """Yields the messages of a bag that can be read; raises as `_tables` does."""
+        records = self._reader.records(path, topics, _EVERYTHING)
+        while True:
+            try:
+                yield from records
+            except BagError as error:
+                self._require_patience(path, error)
+                if error.lost is None:
+                    return
+            else:
+                return
+
+    def _require_patience(self, path: Path, error: BagError) -> None:
+        """Raises an error again that may pass, for a day."""
+        if isinstance(error, BagUnreachableError) and self._patience.is_left(path):
+            raise error
 
     def _smaller(self, record: Record) -> Record | None:
         """Returns a message with rounded numbers, without people whose label may not stay.
@@ -473,42 +512,6 @@ class _Chosen:
 
 def _is_named(topic: str, globs: Sequence[str]) -> bool:
     return any(match_topics((topic,), glob) for glob in globs)
-
-
-def _tables(reader: BagReader, path: Path) -> Iterator[Table]:
-    """Yields the messages of a bag as tables; what is lost of it is left out.
-
-    Raises:
-        BagUnreachableError: the disk fails: the bag may be whole.
-    """
-    groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
-    while True:
-        try:
-            tables = next(groups, None)
-            if tables is None:
-                return
-            yield from tables
-        except BagUnreachableError:
-            raise
-        except BagError as error:
-            _log.warning("memory_not_read", path=str(path), reason=error.reason)
-            if error.lost is None:
-                return
-
-
-def _readable(reader: BagReader, path: Path, topics: Sequence[str]) -> Iterator[Record]:
-    """Yields the messages of a bag that can be read; raises as `_tables` does."""
-    records = reader.records(path, topics, _EVERYTHING)
-    while True:
-        try:
-            yield from records
-        except BagUnreachableError:
-            raise
-        except BagError as error:
-            if error.lost is None:
-                return
-        else:
-            return
 
 
 def _stays(record: Record, stays: Mapping[tuple[str, str], Collection[Ns]]) -> bool:

@@ -691,6 +691,25 @@ def test_age_waits_while_the_disk_fails_and_then_all_of_it_stays(bag_dir: Path, 
     assert len([*bag_dir.glob("memory/*.mcap")]) == 1
 
 
+@pytest.mark.parametrize("way", ["records", "batches"])
+def test_what_the_disk_never_gives_holds_others_for_a_day(bag_dir: Path, way: str) -> None:
+    split(bag_dir, 0)
+    split(bag_dir, 600, name="rec_C")
+    split(bag_dir, 72_000, name="rec_B")
+    own_all(bag_dir)
+    monotonic = SettableClock(0)
+    seconds = lambda: monotonic.now() / S  # noqa: E731 - for both
+    memory = days_of(bag_dir, reader=Unreachable(way), monotonic=seconds)
+    keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, monotonic=seconds)
+    keeper.apply()
+    assert not [*bag_dir.glob("memory/*.mcap")]
+    monotonic.at = 86_401 * S
+    keeper.apply()
+    assert not [*bag_dir.glob("rec_[AC]/*.mcap")]
+    [day] = bag_dir.glob("memory/*.mcap")
+    assert McapReader().summarize(day).start >= T0 + 600 * S
+
+
 def test_forgetting_takes_it_out_of_days_to_the_byte(
     bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
