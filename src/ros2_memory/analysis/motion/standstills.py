@@ -82,7 +82,7 @@ _OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
 PER_METRE: Final = 10_000
 """Means of positions are rounded: nothing depends on the order in which they are added up."""
 _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
-_BLOCKS_AT_ONCE: Final = 64
+_BLOCKS_AT_ONCE: Final = 128
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
 """How far the means of a block spread without noise."""
 
