@@ -1,14 +1,16 @@
-"""A reader of MCAP bags that notes what it was asked."""
+"""Readers of MCAP bags that note what they are asked, or fail."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ros2_memory.storage.mcap_reader import McapReader
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
+
+    import pytest
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.model import TimeWindow
@@ -53,3 +55,17 @@ class NotingReader(McapReader):
     def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
         self.asked.append((path, (topic,)))
         return super().newest(path, topic, window)
+
+
+def fail_reading(
+    monkeypatch: pytest.MonkeyPatch, way: str, error_of: Callable[[Path], Exception | None]
+) -> None:
+    """Has one way of reading (`records`, `batches`) fail for the bags that have an error."""
+    read = getattr(McapReader, way)
+
+    def failing(self: McapReader, path: Path, *given: Any, **how: Any) -> Any:
+        if error := error_of(path):
+            raise error
+        return read(self, path, *given, **how)
+
+    monkeypatch.setattr(McapReader, way, failing)

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.metadata_yaml import bare_name
 from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.retention.delete import remove_bag, remove_emptied
-from ros2_memory.retention.disk import free_bytes
+from ros2_memory.retention.disk import RETRIED_S, free_bytes
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
     RetentionLimits,
@@ -45,7 +45,6 @@ if TYPE_CHECKING:
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
-_DAY_S: Final = 86_400.0
 _WRITTEN_AT_ONCE: Final = 2
 """Recordings, during a rotation."""
 
@@ -377,7 +376,7 @@ class GarbageCollector:
             now = self._monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
-            waiting = [bag for bag in to_delete if bag.path in aged and now - since < _DAY_S]
+            waiting = [bag for bag in to_delete if bag.path in aged and now - since < RETRIED_S]
             run.remaining |= {bag.path for bag in waiting}
             lost = len(to_delete) - len(waiting)
             _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)

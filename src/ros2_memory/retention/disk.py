@@ -1,4 +1,4 @@
-"""Notices when the bag directory no longer lies on the disk on which recording began.
+"""The disk of the bag directory: is it still the one on which recording began, and what fails?
 
 When a disk is unmounted under a running recorder, the path of the bag directory names a directory
 of the disk below it, mostly the system disk, which recordings would fill.
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
 
-_DAY_S: Final = 86_400.0
+RETRIED_S: Final = 86_400.0
+"""So long it is tried again what the disk refuses; after that it counts as lost."""
 
 
 def free_bytes(directory: Path) -> int:
@@ -85,10 +86,8 @@ class HomeDisk:
         return self.away
 
 
-class Patience:
-    """Waits for files that the disk does not give, a day for each: then they count as damaged.
-
-    A sector that is bad for good would hold the files behind it for ever.
+class FailingFiles:
+    """Since when the disk fails to read files, so that those bad for good are given up.
 
     Args:
         monotonic: a clock that never steps, in seconds.
@@ -96,9 +95,9 @@ class Patience:
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._monotonic = monotonic
-        self._failing_since: dict[Path, float] = {}
+        self._since: dict[Path, float] = {}
 
-    def is_left(self, path: Path) -> bool:
-        """Returns whether a file that fails now has failed for less than a day."""
+    def may_recover(self, path: Path) -> bool:
+        """Returns whether a file that fails now first failed less than `RETRIED_S` ago."""
         now = self._monotonic()
-        return now - self._failing_since.setdefault(path, now) < _DAY_S
+        return now - self._since.setdefault(path, now) < RETRIED_S

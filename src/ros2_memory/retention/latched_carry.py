@@ -44,7 +44,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.retention.disk import Patience
+from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -186,7 +186,7 @@ class Carrier:
         self._writer = writer
         self._static_topics = frozenset(static_topics)
         self._own = own
-        self._patience = Patience(monotonic)
+        self._failing = FailingFiles(monotonic)
         self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
@@ -293,14 +293,14 @@ class Carrier:
         Raises:
             BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
                 it must not be replaced by a bag without them.
-            BagUnreachableError: the disk has failed to give the bag for less than a day.
+            BagUnreachableError: the disk fails to read a bag, and may recover.
         """
         try:
             yield from self._reader.records(path, topics, TimeWindow.everything())
         except BagVanishedError:
             return
         except BagError as error:
-            if isinstance(error, BagUnreachableError) and self._patience.is_left(path):
+            if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
                 raise
             if path == self.path:
                 reason = f"{error.reason}; move it away to give up its messages"

@@ -19,10 +19,11 @@ from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
 from tests.support.memories import memory_of
+from tests.support.noting_reader import fail_reading
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Iterable
     from pathlib import Path
 
     from ros2_memory.storage.base import Record
@@ -263,44 +264,25 @@ class TestTheBagOfCarriedMessages:
         assert held(memory, "/tf_static", latest)[0] < latest - 50 * S  # type: ignore[operator]
 
     def test_a_bag_stays_while_the_disk_fails_to_give_its_latched_messages(
-        self, tmp_path: Path
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        class Unlucky(McapReader):
-            def records(
-                self,
-                path: Path,
-                topics: Collection[str],
-                window: TimeWindow,
-                *,
-                newest_first: bool = False,
-            ) -> Iterator[Record]:
-                if path.name == "rec_0.mcap":
-                    raise BagUnreachableError(str(path), "it cannot be opened: Too many open files")
-                return super().records(path, topics, window, newest_first=newest_first)
-
+        too_many = BagUnreachableError("rec_0.mcap", "it cannot be opened: Too many open files")
+        fail_reading(
+            monkeypatch, "records", lambda path: too_many if path.name == "rec_0.mcap" else None
+        )
         at_home(tmp_path, splits=4)
         now = SettableClock(0)
-        keeper = keeper_of(tmp_path, reader=Unlucky(), max_bytes=1, monotonic=lambda: now.now() / S)
+        keeper = keeper_of(tmp_path, max_bytes=1, monotonic=lambda: now.now() / S)
         keeper.apply()
         assert (tmp_path / "rec" / "rec_0.mcap").exists()
         now.at = 86_401 * S
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
 
-    def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(self, tmp_path: Path) -> None:
-        class Unlucky(McapReader):
-            def records(
-                self,
-                path: Path,
-                topics: Collection[str],
-                window: TimeWindow,
-                *,
-                newest_first: bool = False,
-            ) -> Iterator[Record]:
-                if is_carried(path):
-                    raise BagError(str(path), "it cannot be opened: Input/output error")
-                return super().records(path, topics, window, newest_first=newest_first)
-
+    @pytest.mark.parametrize("kind", [BagError, BagUnreachableError])
+    def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(
+        self, tmp_path: Path, kind: type[BagError]
+    ) -> None:
         recording(
             tmp_path,
             "rec",
@@ -310,7 +292,10 @@ class TestTheBagOfCarriedMessages:
             drive(T0 + 30 * S, T0 + 40 * S),
         )
         keep_only(tmp_path, *(f"rec/rec_{number}.mcap" for number in (1, 2, 3)))
-        keeper_of(tmp_path, max_bytes=1, reader=Unlucky()).apply()
+        with pytest.MonkeyPatch.context() as patched:
+            fault = kind("carried.mcap", "it cannot be opened: Input/output error")
+            fail_reading(patched, "records", lambda path: fault if is_carried(path) else None)
+            keeper_of(tmp_path, max_bytes=1).apply()
         assert [each.log_time for each in records(tmp_path)] == [T0]
         assert not (tmp_path / "rec/rec_2.mcap").exists()
         assert (tmp_path / "rec/rec_1.mcap").exists()

@@ -48,7 +48,7 @@ from ros2_memory.recorder.memory.thinning import (
     is_sampled,
     rounded,
 )
-from ros2_memory.retention.disk import Patience
+from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -162,7 +162,7 @@ class MemoryDays:
         self._static_topics = frozenset(static_topics)
         self._minutes: set[Path] = set()
         self._monotonic = monotonic
-        self._patience = Patience(monotonic)
+        self._failing = FailingFiles(monotonic)
         self._leaving_since: float | None = None
 
     def keep(self, snapshot: Snapshot, paths: Collection[str]) -> None:
@@ -205,7 +205,7 @@ class MemoryDays:
         date, and do not age either.
 
         Raises:
-            BagError: a day cannot be written anew.
+            BagError: a day cannot be read or written anew.
             OSError: the folder cannot be read, or a day not be deleted.
         """
         oldest = "" if now is None else memory_file(utc_day(now - self._limits.max_age_ns))
@@ -345,7 +345,7 @@ class MemoryDays:
         """Yields the messages of a bag as tables; what is damaged of it is left out.
 
         Raises:
-            BagUnreachableError: the disk has failed to give the bag for less than a day.
+            BagUnreachableError: the disk fails to read the bag, and may recover.
         """
         groups = decoded(self._reader, pieces(self._reader, path), skip_undecodable=True)
         while True:
@@ -355,7 +355,7 @@ class MemoryDays:
                     return
                 yield from tables
             except BagError as error:
-                self._require_patience(path, error)
+                self._raise_if_transient(path, error)
                 _log.warning("memory_not_read", path=str(path), reason=error.reason)
                 if error.lost is None:
                     return
@@ -367,15 +367,15 @@ class MemoryDays:
             try:
                 yield from records
             except BagError as error:
-                self._require_patience(path, error)
+                self._raise_if_transient(path, error)
                 if error.lost is None:
                     return
             else:
                 return
 
-    def _require_patience(self, path: Path, error: BagError) -> None:
-        """Raises an error again that may pass, for a day."""
-        if isinstance(error, BagUnreachableError) and self._patience.is_left(path):
+    def _raise_if_transient(self, path: Path, error: BagError) -> None:
+        """Raises an error of the disk again while the disk may recover."""
+        if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
             raise error
 
     def _smaller(self, record: Record) -> Record | None:

@@ -7,7 +7,7 @@ import operator
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from ros2_memory.retention.delete import remove_bag
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.page.routes import span_request
 from ros2_memory.serving.page.span import span_shown
-from ros2_memory.storage.base import BagReader, BagWriter, Batch, Record
+from ros2_memory.storage.base import BagWriter, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.reply_size import to_json_text
@@ -55,6 +55,7 @@ from tests.support.bags import (
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, own_all
 from tests.support.memories import reply_over, shipped_extractor
+from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
 
 S = NS_PER_S
@@ -85,7 +86,6 @@ def split(
 def days_of(
     bag_dir: Path,
     *,
-    reader: BagReader | None = None,
     writer: BagWriter | None = None,
     limits: MemoryLimits | None = None,
     keeps: bool = True,
@@ -93,7 +93,7 @@ def days_of(
 ) -> MemoryDays:
     return MemoryDays(
         bag_dir,
-        BagDirReader(reader or McapReader()),
+        BagDirReader(McapReader()),
         writer or McapWriter(),
         OwnRecordings(bag_dir),
         shipped_extractor(),
@@ -641,38 +641,9 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
     assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 40
 
 
-class Unreachable(McapReader):
-    """Of `rec_A` one of two ways of reading fails for a while, as for want of descriptors."""
-
-    def __init__(self, way: str) -> None:
-        super().__init__()
-        self.way = way
-
-    def _require(self, path: Path, way: str) -> None:
-        if self.way == way and path.parent.name == "rec_A":
-            raise BagUnreachableError(str(path), "it cannot be opened: Too many open files")
-
-    def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
-    ) -> Iterator[Record]:
-        self._require(path, "records")
-        return super().records(path, topics, window, newest_first=newest_first)
-
-    def batches(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        bare: Collection[str] = (),
-    ) -> Iterator[Batch]:
-        self._require(path, "batches")
-        return super().batches(path, topics, window, bare=bare)
+def unreachable(path: Path) -> BagError | None:
+    reason = "it cannot be opened: Too many open files"
+    return BagUnreachableError(str(path), reason) if path.parent.name == "rec_A" else None
 
 
 @pytest.mark.parametrize("way", ["records", "batches"])
@@ -680,31 +651,38 @@ def test_age_waits_while_the_disk_fails_and_then_all_of_it_stays(bag_dir: Path, 
     split(bag_dir, 0)
     split(bag_dir, 72_000, name="rec_B")
     own_all(bag_dir)
-    reader = Unreachable(way)
-    keeper = house(bag_dir, T0 + 72_100 * S, max_age_h=12, memory=days_of(bag_dir, reader=reader))
-    keeper.apply()
+    keeper = house(bag_dir, T0 + 72_100 * S, max_age_h=12, memory=days_of(bag_dir))
+    with pytest.MonkeyPatch.context() as patched:
+        fail_reading(patched, way, unreachable)
+        keeper.apply()
     assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 1
     assert not [*bag_dir.glob("memory/*.mcap")]
-    reader.way = ""
     keeper.apply()
     assert not [*bag_dir.glob("rec_A/*.mcap")]
     assert len([*bag_dir.glob("memory/*.mcap")]) == 1
 
 
 @pytest.mark.parametrize("way", ["records", "batches"])
-def test_what_the_disk_never_gives_holds_others_for_a_day(bag_dir: Path, way: str) -> None:
+def test_what_the_disk_never_gives_holds_others_for_two_days_at_most(
+    bag_dir: Path, way: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     split(bag_dir, 0)
     split(bag_dir, 600, name="rec_C")
     split(bag_dir, 72_000, name="rec_B")
     own_all(bag_dir)
-    monotonic = SettableClock(0)
-    seconds = lambda: monotonic.now() / S  # noqa: E731 - for both
-    memory = days_of(bag_dir, reader=Unreachable(way), monotonic=seconds)
-    keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, monotonic=seconds)
+    fail_reading(monkeypatch, way, unreachable)
+    clock = SettableClock(0)
+
+    def monotonic() -> float:
+        return clock.now() / S
+
+    memory = days_of(bag_dir, monotonic=monotonic)
+    keeper = house(bag_dir, T0 + 72_700 * S, max_age_h=12, memory=memory, monotonic=monotonic)
     keeper.apply()
     assert not [*bag_dir.glob("memory/*.mcap")]
-    monotonic.at = 86_401 * S
-    keeper.apply()
+    # A day for its latched messages, then one for what stays of it.
+    for clock.at in (86_401 * S, 172_802 * S):
+        keeper.apply()
     assert not [*bag_dir.glob("rec_[AC]/*.mcap")]
     [day] = bag_dir.glob("memory/*.mcap")
     assert McapReader().summarize(day).start >= T0 + 600 * S
