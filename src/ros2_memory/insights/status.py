@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
@@ -11,7 +12,7 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
-    deleted_length,
+    deleted_between,
     describe_excluded,
     describe_gaps,
     describe_lost,
@@ -113,9 +114,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
 
 def gaps_with_deleted(view: View, gaps: Iterable[tuple[Ns, Ns]]) -> tuple[Gap, ...]:
     """Returns gaps, each with how much of it retention deleted."""
-    return tuple(
-        Gap(start, end, deleted_length(view, TimeWindow(start, end))) for start, end in gaps
-    )
+    deleted = deleted_between(view, TimeWindow.everything())
+    return tuple(Gap(start, end, length_in(deleted, start, end)) for start, end in gaps)
 
 
 def state_of(heartbeat: Heartbeat, *, live: bool) -> str:

@@ -114,7 +114,7 @@ class ThingsBetween:
         )
         estimate = self.known.estimate
         if before is None and after is not None:
-            evidence = estimate.evidence[instance.key, instance.epoch][after.stay.place]
+            evidence = estimate.evidence[instance.key, instance.epoch].at(after.stay.place)
             end = min(self.earlier.stop, self.later.start)
             looked = missed_in(estimate.cells, evidence, after.stay.stay, (self.earlier.start, end))
             return "appeared" if looked else "not_looked_at", thing

@@ -151,8 +151,17 @@ class Estimate:
     names: dict[str, str]
     """The name to show of each key."""
     cells: Cells
-    evidence: dict[tuple[str, int], list[Evidence]]
-    """By key and epoch: the evidence for each place."""
+    evidence: dict[tuple[str, int], Evidence]
+    """By key and epoch: the evidence for all places."""
+    stays: list[tuple[Instance, PlacedStay]] = field(init=False)
+    stay_of: Ints = field(init=False)
+    """Of each spot, the first of `stays` that has it; -1 where none has."""
+
+    def __post_init__(self) -> None:
+        self.stays = [(each, stay) for each in self.instances for stay in each.stays]
+        self.stay_of = np.full(len(self.sights.spots), -1, np.int64)
+        for nth, (_, stay) in reversed([*enumerate(self.stays)]):
+            self.stay_of[stay.spots] = nth
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
         """Returns which of some spots are of slices that reach into a window and end before a time.
@@ -200,8 +209,8 @@ class Estimate:
 
     def missing(self, instance: Instance, stay: PlacedStay) -> tuple[float, int, Ns | None]:
         """Returns `chance_of_missing` a thing after one of its stays."""
-        place = self.evidence[instance.key, instance.epoch][stay.place]
-        return chance_of_missing(self.cells, place, stay.stay, stay.last)
+        evidence = self.evidence[instance.key, instance.epoch].at(stay.place)
+        return chance_of_missing(self.cells, evidence, stay.stay, stay.last)
 
     def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
@@ -209,14 +218,14 @@ class Estimate:
         `seen` are rows of `Sights.spots` of another estimate (mm, ns), of some of the same bags.
         Returns None where no thing has any of them.
         """
-        alike = [Spot.N, Spot.X, Spot.Y, Spot.FIRST, Spot.LAST]
-        spots = np.ascontiguousarray(self.sights.spots[:, alike])
-        for spot in seen[:, alike]:
-            rows = np.flatnonzero((spots == spot).all(axis=1))
-            for instance in self.instances:
-                for stay in instance.stays:
-                    if np.isin(rows, stay.spots).any():
-                        return instance, stay
+        alike = [Spot.N, Spot.X, Spot.Y, Spot.LAST]
+        spots = self.sights.spots
+        for spot in seen:
+            rows = np.flatnonzero(spots[:, Spot.FIRST] == spot[Spot.FIRST])
+            rows = rows[(spots[rows][:, alike] == spot[alike]).all(axis=1)]
+            stays = self.stay_of[rows]
+            if (stays >= 0).any():
+                return self.stays[int(stays[stays >= 0].min())]
         return None
 
 
@@ -229,7 +238,7 @@ class _Group:
     rows: Ints
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
-    evidence: list[Evidence] = field(default_factory=list)
+    evidence: Evidence | None = None
 
 
 def estimate(
@@ -264,6 +273,9 @@ def estimate(
             instances += linked
         elif _is_seen(group, seen):
             movers.append(Mover(group.key, group.epoch, group.rows))
+    for each in instances:
+        each.labels = _labels_of(each, labels, names)
+    instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
     found = Estimate(
         sights=sights.only(Spot, Score, Unplaced),
         instances=instances,
@@ -274,12 +286,14 @@ def estimate(
         hit_starts=seen.starts,
         names=names,
         cells=seen.cells,
-        evidence={(group.key, group.epoch): group.evidence for group in groups},
+        evidence={
+            (group.key, group.epoch): group.evidence
+            for group in groups
+            if group.evidence is not None
+        },
     )
     for each in instances:
         each.chance, each.looks, each.missed_by = found.missing(each, each.stays[-1])
-        each.labels = _labels_of(each, labels, names)
-    instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
     return found
 
 
@@ -402,50 +416,62 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
         go_on()
         rows = seen.firm(group.rows)
         place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
-        for nth in range(int(place.max(initial=-1)) + 1):
-            mine = rows[place == nth]
-            if _are_several(seen.groups[mine]):
+        rows, place = rows[place >= 0], place[place >= 0]
+        several, counts = (
+            _are_several(place, seen.groups[rows]),
+            np.bincount(place, seen.counts[rows]),
+        )
+        order = np.argsort(place, kind="stable")
+        ends = np.cumsum(np.bincount(place))
+        for nth, mine in enumerate(np.split(rows[order], ends[:-1])):
+            if several[nth]:
                 group.places.append(mine)
-            elif seen.counts[mine].sum() >= _FEWEST:
+            elif counts[nth] >= _FEWEST:
                 single.append((group, mine))
     steps = stays_in([seen.sightings(rows) for _, rows in single])
     for (group, rows), step in zip(single, steps, strict=True):
         group.places += [rows[step == each] for each in range(int(step.max()) + 1)]
 
 
-def _are_several(groups: Ints) -> bool:
-    """Whether bags have several spots of a label at one place: things that stand together."""
-    distinct = np.unique(groups).size
-    return groups.size - distinct > _SEVERAL_SHARE * distinct
+def _are_several(place: Ints, groups: Ints) -> Flags:
+    """Returns at which places bags have several spots of a label: things that stand together."""
+    width = int(groups.max(initial=0)) + 1
+    distinct = np.bincount(np.unique(place * width + groups) // width)
+    several: Flags = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
+    return several
 
 
 def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     """Finds when a label was at its places."""
     every = seen.sights.spots
-    for place, mine in enumerate(group.places):
+    if not group.places:
+        return
+    mine = np.concatenate(group.places)
+    of = np.repeat(np.arange(len(group.places)), [len(rows) for rows in group.places])
+    n = seen.counts[mine]
+    sums = [np.bincount(of, n * every[mine, column]) for column in (Spot.X, Spot.Y)]
+    places = np.stack(sums, axis=1) / np.bincount(of, n)[:, None]
+    rows = _rows_of(mine, seen.hits, seen.starts)
+    rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
+    of = np.repeat(of, seen.starts[mine + 1] - seen.starts[mine])
+    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of)
+    for place, stay in stays_at(seen.cells, group.evidence):
         go_on()
-        bag, n = every[mine, Spot.SLICE], seen.counts[mine]
-        x, y = (float(np.average(every[mine, column], weights=n)) for column in (Spot.X, Spot.Y))
-        rows = _rows_of(mine, seen.hits, seen.starts)
-        rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
-        group.evidence.append(evidence_at(seen.cells, seen.view, x, y, rows))
-        for stay in stays_at(seen.cells, group.evidence[-1]):
-            inside = mine[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
-            group.stays.append(_placed(seen, place, stay, inside))
+        spots = group.places[place]
+        bag = every[spots, Spot.SLICE]
+        inside = spots[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
+        group.stays.append(_placed(seen, place, stay, inside))
 
 
 def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     spots, n = seen.sights.spots[rows], seen.counts[rows]
-    x, y, z = (float(np.average(spots[:, at], weights=n)) for at in (Spot.X, Spot.Y, Spot.Z))
+    total = int(n.sum())
+    x, y, z = (n @ spots[:, [Spot.X, Spot.Y, Spot.Z]] / total).tolist()
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
     often = np.bincount(spots[:, Spot.LABEL], n).astype(np.int64)
     spellings = Counter(
         {seen.sights.labels[label]: int(often[label]) for label in np.flatnonzero(often).tolist()}
     )
-    left = None
-    if stay.left is not None:
-        of = seen.cells.bag == stay.left
-        left = int(seen.cells.last[of].min()) if of.any() else None
     firm = spots[:, Spot.SLICE]
     firm = spots[(firm >= stay.firm_first) & (firm <= stay.firm_last)]
     firm = firm if len(firm) and stay.firm_first >= 0 else spots
@@ -453,13 +479,13 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
         x=x,
         y=y,
         z=z,
-        dev_mm=float(np.sqrt(np.average(squares, weights=n))),
+        dev_mm=math.sqrt(n @ squares / total),
         first=int(spots[:, Spot.FIRST].min()),
         last=int(spots[:, Spot.LAST].max()),
         firm_first=int(firm[:, Spot.FIRST].min()),
         firm_last=int(firm[:, Spot.LAST].max()),
-        left=left,
-        count=int(n.sum()),
+        left=None if stay.left is None else seen.cells.looked_in(stay.left),
+        count=total,
         spots=rows,
         spellings=spellings,
         place=place,
@@ -505,6 +531,10 @@ class _Hosts:
     ) -> None:
         self._every, self._seen, self._keys = every, seen, keys
         self._beside = _by_spot(seen.sights.beside, seen.sights)
+        self._hits = [
+            (seen.sights.spots[rows, Spot.SLICE], np.append(0, np.cumsum(seen.counts[rows])))
+            for rows in (stay.spots for _, stay in every)
+        ]
         columns = [
             (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in every
         ]
@@ -523,7 +553,7 @@ class _Hosts:
         beside: Counter[str] | None = None
         found = zip(self._order[start:stop][near].tolist(), away[near].tolist(), strict=True)
         for other, metres in sorted(found):
-            host_group, host = self._every[other]
+            host_group, _ = self._every[other]
             if other == nth:
                 continue
             if host_group is not group:
@@ -532,7 +562,7 @@ class _Hosts:
                 beside = self._beside_of(stay) if beside is None else beside
                 if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
                     continue
-            yield other, self._seen_during(host, stay.stay)
+            yield other, self._seen_during(other, stay.stay)
 
     def _beside_of(self, stay: PlacedStay) -> Counter[str]:
         """Returns how often its detections had other labels beside them, by the key of these."""
@@ -541,10 +571,10 @@ class _Hosts:
             counts[self._keys[label]] += n
         return counts
 
-    def _seen_during(self, host: PlacedStay, stay: Stay) -> int:
-        bags = self._seen.sights.spots[host.spots, Spot.SLICE]
+    def _seen_during(self, host: int, stay: Stay) -> int:
+        bags, counts = self._hits[host]
         start, stop = np.searchsorted(bags, (stay.first_bag, stay.last_bag + 1))
-        return int(self._seen.counts[host.spots[start:stop]].sum())
+        return int(counts[stop] - counts[start])
 
 
 def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instance]:

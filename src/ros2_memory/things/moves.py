@@ -9,6 +9,7 @@ side and on a step says how large the step is, and how exactly that is known.
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -16,9 +17,9 @@ import numpy as np
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.sights import Floats, Ints
+    from ros2_memory.analysis.sights import Flags, Floats, Ints
 
 
 _PAUSE_NS: Final = 60 * NS_PER_S
@@ -37,6 +38,8 @@ _VISIT_MM: Final = 40.0
 """Usual standard deviation of what the looks of a visit share, which all visits correct."""
 _LEAST_VISIT_MM: Final = 20.0
 """That of a thing is taken for no less: a few visits may agree by chance."""
+_AT_ONCE: Final = 8_192
+"""Sightings that are looked at together: more take more memory, and no less time."""
 _USUAL: Final = 8
 """What is usual weighs as much as so many looks, or differences between visits."""
 
@@ -58,59 +61,91 @@ class Sightings(NamedTuple):
     last: Ints
 
 
-def visits_of(first: Ints, last: Ints) -> Ints:
-    """Returns the number of the visit of each sighting."""
-    ends: Ints = np.maximum.accumulate(last)[:-1]
-    return np.concatenate(([0], np.cumsum(first[1:] > ends + _PAUSE_NS)))
+def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
+    """Returns the number of the visit of each sighting, of things in ascending order."""
+    # The latest so far of a thing, as its place among all: these are small numbers.
+    order = np.argsort(last, kind="stable")
+    rank = np.empty(len(last), np.int64)
+    rank[order] = np.arange(len(last))
+    offset = np.broadcast_to(thing, len(last)) * len(last)
+    latest = last[order][np.maximum.accumulate(rank + offset) - offset]
+    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (offset[1:] != offset[:-1])
+    return np.concatenate(([0], np.cumsum(begins)))
 
 
 def stays_in(every: Sequence[Sightings]) -> list[Ints]:
     """Returns for the sightings of each thing the number of the stay of each, from 0."""
-    series = [_Series.of(seen) for seen in every]
-    differences = [_differences(each) for each in series]
-    usual = _variance(np.concatenate([np.zeros(0), *differences]), _VISIT_MM**2)
-    return [
-        _split(each, _variance(some, usual)) for each, some in zip(series, differences, strict=True)
-    ]
+    if not every:
+        return []
+    series = _Series.of(every)
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    moves = np.cumsum(_moves(series, _variances(*_differences(series), len(every))))
+    return np.split(moves - moves[begins][series.thing], begins[1:])
 
 
 class _Series(NamedTuple):
-    """Sightings as rows of 1, the side and the place, by the weight of their looks (1/mm²)."""
+    """Sightings as rows of 1, the side and the place, by the weight of their looks (1/mm²).
+
+    Of all things, which are numbered; visits are numbered through all of them.
+    """
 
     rows: Floats
     n: Ints
     visit: Ints
+    thing: Ints
 
     @classmethod
-    def of(cls, seen: Sightings) -> _Series:
-        squares = seen.n * seen.dev**2 / 2
-        usual = (squares.sum() + _USUAL * _LOOK_MM**2) / (seen.n.sum() - len(seen.n) + _USUAL)
-        weight = seen.n * (seen.n - 1 + _USUAL) / (squares + _USUAL * usual)
-        place = seen.xy - seen.xy.mean(axis=0)
-        rows = np.hstack((np.ones((len(weight), 1)), seen.side, place)) * weight[:, None]
-        return cls(rows, seen.n, visits_of(seen.first, seen.last))
+    def of(cls, every: Sequence[Sightings]) -> _Series:
+        sizes = np.array([len(seen.n) for seen in every])
+        thing, begins = np.repeat(np.arange(len(every)), sizes), np.cumsum(sizes) - sizes
+        xy, n, dev, side, first, last = map(np.concatenate, zip(*every, strict=True))
+        squares = n * dev**2 / 2
+        looks = np.add.reduceat(n, begins) - sizes + _USUAL
+        usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks
+        weight = n * (n - 1 + _USUAL) / (squares + _USUAL * usual[thing])
+        place = xy - (np.add.reduceat(xy, begins) / sizes[:, None])[thing]
+        rows = np.hstack((np.ones((len(weight), 1)), side, place)) * weight[:, None]
+        return cls(rows, n, visits_of(first, last, thing), thing)
 
 
-def _differences(series: _Series) -> Floats:
-    """Returns what visits add to the variance, by each two that follow each other.
+def _differences(series: _Series) -> tuple[Floats, Ints]:
+    """Returns what visits add to the variance, by each two of a thing that follow each other.
 
-    Not by the two that differ most: between these it may have been moved.
+    Not by the two that differ most: between these it may have been moved. With the thing of each;
+    ascending for each thing.
     """
     starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
-    sums = np.add.reduceat(series.rows, starts)
+    sums, thing = np.add.reduceat(series.rows, starts), series.thing[starts]
     means = sums / sums[:, :1]
-    normal = _squares(sums, _VISIT_MM**2).sum(axis=0)
-    fit = np.linalg.solve(normal[:3, :3] + np.diag(_PRIOR[:3]), normal[:3, 3:])
-    off = means[:, 3:] - means[:, :3] @ fit
+    begins = np.flatnonzero(np.diff(thing, prepend=-1))
+    normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins)
+    fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR[:3]), normal[:, :3, 3:])
+    off = means[:, 3:] - np.einsum("vi,vij->vj", means[:, :3], fit[thing])
     by_looks = 1 / sums[:-1, 0] + 1 / sums[1:, 0]
     found = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
-    return np.sort(found)[:-1]
+    alike = thing[1:] == thing[:-1]
+    found, thing = found[alike], thing[1:][alike]
+    order = np.lexsort((found, thing))
+    found, thing = found[order], thing[order]
+    is_greatest = np.diff(thing, append=-1) != 0
+    return found[~is_greatest], thing[~is_greatest]
 
 
-def _variance(differences: Floats, usual: float) -> float:
-    n = len(differences)
-    median = float(np.median(differences)) if n else 0.0
-    return max((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
+def _variances(differences: Floats, thing: Ints, things: int) -> Floats:
+    """Returns what visits add to the variance of each thing."""
+    median = float(np.median(differences)) if len(differences) else 0.0
+    usual = _variance(len(differences), median, _VISIT_MM**2)
+    sizes = np.bincount(thing, minlength=things)
+    begins = np.cumsum(sizes) - sizes
+    some = np.flatnonzero(sizes)
+    medians = np.zeros(things)
+    low, high = begins[some] + (sizes[some] - 1) // 2, begins[some] + sizes[some] // 2
+    medians[some] = (differences[low] + differences[high]) / 2
+    return _variance(sizes, medians, usual)
+
+
+def _variance(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:
+    return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
 
 
 _PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2, 0.0])
@@ -120,35 +155,49 @@ Of the place next to nothing, so that the equations have a solution; of the step
 """
 
 
-def _squares(sums: Floats, visit: float) -> Floats:
+def _squares(sums: Floats, visit: Floats | float) -> Floats:
     """Returns the squares of visits' means, each by its weight; `visit` is their own variance."""
-    weight = np.maximum(sums[:, :1, None], 1e-30)
-    squares: Floats = sums[:, :, None] * sums[:, None, :] / weight / (1 + visit * weight)
+    weight = np.maximum(sums[:, 0], 1e-30)
+    scale = 1 / weight / (1 + visit * weight)
+    squares: Floats = sums[:, :, None] * sums[:, None, :] * scale[:, None, None]
     return squares
 
 
-def _split(series: _Series, visit: float) -> Ints:
-    """Returns the number of the stay of each sighting."""
-    stay = np.zeros(len(series.n), np.int64)
-    waiting = [(0, len(stay))]
+def _moves(series: _Series, variance: Floats) -> Flags:
+    """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
+    moved = np.zeros(len(series.n), np.bool_)
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1)).tolist()
+    waiting = [*pairwise([*begins, len(moved)])]
     while waiting:
-        start, stop = waiting.pop()
-        here = slice(start, stop)
-        part = _Series(series.rows[here], series.n[here], series.visit[here])
-        at = _step(part, visit)
-        if at:
-            stay[start + at :] += 1
-            waiting += [(start, start + at), (start + at, stop)]
-    return stay
+        parts, rows = [], 0
+        while waiting and rows < _AT_ONCE:
+            parts.append(waiting.pop())
+            rows += parts[-1][1] - parts[-1][0]
+        of = np.concatenate([np.arange(*part) for part in parts])
+        part = np.repeat(np.arange(len(parts)), [stop - start for start, stop in parts])
+        some = _Series(series.rows[of], series.n[of], series.visit[of], part)
+        for nth, step in _steps(some, variance[series.thing[of]]):
+            start, stop = parts[nth]
+            at = int(of[step])
+            moved[at] = True
+            waiting += [(start, at), (at, stop)]
+    return moved
 
 
-def _step(series: _Series, visit: float) -> int:
-    """Returns the first sighting after the likeliest step; 0 where there is none."""
-    seen = np.cumsum(series.n)
-    at = np.flatnonzero((seen >= _FEWEST) & (seen[-1] - seen >= _FEWEST)) + 1
+def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
+    """Yields the things with a step, and the first sighting after the likeliest one.
+
+    `variance` is that of the visit of each sighting.
+    """
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    looks = np.cumsum(series.n)
+    before, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
+    old_looks = looks - before[series.thing]
+    new_looks = total[series.thing] - old_looks
+    at = np.flatnonzero((old_looks >= _FEWEST) & (new_looks >= _FEWEST)) + 1
     if not len(at):
-        return 0
-    old, new = _before_and_after(series, at, visit)
+        return
+    old, new = _before_and_after(series, begins, at, variance)
     normal = np.zeros((len(at), 4, 4))
     normal[:, :3, :3] = (old + new)[:, :3, :3]
     normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
@@ -157,19 +206,31 @@ def _step(series: _Series, visit: float) -> int:
     inverse = np.linalg.inv(normal + np.diag(_PRIOR))
     moved = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
     likely = np.where(moved >= _LEAST_MM**2, moved / inverse[:, 3, 3], 0.0)
-    best = int(likely.argmax())
-    return int(at[best]) if likely[best] > _SIGMAS**2 else 0
+    # Of each thing the likeliest, of equal ones the first.
+    order = np.lexsort((at, -likely, series.thing[at]))
+    things, first = np.unique(series.thing[at[order]], return_index=True)
+    best = order[first]
+    is_sure = likely[best] > _SIGMAS**2
+    yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
 
 
-def _before_and_after(series: _Series, at: Ints, visit: float) -> tuple[Floats, Floats]:
-    """Returns the squares of the visits before and after each step, which may be within a visit."""
-    starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
-    sums = np.vstack((np.zeros((1, 5)), np.cumsum(series.rows, axis=0)))
+def _before_and_after(
+    series: _Series, begins: Ints, at: Ints, variance: Floats
+) -> tuple[Floats, Floats]:
+    """Returns the squares of a thing's visits before and after each step, which may be within one.
+
+    `begins` has where each thing begins.
+    """
+    is_start = np.diff(series.visit, prepend=-1) != 0
+    is_start[begins] = True
+    starts = np.flatnonzero(is_start)
     ends = np.append(starts, len(series.n))
-    squares = _squares(np.diff(sums[ends], axis=0), visit)
+    sums = np.vstack((np.zeros((1, 5)), np.cumsum(series.rows, axis=0)))
+    squares = _squares(np.diff(sums[ends], axis=0), variance[starts])
     until = np.concatenate((np.zeros((1, 5, 5)), np.cumsum(squares, axis=0)))
-    of = np.searchsorted(starts, at, side="right") - 1
-    of -= starts[of] == at
-    old = until[of] + _squares(sums[at] - sums[ends[of]], visit)
-    new = until[-1] - until[of + 1] + _squares(sums[ends[of + 1]] - sums[at], visit)
+    first = np.searchsorted(starts, begins)
+    stop = np.append(first[1:], len(starts))
+    of, thing, variance = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
+    old = until[of] - until[first[thing]] + _squares(sums[at] - sums[ends[of]], variance)
+    new = until[stop[thing]] - until[of + 1] + _squares(sums[ends[of + 1]] - sums[at], variance)
     return old, new

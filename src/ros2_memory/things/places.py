@@ -51,39 +51,39 @@ def places_of(x: Ints, y: Ints, n: Ints) -> Ints:
 
 def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
     """Returns where the spots are densest, the densest first, `_CLAIM_MM` or more apart."""
-    density = _density(cells, mass)
-    order = np.argsort(-density, kind="stable")
+    order = np.argsort(-_density(cells, mass), kind="stable")
+    centre, mass = centre[order], mass[order]
     free = np.ones(len(cells), bool)
-    found: list[Floats] = []
-    masses: list[float] = []
-    for at in order.tolist():
+    peaks, masses = np.empty((_MAX_PLACES, 2)), np.empty(_MAX_PLACES)
+    count = 0
+    for at in range(len(cells)):
         if not free[at]:
             continue
-        middle = centre[at]
+        middle, left, rest = centre[at], free[at:], centre[at:]
         for _ in range(3):
-            near = free & (_away_squared(centre, middle) <= _PEAK_MM**2)
-            if not near.any():
+            near = at + np.flatnonzero(left & (_away_squared(rest, middle) <= _PEAK_MM**2))
+            if not len(near):
                 break
             # As `numpy.average`, which takes ten times as long for few rows.
-            middle = (centre[near] * mass[near, None]).sum(axis=0) / mass[near].sum()
-        claimed = free & (_away_squared(centre, middle) <= _CLAIM_MM**2)
-        claimed[at] = True
-        free &= ~claimed
-        weight = float(mass[claimed].sum())
-        if not _is_halo(middle, weight, found, masses):
-            found.append(middle)
-            masses.append(weight)
-        if len(found) == _MAX_PLACES:
+            before, middle = middle, mass[near] @ centre[near] / mass[near].sum()
+            if (before == middle).all():
+                break
+        claimed = left & (_away_squared(rest, middle) <= _CLAIM_MM**2)
+        claimed[0] = True
+        weight = float(mass[at:][claimed].sum())
+        left[claimed] = False
+        if not _is_halo(middle, weight, peaks[:count], masses[:count]):
+            peaks[count], masses[count] = middle, weight
+            count += 1
+        if count == _MAX_PLACES:
             break
-    return np.array(found).reshape(-1, 2)
+    return peaks[:count]
 
 
-def _is_halo(middle: Floats, weight: float, peaks: list[Floats], masses: list[float]) -> bool:
-    if not peaks:
-        return False
-    away, mass = _away_squared(np.array(peaks), middle), np.array(masses)
-    noise = (away <= _HALO_MM**2) & (mass > weight / _HALO_SHARE)
-    scattered = (away <= _SCATTER_MM**2) & (mass + weight < _FEW)
+def _is_halo(middle: Floats, weight: float, peaks: Floats, masses: Floats) -> bool:
+    away = _away_squared(peaks, middle)
+    noise = (away <= _HALO_MM**2) & (masses > weight / _HALO_SHARE)
+    scattered = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
     return bool((noise | scattered).any())
 
 

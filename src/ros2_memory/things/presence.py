@@ -10,7 +10,10 @@ being there (Viterbi, two states) gives the stays.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from dataclasses import dataclass
+from itertools import groupby, pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -28,6 +31,8 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from ros2_memory.core.timebase import Ns
 
 
@@ -96,22 +101,35 @@ class Cells:
         self._before[after] = before
 
     def looks_from(self, cells: Ints) -> Ints:
-        """Returns all looks from some cells, by cell."""
-        return self._by_cell[in_ranges(self._starts[cells], self.looks_in[cells])]
+        """Returns all looks from some cells of places, by cell."""
+        cell = _number(cells)
+        looks = self._by_cell[in_ranges(self._starts[cell], self.looks_in[cell])]
+        return _keys(np.repeat(_place(cells), self.looks_in[cell]), looks)
 
     def looks_during(self, bags: Ints) -> Ints:
-        """Returns all looks of some bags."""
-        first = np.searchsorted(self.bag, bags)
-        return in_ranges(first, np.searchsorted(self.bag, bags, side="right") - first)
+        """Returns all looks of some bags of places, by bag."""
+        first, last = (np.searchsorted(self.bag, _number(bags), side) for side in ("left", "right"))
+        looks = in_ranges(first, last - first)
+        return _keys(np.repeat(_place(bags), last - first), looks)
+
+    def looked_in(self, bag: int) -> Ns | None:
+        """Returns when the first look of a bag ended; None without any."""
+        first, last = np.searchsorted(self.bag, (bag, bag + 1))
+        return int(self.last[first:last].min()) if first < last else None
+
+    def cells_of(self, looks: Ints) -> Ints:
+        """Returns the cells of looks of places."""
+        return _keys(_place(looks), self.cell[_number(looks)])
 
     def repeated_misses(self, looks: Ints, hits: Ints) -> Flags:
         """Returns which looks without a hit repeat the previous one, which had none either.
 
         The one before, from the same cell, is no older than the bag before.
         """
-        seen = np.zeros(len(self.cell), bool)
-        seen[looks] = hits > 0
-        again: Flags = self._goes_on[looks] & ~seen[looks] & ~seen[self._before[looks]]
+        again: Flags = (hits == 0) & self._goes_on[_number(looks)]
+        rows = np.flatnonzero(again)
+        before = _keys(_place(looks[rows]), self._before[_number(looks[rows])])
+        again[rows] = ~_are_in(looks[hits > 0], before)
         return again
 
     def seen_at(self, looks: Ints, x: float, y: float) -> tuple[Floats, Floats]:
@@ -157,16 +175,17 @@ def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
 
 
 class Evidence(NamedTuple):
-    """The evidence for one place: the looks at it, and those that saw the label there.
+    """The evidence for the places of a label: the looks at each, and those that saw it there.
 
     Looks are from cells that saw it at least once. Of a cell that does not see it, but for a false
     detection once in a while, only those are here that are in a bag in which it was seen.
 
     Attributes:
-        looks: their numbers, in order of time.
-        cell: of each look, numbered from 0 within the place.
+        looks: their places and numbers, as keys in order.
+        cell: of each look; cells are numbered for each place.
         hits: how many messages of each of these looks have the label there.
-        blind: rows of a bag and its hits of messages without a known pose.
+        blind: the places and bags, as keys in order, of hits by messages without a known pose.
+        times: how many hits each of these has.
         fair: whether a look that has no hit could have: from a cell that sees the place, and with
             the place well inside the field of view.
     """
@@ -175,7 +194,21 @@ class Evidence(NamedTuple):
     cell: Ints
     hits: Ints
     blind: Ints
+    times: Ints
     fair: Flags
+
+    def at(self, place: int) -> Evidence:
+        """Returns that for one place."""
+        ends = _keys(np.array([place, place + 1]), np.zeros(2, np.int64))
+        looks, blind = (slice(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind))
+        return Evidence(
+            self.looks[looks],
+            self.cell[looks],
+            self.hits[looks],
+            self.blind[blind],
+            self.times[blind],
+            self.fair[looks],
+        )
 
 
 class Stay(NamedTuple):
@@ -196,33 +229,73 @@ class Stay(NamedTuple):
 
 
 def evidence_at(
-    cells: Cells, view: dict[int, FieldOfView], x: float, y: float, rows: Ints
+    cells: Cells, view: dict[int, FieldOfView], places: Floats, rows: Ints, place: Ints
 ) -> Evidence:
-    """Returns the evidence on a place (mm) from its rows of `Hit` with `SPOT` as the bag."""
-    placed = rows[:, Hit.LOOK] >= 0
-    blind_bags, which = np.unique(rows[~placed, Hit.SPOT], return_inverse=True)
-    times = np.bincount(which, rows[~placed, Hit.N], len(blind_bags)).astype(np.int64)
-    hit, which = np.unique(rows[placed, Hit.LOOK], return_inverse=True)
-    hits_of = np.bincount(which, rows[placed, Hit.N], len(hit)).astype(np.int64)
-    np.minimum(hits_of, cells.n[hit], out=hits_of)
-    known, cell_of = np.unique(cells.cell[hit], return_inverse=True)
-    sees = _sees(cells, known, cell_of, cells.n[hit], hits_of)
+    """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the bag.
+
+    `place` has the number of the place of each row.
+    """
+    placed, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
+    blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~placed], n[~placed])
+    hit, hits_of = _totals(_keys(place, rows[:, Hit.LOOK])[placed], n[placed])
+    looked = cells.n[_number(hit)]
+    np.minimum(hits_of, looked, out=hits_of)
+    known, cell_of = np.unique(cells.cells_of(hit), return_inverse=True)
+    sees = _sees(cells, known, cell_of, looked, hits_of)
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
-    bags = np.unique(np.concatenate((cells.bag[hit], blind_bags)))
-    beside = cells.looks_during(bags)
-    beside = beside[np.isin(cells.cell[beside], known)]
-    looks = np.union1d(beside, cells.looks_from(known[sees]))
-    cell = np.searchsorted(known, cells.cell[looks])
+    hit_bags = _keys(_place(hit), cells.bag[_number(hit)])
+    beside = cells.looks_during(_distinct(np.concatenate((hit_bags, blind))))
+    beside = beside[_are_in(known, cells.cells_of(beside))]
+    looks = _distinct(np.concatenate((beside, cells.looks_from(known[sees]))))
+    cell = np.searchsorted(known, cells.cells_of(looks))
     hits = np.zeros(len(looks), np.int64)
     hits[np.searchsorted(looks, hit)] = hits_of
     fair = sees[cell]
-    seeing = looks[fair]
-    away, bearing = cells.seen_at(seeing, x, y)
+    seeing, of = _number(looks[fair]), _place(looks[fair])
+    away, bearing = cells.seen_at(seeing, places[of, 0], places[of, 1])
     covered = np.zeros(len(seeing), bool)
     for topic, each in view.items():
         covered |= (cells.topic[seeing] == topic) & each.covers(away, bearing)
     fair[fair] = covered
-    return Evidence(looks, cell, hits, np.stack((blind_bags, times), axis=1), fair)
+    return Evidence(looks, cell, hits, blind, times, fair)
+
+
+_BITS: Final = 32
+
+
+def _keys(place: Ints, number: Ints) -> Ints:
+    """Returns pairs of a place and the number of a look, a cell or a bag as one number each."""
+    keys: Ints = (place << _BITS) | number
+    return keys
+
+
+def _place(keys: Ints) -> Ints:
+    return keys >> _BITS
+
+
+def _number(keys: Ints) -> Ints:
+    return keys & ((1 << _BITS) - 1)
+
+
+def _distinct(keys: Ints) -> Ints:
+    """Returns the distinct ones of keys that are mostly in order: `numpy.unique` takes longer."""
+    ordered = np.sort(keys, kind="stable")
+    found: Ints = ordered[np.diff(ordered, prepend=-1) > 0]
+    return found
+
+
+def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
+    """Returns the distinct keys in order, and the sum of each."""
+    distinct, which = np.unique(keys, return_inverse=True)
+    return distinct, np.bincount(which, n, len(distinct)).astype(np.int64)
+
+
+def _are_in(some: Ints, keys: Ints) -> Flags:
+    """Returns which keys are among some that are in order."""
+    if not len(some):
+        return np.zeros(len(keys), bool)
+    found: Flags = some[np.minimum(np.searchsorted(some, keys), len(some) - 1)] == keys
+    return found
 
 
 def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
@@ -231,29 +304,29 @@ def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
     `cell` has the number among these of each look that saw it, `n` its messages. From a dock that
     faces a wall, ten thousands of messages have some false detections behind it.
     """
-    seen, of = np.bincount(cell, hits, len(known)), cells.messages_in[known]
-    looks, hit_looks = cells.looks_in[known], np.bincount(cell, minlength=len(known))
+    place, number = _place(known), _number(known)
+    seen, of = np.bincount(cell, hits, len(known)), cells.messages_in[number]
+    looks, hit_looks = cells.looks_in[number], np.bincount(cell, minlength=len(known))
     enough = (seen >= _FEWEST_HITS) | (of <= _RARE_OF * seen)
     dense = seen >= _LEAST_RATE * np.bincount(cell, n, len(known))
     # What other cells see most of the time, a cell that sees it does not miss nearly always.
     share, weight = hit_looks / looks, np.minimum(looks, _MANY_LOOKS)
-    others = weight.sum() - weight
-    pooled = ((share * weight).sum() - share * weight) / np.maximum(others, 1)
-    blocked = (looks >= _MANY_LOOKS) & (share < _BLOCKED_SHARE * pooled)
+    others = np.bincount(place, weight)[place] - weight
+    pooled = np.bincount(place, share * weight)[place] - share * weight
+    blocked = looks >= _MANY_LOOKS
+    blocked &= share < _BLOCKED_SHARE * (pooled / np.maximum(others, 1))
     sees: Flags = enough & dense & ~blocked
     return sees
 
 
-def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
-    """Returns the stays at a place, in order of time."""
-    looks, cell = evidence.looks, evidence.cell
-    bag, n = cells.bag[looks], cells.n[looks]
+def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
+    """Yields the stays at places, each with the number of its place, in order of time."""
+    looks, cell = _number(evidence.looks), evidence.cell
+    n, blind, times = cells.n[looks], evidence.blind, evidence.times
     hit = np.flatnonzero(evidence.hits)  # few of them all
     hits = evidence.hits[hit]
-    blind, times = evidence.blind.T
-    if not len(hit) and not len(blind):
-        return []
-    bags = np.union1d(bag, blind)
+    bag = _keys(_place(evidence.looks), cells.bag[looks])
+    bags = _distinct(np.concatenate((bag, blind)))
     at, blind = np.searchsorted(bags, bag), np.searchsorted(bags, blind)
     seen = np.bincount(at[hit], hits, len(bags))
     seen[blind] += times
@@ -266,15 +339,14 @@ def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
     odds = np.where(evidence.fair, n * for_miss[cell], 0.0)
     own = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
     odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
-    again = cells.repeated_misses(looks, evidence.hits)
+    again = cells.repeated_misses(evidence.looks, evidence.hits)
     np.multiply(odds, _STANDING, out=odds, where=again)
     by_bag = np.bincount(at, odds, len(bags)).astype(np.float64)
     messages = np.bincount(at[hit], n[hit], len(bags))
     by_bag[blind] += 2.0 * times
     messages[blind] += times
     by_bag = by_bag.clip(-_MOST_BY_BAG, _MOST_BY_BAG)
-    stays = []
-    for start, stop in _present(by_bag):
+    for place, start, stop, end in _present(by_bag, _place(bags)):
         inside = np.flatnonzero(seen[start:stop]) + start
         clear = inside[by_bag[inside] >= _CLEAR]
         if not len(inside):
@@ -284,20 +356,12 @@ def stays_at(cells: Cells, evidence: Evidence) -> list[Stay]:
         first, last = int(inside[0]), int(inside[-1])
         firm = inside[by_bag[inside] >= _FIRM]
         firm = firm if len(firm) else inside
-        gone = np.cumsum(by_bag[firm[-1] + 1 :]) < math.log(_LEFT_BY_CHANCE)
-        left = int(bags[firm[-1] + 1 + int(gone.argmax())]) if gone.any() else None
-        stays.append(
-            Stay(
-                int(bags[first]),
-                int(bags[last]),
-                int(bags[firm[0]]),
-                int(bags[firm[-1]]),
-                int(seen[first : last + 1].sum()),
-                int(messages[first : last + 1].sum()),
-                left,
-            )
-        )
-    return stays
+        gone = np.cumsum(by_bag[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
+        left = int(_number(bags[firm[-1] + 1 + gone.argmax()])) if gone.any() else None
+        ends = bags[[first, last, firm[0], firm[-1]]]
+        first_bag, last_bag, firm_first, firm_last = _number(ends).tolist()
+        hit_count, count = (int(each[first : last + 1].sum()) for each in (seen, messages))
+        yield place, Stay(first_bag, last_bag, firm_first, firm_last, hit_count, count, left)
 
 
 def chance_of_missing(
@@ -305,11 +369,13 @@ def chance_of_missing(
 ) -> tuple[float, int, Ns | None]:
     """Returns how likely it is that a thing which is still at its place was missed since.
 
+    `evidence` is that for this place.
+
     By the looks after a time (ns) from cells that saw it during the stay; each cell's own rate is
     known as well as its messages make it (a uniform prior). With the number of messages of these
     looks, and when the chance fell below 1 %; None where it did not.
     """
-    looks, hits = evidence.looks, evidence.hits
+    looks, hits = _number(evidence.looks), evidence.hits
     bag = cells.bag[looks]
     during = (bag >= stay.first_bag) & (bag <= stay.last_bag) & (cells.last[looks] <= after)
     during |= (bag >= stay.first_bag) & (bag <= stay.last_bag) & (hits > 0)
@@ -323,9 +389,10 @@ def missed_in(cells: Cells, evidence: Evidence, stay: Stay, window: tuple[Ns, Ns
     That is what was seen in a stay after the window: it was not there in the window, but for a
     chance of 1 %.
     """
-    bag, first = cells.bag[evidence.looks], cells.first[evidence.looks]
+    looks = _number(evidence.looks)
+    bag, first = cells.bag[looks], cells.first[looks]
     during = (bag >= stay.first_bag) & (bag <= stay.last_bag)
-    inside = (first >= window[0]) & (cells.last[evidence.looks] < window[1])
+    inside = (first >= window[0]) & (cells.last[looks] < window[1])
     _, _, crossed = _missed(cells, evidence, during, inside & evidence.fair & ~during)
     return crossed is not None
 
@@ -334,7 +401,7 @@ def _missed(
     cells: Cells, evidence: Evidence, during: Flags, since: Flags
 ) -> tuple[float, int, Ns | None]:
     """Returns `chance_of_missing` by the looks `since`, with the rates of those `during`."""
-    looks, hits, cell = evidence.looks, evidence.hits, evidence.cell
+    looks, hits, cell = _number(evidence.looks), evidence.hits, evidence.cell
     known: dict[int, list[float]] = {}
     for each, n, hit in zip(
         cell[during].tolist(), cells.n[looks[during]].tolist(), hits[during].tolist(), strict=True
@@ -369,12 +436,31 @@ def _missed(
     return math.exp(chance), messages, crossed
 
 
-def _present(by_bag: Floats) -> list[tuple[int, int]]:
-    """Returns the likeliest runs of bags in which a thing was there, as [start, stop)."""
+def _present(by_bag: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]:
+    """Yields the likeliest runs of bags in which a thing was there.
+
+    As the place, [start, stop), and where the bags of this place end.
+    """
+    ends = np.append(np.flatnonzero(place[1:] != place[:-1]) + 1, len(place)).tolist()
+    if not len(place):
+        return
     # Runs of one sign have one state: fewer steps than bags.
-    sign = by_bag >= 0
-    starts = np.concatenate(([0], np.flatnonzero(np.diff(sign)) + 1))
-    sums = np.add.reduceat(by_bag, starts).tolist()
+    changes = np.flatnonzero(np.diff(by_bag >= 0)) + 1
+    starts = np.union1d([0, *ends[:-1]], changes)
+    sums, starts = np.add.reduceat(by_bag, starts).tolist(), starts.tolist()
+    begin = 0
+    for end in ends:
+        stop = bisect_left(starts, end)
+        runs = zip(_states(sums[begin:stop]), pairwise([*starts[begin:stop], end]), strict=True)
+        for is_there, some in groupby(runs, itemgetter(0)):
+            if is_there:
+                spans = [span for _, span in some]
+                yield int(place[end - 1]), spans[0][0], spans[-1][1], end
+        begin = stop
+
+
+def _states(sums: Sequence[float]) -> Sequence[bool]:
+    """Returns in which runs of bags a thing was there, by the evidence of each."""
     absent, present = 0.0, -_SWITCH / 4
     came_from: list[tuple[bool, bool]] = []
     for value in sums:
@@ -386,14 +472,4 @@ def _present(by_bag: Floats) -> list[tuple[int, int]]:
     for from_present, stays_present in reversed(came_from):
         states.append(state)
         state = stays_present if state else from_present
-    states.reverse()
-    stops = [*starts[1:].tolist(), len(by_bag)]
-    runs: list[tuple[int, int]] = []
-    for inside, start, stop in zip(states, starts.tolist(), stops, strict=True):
-        if not inside:
-            continue
-        if runs and runs[-1][1] == start:
-            runs[-1] = (runs[-1][0], stop)
-        else:
-            runs.append((start, stop))
-    return runs
+    return states[::-1]

@@ -25,11 +25,63 @@ _looks = st.lists(
 """Steps to the next bag, the cell, messages, and how often these have the label."""
 
 
-@given(_looks, st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3))
+_unplaced = st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3)
+_ANYWHERE = {0: FieldOfView(1e9, -180.0, 180.0)}
+
+
+@given(_looks, _unplaced)
 def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     given_looks: list[tuple[int, int, int, int]], unplaced: dict[int, int]
 ) -> None:
     """From where the robot mostly stands, all looks of a week are at what it once saw there."""
+    cells, hits = _seen(given_looks, unplaced)
+    place = np.array([[3000.0, 100.0]])
+    found = evidence_at(cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64))
+
+    whole = _with_every_look(cells, found, hits)
+    left_out = np.setdiff1d(whole.looks, found.looks)
+    seen_in = {bag for bag, *_ in hits.tolist()}
+    assert not seen_in & {*cells.bag[left_out].tolist()}
+    assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
+    assert [*stays_at(cells, found)] == [*stays_at(cells, whole)]
+    for _, stay in stays_at(cells, found):
+        for after in (0, cells.last[len(cells.last) // 2]):
+            assert chance_of_missing(cells, found, stay, after) == chance_of_missing(
+                cells, whole, stay, after
+            )
+
+
+@given(_looks, _unplaced, _looks, st.lists(st.booleans(), min_size=120, max_size=120))
+def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
+    given_looks: list[tuple[int, int, int, int]],
+    unplaced: dict[int, int],
+    others: list[tuple[int, int, int, int]],
+    is_second: list[bool],
+) -> None:
+    cells, hits = _seen([*given_looks, *others], unplaced)
+    place = np.array(is_second, np.int64)[: len(hits)]
+    places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
+    found = evidence_at(cells, _ANYWHERE, places, hits, place)
+    stays = [*stays_at(cells, found)]
+
+    assert stays == sorted(stays, key=lambda each: each[0])
+    for nth in (0, 1):
+        mine = hits[place == nth]
+        alone = evidence_at(cells, _ANYWHERE, places[[nth]], mine, np.zeros(len(mine), np.int64))
+        at_once = found.at(nth)
+        assert (at_once.looks & 0xFFFF_FFFF).tolist() == alone.looks.tolist()
+        assert at_once.hits.tolist() == alone.hits.tolist()
+        assert at_once.fair.tolist() == alone.fair.tolist()
+        assert at_once.times.tolist() == alone.times.tolist()
+        assert [stay for of, stay in stays if of == nth] == [
+            stay for _, stay in stays_at(cells, alone)
+        ]
+
+
+def _seen(
+    given_looks: list[tuple[int, int, int, int]], unplaced: dict[int, int]
+) -> tuple[Cells, np.ndarray]:
+    """Returns looks, and rows of `Hit` with the bag for the spot."""
     bag = 0
     looks: list[tuple[int, ...]] = []
     rows: list[tuple[int, int, int]] = []
@@ -41,21 +93,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
     cells = Cells(_sights(looks, bag + 1), np.zeros(bag + 1, np.int64))
-    hits = np.array(rows, np.int64).reshape(-1, len(Hit))
-    anywhere = {0: FieldOfView(1e9, -180.0, 180.0)}
-    found = evidence_at(cells, anywhere, 3000.0, 100.0, hits)
-
-    whole = _with_every_look(cells, found, hits)
-    left_out = np.setdiff1d(whole.looks, found.looks)
-    seen_in = {bag for bag, *_ in rows}
-    assert not seen_in & {*cells.bag[left_out].tolist()}
-    assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
-    assert stays_at(cells, found) == stays_at(cells, whole)
-    for stay in stays_at(cells, found):
-        for after in (0, cells.last[len(looks) // 2]):
-            assert chance_of_missing(cells, found, stay, after) == chance_of_missing(
-                cells, whole, stay, after
-            )
+    return cells, np.array(rows, np.int64).reshape(-1, len(Hit))
 
 
 def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidence:
@@ -69,7 +107,7 @@ def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidenc
     np.add.at(of := np.zeros(len(cells.n), np.int64), seen_in, rows[rows[:, 1] >= 0, Hit.N])
     assert (hits == np.minimum(of, cells.n)[looks]).all()
     cell = np.searchsorted(known, cells.cell[looks])
-    return Evidence(looks, cell, hits, found.blind, fair)
+    return Evidence(looks, cell, hits, found.blind, found.times, fair)
 
 
 def _sights(looks: list[tuple[int, ...]], bags: int) -> Sights:
