@@ -189,6 +189,13 @@ class Sights:
         tables = (table if kind in kinds else table[:0].copy() for kind, table in every)
         return replace(self, tables=tuple(tables))
 
+    def with_scores_from(self, lowest: int) -> Sights:
+        """Returns these sights without the scores in lower bins."""
+        at = TABLES.index(Score)
+        scores = self.tables[at]
+        kept = scores[scores[:, Score.BIN] >= lowest]
+        return replace(self, tables=(*self.tables[:at], kept, *self.tables[at + 1 :]))
+
     @property
     def spots(self) -> Ints:
         """Where labels were seen (`Spot`)."""

@@ -84,11 +84,16 @@ def packed(sights: Sights) -> bytes:
     return compressed(b"".join((head, names, *planes)))
 
 
-def joined(parts: Sequence[bytes], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
+def joined(
+    parts: Sequence[bytes],
+    epochs: Sequence[int] | None = None,
+    sessions: Sequence[int] | None = None,
+) -> tuple[Sights, Ints]:
     """Returns the sights of packed parts, and the epoch of each slice.
 
     There is one table of names. Slices are numbered in order of time. Those of one time and another
-    epoch (the coordinate system of a part) are different ones.
+    epoch (the coordinate system of a part) are different ones. Fixes are in order of time for each
+    session: at one time there may be several robots.
     """
     found = _Unpacked(parts)
     spots, looks, hits, scores, beside, unplaced, fixes = found.tables
@@ -105,9 +110,12 @@ def joined(parts: Sequence[bytes], epochs: Sequence[int] | None = None) -> tuple
     look = hits[:, Hit.LOOK] + found.begins(_LOOKS)[found.part[_HITS]]
     hits[:, Hit.LOOK] = look_at[np.where(hits[:, Hit.LOOK] < 0, -1, look)]
     # Where a stretch of the clock ends, both that it parts have the fix.
-    fixes = fixes[np.lexsort(fixes.T[::-1])]
+    session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
+    session = session[found.part[_FIXES]]
+    order = np.lexsort((*fixes.T[::-1], session))
+    fixes, session = fixes[order], session[order]
     is_other = np.ones(len(fixes), np.bool_)
-    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1)
+    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
     tables = (
         spots[spot_order],
         looks[look_order],

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
@@ -126,32 +127,35 @@ class Polygon:
 
     def crossings(self, steps: Steps) -> Parts:
         """Returns the parts of steps inside: between the crossings of the polygon's sides."""
-        count = len(steps.x)
-        shares = [np.zeros(count), np.ones(count)]
+        cuts = self._cuts(steps)
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
-        for (ax, ay), (bx, by) in zip(
-            self.corners, (*self.corners[1:], self.corners[0]), strict=True
-        ):
-            ex, ey = bx - ax, by - ay
-            cross = dx * ey - dy * ex
-            size = np.where(cross != 0, cross, 1.0)
-            along = ((ax - steps.x) * ey - (ay - steps.y) * ex) / size
-            beside = ((ax - steps.x) * dy - (ay - steps.y) * dx) / size
-            meets = (cross != 0) & (along > 0) & (along < 1) & (beside >= 0) & (beside <= 1)
-            shares.append(np.where(meets, along, 1.0))
-        table = np.sort(np.stack(shares), axis=0)
-        middle = (table[1:] + table[:-1]) / 2
+        middle = (cuts[1:] + cuts[:-1]) / 2
         inside = _inside(self.corners, steps.x + dx * middle, steps.y + dy * middle)
-        inside &= table[1:] > table[:-1]
+        inside &= cuts[1:] > cuts[:-1]
         # A step of no length is inside as a whole, or not.
         still = (dx == 0) & (dy == 0)
         inside[:, still] = False
         inside[0, still] = _inside(self.corners, steps.x[still], steps.y[still])
-        which, step = np.nonzero(inside)
-        order = np.lexsort((which, step))
-        which, step = which[order], step[order]
-        stop = np.where(still[step], 1.0, table[which + 1, step])
-        return Parts(step, table[which, step], stop)
+        step, part = np.nonzero(inside.T)
+        return Parts(step, cuts[part, step], np.where(still[step], 1.0, cuts[part + 1, step]))
+
+    def _cuts(self, steps: Steps) -> Floats:
+        """Returns the shares at which each step (a column) meets a side, ascending, with 0 and 1.
+
+        1 stands for each side that it does not meet, too.
+        """
+        count = len(steps.x)
+        dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
+        cuts = [np.zeros(count), np.ones(count)]
+        for (ax, ay), (bx, by) in pairwise((*self.corners, self.corners[0])):
+            side_x, side_y = bx - ax, by - ay
+            cross = dx * side_y - dy * side_x
+            size = np.where(cross != 0, cross, 1.0)
+            along = ((ax - steps.x) * side_y - (ay - steps.y) * side_x) / size
+            beside = ((ax - steps.x) * dy - (ay - steps.y) * dx) / size
+            meets = (cross != 0) & (along > 0) & (along < 1) & (beside >= 0) & (beside <= 1)
+            cuts.append(np.where(meets, along, 1.0))
+        return np.sort(np.stack(cuts), axis=0)
 
 
 @dataclass(frozen=True, slots=True)

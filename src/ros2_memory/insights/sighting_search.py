@@ -157,13 +157,15 @@ class Matching:
         return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
     def _tested(self, topic: str, parts: Sequence[Rows], truth: Kept) -> Tested:
+        """Tests the rows that count: by columns, and by messages where these leave it open."""
         counting = np.concatenate([rows.mask() for rows in parts])
-        met, unsure = truth.surely[counting], truth.unsure[counting]
         self.ruled_out |= not truth.perhaps[counting].all()
-        times, found = np.concatenate([rows.times for rows in parts]), met.astype(np.uint8)
+        times = np.concatenate([rows.times for rows in parts])
         sources = self._sources(topic, parts)
-        undecided = np.flatnonzero(unsure)
+        found = truth.surely[counting].astype(np.uint8)
+        undecided = np.flatnonzero(truth.unsure[counting])
         if undecided.size:
+            # Messages that lie close together are read at once.
             edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
             for some in np.split(undecided, edges):
                 found[some] = self._read(topic, times[some], sources[some])

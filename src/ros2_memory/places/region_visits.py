@@ -204,20 +204,19 @@ def _visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None)
 
     Its times are those of poses: of the first and the last one inside, and of the closest.
     """
-    there_still = newest is not None and one.stop >= newest
+    is_there = newest is not None and one.stop >= newest and not one.left
     distance_m, at = None, None
     if isinstance(where.region, Circle):
         distance_m, at = _closest(found, one, where.region)
-    departed = None if there_still and not one.left else one.stop
     return Visit(
         arrived=one.start,
-        departed=departed,
+        departed=None if is_there else one.stop,
         duration=found.elapsed.between(one.start, one.stop),
         closest_m=distance_m,
         closest_at=at,
         restarts=0,
         already_inside=not one.entered,
-        still_inside=not one.left and departed is not None,
+        still_inside=not one.left and not is_there,
     )
 
 

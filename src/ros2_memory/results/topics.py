@@ -275,9 +275,9 @@ def _other_topic(topic: str, scope: Scope) -> JsonValue | Absent:
     LASTED("duration_s", "first", "until", "skipped"),
     AGO("ago_s", "last"),
     PLAIN("count", "messages").if_any,
-    an_object(keys(PLAIN("at", "robot_at"), POSE("robot"), NAME("frame_id", "robot.frame_id")))(
-        "robot", itself_if("robot")
-    ),
+    an_object(
+        keys(PLAIN("at", "robot_time_key"), POSE("robot"), NAME("frame_id", "robot.frame_id"))
+    )("robot", itself_if("robot")),
     texts(_LONGEST_MATCHED)("matched").first(_MOST_MATCHED).if_any,
     PLAIN("value").if_known,
     OBJECT("place", "thing").if_known,
@@ -323,7 +323,7 @@ class Sighting:
     said: tuple[Spell, ...] | None = None
 
     @property
-    def robot_at(self) -> str:
+    def robot_time_key(self) -> str:
         """The key of the time that `robot` is of."""
         return "first_seen" if self.robot_at_first else "last_seen"
 

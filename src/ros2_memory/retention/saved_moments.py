@@ -215,22 +215,26 @@ class MomentKeeper:
             if moment.moment.pending:
                 stored[name] = self._advance(moment, stored, snapshot)
         for request in self._queue.take(now) if self._queue.has_requests() else ():
-            known: StoredMoment | str | None = _of_number(request, stored)
-            if known is None:
-                try:
-                    known = self._begin(SavedMoment(request), stored, snapshot)
-                except OSError as error:
-                    known = (
-                        f"the bags cannot be saved in {self._bag_dir / MOMENTS_FOLDER} by hard "
-                        f"links: {error.strerror or error}"
-                    )
-            if isinstance(known, str):
-                _log.warning("moment_refused", label=request.label, reason=known)
-                outcome = Outcome(refused=known)
-            else:
-                outcome = Outcome(known.folder.name, len(known.files), known.moment.pending)
-            self._queue.answer(request, outcome)
+            self._queue.answer(request, self._outcome(request, stored, snapshot))
         self._waiting = any(moment.moment.pending for moment in stored.values())
+
+    def _outcome(
+        self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
+    ) -> Outcome:
+        """Returns the outcome of a request, whose moment begins unless it has one already."""
+        found: StoredMoment | str | None = _of_number(request, stored)
+        if found is None:
+            try:
+                found = self._begin(SavedMoment(request), stored, snapshot)
+            except OSError as error:
+                found = (
+                    f"the bags cannot be saved in {self._bag_dir / MOMENTS_FOLDER} by hard "
+                    f"links: {error.strerror or error}"
+                )
+        if isinstance(found, str):
+            _log.warning("moment_refused", label=request.label, reason=found)
+            return Outcome(refused=found)
+        return Outcome(found.folder.name, len(found.files), found.moment.pending)
 
     def keep_for_rule(
         self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot

@@ -89,15 +89,18 @@ class _Walk:
             self._elements(field[1][0], self._length())
 
     def _elements(self, element: FieldDesc, count: int) -> None:
+        """Goes past some elements: at once where all have one size."""
         size = _SIZES.get(element[1][0]) if element[0] == Nodetype.BASE else None
-        if size is None:
-            if element[0] == Nodetype.NAME and self.objects + count > MAX_OBJECTS:
-                self.objects += count
-                raise _StoppedError
-            for _ in range(count):
-                self._field(element)
-        elif count:
-            self._advance(size, size * count)
+        if size is not None:
+            if count:  # without elements there is no padding either
+                self._advance(size, size * count)
+            return
+        if element[0] == Nodetype.NAME and self.objects + count > MAX_OBJECTS:
+            # Each is an object: none of them needs to be read.
+            self.objects += count
+            raise _StoppedError
+        for _ in range(count):
+            self._field(element)
 
     def _primitive(self, name: str) -> None:
         if name == "string":

@@ -356,17 +356,18 @@ class _Finder:
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
         """Returns the best score of some spots, and their median to 0.05, the width of a bin.
 
-        That is the best score in its bin, where that is known: of spots with none in a higher one.
+        Of detections that count; None where none of them has a score. The median is the best score
+        in its bin, where that is known: of spots with none in a higher one.
         """
         sights = self.known.estimate.sights
         best = int(sights.spots[rows, Spot.BEST].max())
-        if best < 0:
-            return None, None
         first, end = (
             np.searchsorted(sights.scores[:, Score.SPOT], rows, side=side)
             for side in ("left", "right")
         )
         scores = sights.scores[in_ranges(first, end - first)]
+        if not len(scores):
+            return None, None
         counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
         highest = np.full(len(sights.spots), -1, np.int64)

@@ -138,7 +138,7 @@ class Estimate:
     """The things in sights, sorted by label and place."""
 
     sights: Sights
-    """Without what is in `cells` and `hits`, and what only an estimate needs."""
+    """Without what is in `cells` and `hits`, what only an estimate needs, and too low scores."""
     instances: list[Instance]
     movers: list[Mover]
     counts: Ints
@@ -277,7 +277,7 @@ def estimate(
         each.labels = _labels_of(each, labels, names)
     instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
     found = Estimate(
-        sights=sights.only(Spot, Score, Unplaced),
+        sights=sights.only(Spot, Score, Unplaced).with_scores_from(_lowest_bin(min_score)),
         instances=instances,
         movers=movers,
         counts=seen.counts,
@@ -365,11 +365,14 @@ def _rows_of(spots: Ints, table: Ints, starts: Ints) -> Ints:
 def _counts(sights: Sights, min_score: float) -> Ints:
     """Returns how many detections of each spot have a score that counts."""
     counts = sights.spots[:, Spot.N].copy()
-    lowest = min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
-    if lowest > 0:
-        low = sights.scores[sights.scores[:, Score.BIN] < lowest]
-        np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
+    low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
+    np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
     return counts
+
+
+def _lowest_bin(min_score: float) -> int:
+    """Returns the lowest bin of scores that count."""
+    return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 
 def _hits(sights: Sights, counts: Ints) -> Ints:

@@ -156,12 +156,14 @@ def _known_until(
 
 def note_other_frames(view: View, known: KnownThings, region: Where | None) -> None:
     """Notes the places that are asked for in frames in which no thing is known."""
-    frames = known.frames if known.has_map else known.frames[1:]
-    for place in () if region is None or not frames else region.each:
-        if place.frame_id not in {None, *frames}:
+    frames = dict.fromkeys(known.frames if known.has_map else known.frames[1:])
+    if region is None or not frames:
+        return
+    for place in region.each:
+        if place.frame_id is not None and place.frame_id not in frames:
             view.notes.add(
                 f"{place.title} is in {place.frame_id}, and things are known in "
-                f"{' and '.join(dict.fromkeys(frames))}: nothing is found there"
+                f"{' and '.join(frames)}: nothing is found there"
             )
 
 
@@ -247,6 +249,7 @@ class _Loader:
         """
         stretches = [stretch for part in parts for stretch in part]
         epochs, names = self._epochs(stretches)
+        sessions = {one: nth for nth, one in enumerate(dict.fromkeys(s.session for s in stretches))}
         until = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
@@ -259,6 +262,7 @@ class _Loader:
         sights, of_slice = joined(
             [one for stretch in stretches for one in stretch.sights],
             [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],
+            [sessions[each.session] for each in stretches for _ in each.sights],
         )
         found = estimate(sights, labels, of_slice, min_score, go_on)
         since = self._since
@@ -277,7 +281,7 @@ class _Loader:
         names = [in_map or ""]
         epochs = []
         for stretch in stretches:
-            key = (stretch.frame_id, stretch.session)
+            key = stretch.frame_id, None if stretch.frame_id == in_map else stretch.session
             if key not in known:
                 known[key] = len(known)
                 names.append(stretch.frame_id)

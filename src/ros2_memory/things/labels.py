@@ -29,6 +29,16 @@ _IRREGULAR: Final = {
     "scarves": "scarf",
     "wolves": "wolf",
     "bookshelves": "bookshelf",
+    "buses": "bus",
+    "gases": "gas",
+    "lenses": "lens",
+    "canvases": "canvas",
+    "cookies": "cookie",
+    "brownies": "brownie",
+    "smoothies": "smoothie",
+    "hoodies": "hoodie",
+    "movies": "movie",
+    **{word: word for word in ("gas", "canvas", "atlas", "christmas", "chaos", "thermos", "lens")},
 }
 _MOVES_BY_ITSELF: Final = frozenset(
     {
@@ -46,7 +56,9 @@ _MOVES_BY_ITSELF: Final = frozenset(
         "pet",
     }
 )
-_NO_PLURALS: Final = ("ss", "us", "is", "as", "os")
+_NO_ANIMALS: Final = frozenset({"hot dog", "corn dog"})
+"""Keys that end in a word for a pet, and name a thing."""
+_NO_PLURALS: Final = ("ss", "us", "is")
 _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 
@@ -68,7 +80,7 @@ def last_word(key: str) -> str:
 
 def moves_by_itself(key: str) -> bool:
     """Whether a key names people or pets."""
-    return last_word(key) in _MOVES_BY_ITSELF
+    return key not in _NO_ANIMALS and last_word(key) in _MOVES_BY_ITSELF
 
 
 def _singular(word: str) -> str:

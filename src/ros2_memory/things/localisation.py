@@ -19,15 +19,17 @@ _JUMP_MM: Final = 300.0
 """So far the map moves that point in a jump."""
 _BEFORE_NS: Final = 5 * NS_PER_S
 _NEXT_NS: Final = 4 * NS_PER_S
+_NEVER_NS: Final = 3600 * NS_PER_S
 _KNOWN_NS: Final = 60 * NS_PER_S
 """What a localiser said holds as long; it says nothing while the robot stands."""
 
 
 def poorly_localised(sights: Sights) -> tuple[Flags, Flags]:
     """Returns which spots and which looks have some of a time when localisation was poor."""
-    fixes = sights.fixes[np.argsort(sights.fixes[:, Fix.TIME], kind="stable")]
+    fixes = sights.fixes
     time = fixes[:, Fix.TIME]
     after = np.diff(time, append=time[-1:])
+    after[after < 0] = _NEVER_NS  # the next one is of another session
     turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
     off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
     jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))

@@ -73,14 +73,14 @@ class Stretch(NamedTuple):
         start: log time (ns).
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
-        session: its recordings; None where the frame is the map, which is the same for all.
+        session: its recordings.
         spots: how many spots there are.
         sights: packed, as `joined` takes them.
     """
 
     start: Ns
     frame_id: str
-    session: Session | None
+    session: Session
     spots: int
     sights: tuple[bytes, ...]
 
@@ -251,8 +251,7 @@ class Watching:
             ends = [*accumulate(lengths, initial=at)]
             parts = tuple(data[begin:end] for begin, end in pairwise(ends))
             at = ends[-1]
-            in_map = frame == self._view.limits.map_frame
-            found.append(Stretch(start, frame, None if in_map else sessions[nth], spots, parts))
+            found.append(Stretch(start, frame, sessions[nth], spots, parts))
         return found
 
     def _session(self, bag: BagFile) -> Session:

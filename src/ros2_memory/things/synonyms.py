@@ -1,7 +1,8 @@
 """Which labels a detector uses for one thing in turn: "mug" and "coffee mug", at one place.
 
 They end in the same word, lie within the scatter of each other, alternate within a visit, and are
-not in one message there. Names that the owner declares apart stay apart.
+not in one message there. Names that the owner declares apart stay apart, and one that is used in
+turn with both of them is joined with neither.
 """
 
 from __future__ import annotations
@@ -37,29 +38,36 @@ _SCATTERS: Final = 2.0
 def with_synonyms(
     sights: Sights,
     counts: Ints,
-    group: Ints,
+    epoch: Ints,
     labels: Labels,
     go_on: Callable[[], None],
 ) -> list[str]:
     """Returns the keys of the labels of sights, one for all that are names of one thing.
 
-    `group` has the epoch of each spot, and `counts` how many of its detections count.
+    `epoch` has the coordinate system of each spot, and `counts` how many of its detections count.
     """
     keys = [labels.key(each) for each in sights.labels]
     by_word: dict[str, list[str]] = defaultdict(list)
     for key in sorted(set(keys)):
         if not moves_by_itself(key):
             by_word[last_word(key)].append(key)
-    known = {key: key for key in keys}
-    for one, other in (pair for some in by_word.values() for pair in combinations(some, 2)):
-        if labels.are_apart(one, other) or known[one] == known[other]:
-            continue
+    of = {key: np.array([key == each for each in keys]) for key in set(keys)}
+
+    def are_two(pair: tuple[str, str]) -> bool:
         go_on()
-        of = [np.array([key == each for key in keys]) for each in (one, other)]
-        if not _are_beside(sights, *of) and _alternate(sights.spots, counts, group, of):
-            gone = known[other]
-            known.update({key: known[one] for key, root in known.items() if root == gone})
-    return [known[key] for key in keys]
+        return labels.are_apart(*pair) or _are_beside(sights, *(of[each] for each in pair))
+
+    groups = {key: frozenset({key}) for key in keys}
+    for pair in (pair for some in by_word.values() for pair in combinations(some, 2)):
+        if not are_two(pair) and _alternate(sights.spots, counts, epoch, [of[key] for key in pair]):
+            group = groups[pair[0]] | groups[pair[1]]
+            groups |= dict.fromkeys(group, group)
+    # A name that is used for two things says of neither which it is.
+    names = {
+        group: None if any(map(are_two, combinations(sorted(group), 2))) else min(group)
+        for group in {*groups.values()}
+    }
+    return [names[groups[key]] or key for key in keys]
 
 
 def _are_beside(sights: Sights, one: Mask, other: Mask) -> bool:
@@ -74,11 +82,11 @@ def _are_beside(sights: Sights, one: Mask, other: Mask) -> bool:
     return bool(beside[both, Beside.N].sum() > _BESIDE_SHARE * least)
 
 
-def _alternate(every: Ints, counts: Ints, group: Ints, of: Sequence[Mask]) -> bool:
+def _alternate(every: Ints, counts: Ints, epoch: Ints, of: Sequence[Mask]) -> bool:
     """Whether two labels take turns at some place, within the scatter of each other."""
     mine = np.flatnonzero((of[0] | of[1])[every[:, Spot.LABEL]] & (counts > 0))
-    for epoch in np.unique(group[mine]).tolist():
-        rows = mine[group[mine] == epoch]
+    for each in np.unique(epoch[mine]).tolist():
+        rows = mine[epoch[mine] == each]
         spots, n = every[rows], counts[rows]
         place = places_of(spots[:, Spot.X], spots[:, Spot.Y], n)
         for nth in range(int(place.max(initial=-1)) + 1):

@@ -64,7 +64,7 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     sights = known.estimate.sights
     if not asked.found:
         yield from _silences(view, known, asked.window)
-    if len(known.frames) > 1 + bool(known.frames[0]):
+    if len(known.frames) > 2:  # the first is the map's
         yield (
             "without a map, each run of odometry has its own coordinates: a thing may be listed "
             "once for each run"
@@ -187,7 +187,8 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
         return
     _, count, low, unplaced, *_ = _detected(known, key, asked.window)
     if unplaced:
-        yield f"{counted(unplaced, 'detection')} of it could not be placed, and are left out"
+        lost = counted(unplaced, "detection")
+        yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
     if key in asked.found:
         return
     if low:

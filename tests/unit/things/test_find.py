@@ -335,14 +335,14 @@ def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:
     assert ask(tmp_path, label=["mug"]) == ask(tmp_path, label="mug")
 
 
-def alternating(*labels: str, y: float = 0.5) -> list[Msg]:
+def alternating(*labels: str, y: float = 0.5, begin: int = 0) -> list[Msg]:
     """A thing that each message names otherwise, with 5 cm of noise."""
     draw = Random(1)
     return [
         message
         for at in range(40)
         for message in scene(
-            at,
+            begin + at,
             HERE,
             [(labels[at % len(labels)], 3.0 + draw.gauss(0, 0.05), y + draw.gauss(0, 0.05))],
         )
@@ -370,6 +370,23 @@ def test_labels_that_the_owner_lists_apart_are_two_things(tmp_path: Path) -> Non
     write(tmp_path, alternating("mug", "coffee mug"))
     apart = QuerySettings(labels={"mug": [], "coffee mug": []})
     assert ask(tmp_path, apart)["labels"] == {"coffee mug": 1, "mug": 1}
+
+
+def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> None:
+    """By the owner's list these are two; where messages have both of them it needs no list."""
+    moved = [
+        *alternating("coffee mug", "mug"),
+        *looked(40, 60, HERE),
+        *alternating("red mug", "mug", y=-1.5, begin=60),
+    ]
+    write(tmp_path / "moved", moved)
+    apart = QuerySettings(labels={"coffee mug": [], "red mug": []})
+    reply = ask(tmp_path / "moved", apart)
+    assert reply["labels"].keys() == {"coffee mug", "mug", "red mug"}
+    for each in ("coffee mug", "red mug"):
+        [thing] = [thing for thing in reply["things"] if thing["label"] == each]
+        assert "moved" not in thing
+    assert ask(tmp_path / "moved", PLAIN)["labels"] == {"mug": 1}
 
 
 @pytest.mark.parametrize("other", ["dog bed", "mugshot", "cup"])
@@ -618,6 +635,18 @@ def test_the_median_score_is_known_to_a_twentieth(
     assert min(scores) - 0.05 <= cup["score"]["median"] <= max(scores)
     if len(scores) == 1:
         assert cup["score"]["median"] == scores[0]
+
+
+def test_scores_are_those_of_the_detections_that_count(tmp_path: Path) -> None:
+    scores = (0.1, 0.1, 0.1, 0.9)
+    seen = [("cup", 3.0, 0.5)]
+    write(
+        tmp_path, [each for at in range(40) for each in scene(at, HERE, seen, score=scores[at % 4])]
+    )
+    [cup] = ask(tmp_path, min_score=0.5)["things"]
+    assert (cup["count"], cup["score"]) == (10, {"best": 0.9, "median": 0.9})
+    [cup] = ask(tmp_path)["things"]
+    assert (cup["count"], cup["score"]) == (40, {"best": 0.9, "median": 0.125})
 
 
 def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from ros2_memory.things.labels import Labels
+from ros2_memory.things.labels import Labels, moves_by_itself
 
 
 @pytest.mark.parametrize(
@@ -19,6 +19,10 @@ from ros2_memory.things.labels import Labels
         ("bookshelf", "bookshelves"),
         ("potato", "potatoes"),
         ("glass", "glasses"),
+        ("banana", "bananas"),
+        ("photo", "photos"),
+        ("cookie", "Cookies"),
+        ("bus", "buses"),
     ],
 )
 def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
@@ -26,10 +30,18 @@ def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("one", "other"), [("mug", "cup"), ("phone", "headphones"), ("bus", "bu"), ("gas", "ga")]
+    ("one", "other"),
+    [("mug", "cup"), ("phone", "headphones"), ("bus", "bu"), ("gas", "ga"), ("lens", "len")],
 )
 def test_other_words_are_other_labels(one: str, other: str) -> None:
     assert Labels().key(one) != Labels().key(other)
+
+
+@pytest.mark.parametrize(
+    ("key", "moves"), [("dog", True), ("small dog", True), ("hot dog", False), ("dog bed", False)]
+)
+def test_people_and_pets_move_by_themselves_and_food_does_not(key: str, *, moves: bool) -> None:
+    assert moves_by_itself(key) == moves
 
 
 def test_declared_spellings_are_one_label_in_any_case_and_number() -> None:

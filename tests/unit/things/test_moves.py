@@ -11,10 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.analysis.sights import fixes_of
+from ros2_memory.columns.sights import joined, packed
+from ros2_memory.things.localisation import poorly_localised
 from ros2_memory.things.moves import Sightings, stays_in, visits_of
 from tests.support.bags import Msg, header, make, point, quaternion
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
+from tests.support.sights import Message, sights_of_messages
 from tests.unit.things.test_find import BEGIN, NAMED, S, scene, write
 
 if TYPE_CHECKING:
@@ -278,6 +282,23 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     assert reply["things_unchanged"] == 2 * is_poor
     assert ("moved" in reply["things"]) == (not is_poor)
     assert any("localisation was poor" in note for note in reply.get("notes", [])) == is_poor
+
+
+def test_fixes_of_two_robots_in_turn_are_no_jumps_of_the_map() -> None:
+    poses = np.zeros((30, 3))
+    times = (BEGIN + np.arange(30)) * S
+    seen = [Message("/detections", time, (0, 0, 0), []) for time in times.tolist()]
+    parts = [
+        sights_of_messages(seen).with_fixes(fixes_of(times + off * S // 2, poses + off, NOT_SAID))
+        for off in (0, 1)
+    ]
+    bags = [packed(part) for part in parts]
+    for sessions, is_poor in (([0, 0], True), ([0, 1], False)):
+        sights, _ = joined(bags, sessions=sessions)
+        assert poorly_localised(sights)[1].any() == is_poor
+
+
+NOT_SAID: Final = np.full(30, math.nan)
 
 
 def test_a_thing_that_was_only_seen_while_localisation_was_poor_is_listed(tmp_path: Path) -> None:

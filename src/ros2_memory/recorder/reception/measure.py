@@ -542,6 +542,7 @@ class Arrivals:
             known = self._topics.get(topic)
             if known is None or arrival.last < known.arrival.last - _SET_BACK_NS:
                 self._topics[topic] = _Topic(arrival)
+                self._silent.discard(topic)
                 continue
             joined = known.arrival.joined(arrival)
             if joined.last > known.arrival.last:
@@ -552,9 +553,10 @@ class Arrivals:
                 known.arrival = joined
 
     def silent(self, idle: Ns) -> frozenset[str]:
-        """Returns the topics that came regularly, and have stopped.
+        """Returns the topics that came regularly, and have stopped: for ten periods, 10 s at least.
 
-        That is for ten periods, and 10 s at least. `idle`: for how long nothing has come at all.
+        One that was found silent stays so until it comes again, also if `idle` is shorter then.
+        `idle`: for how long (ns) nothing has come at all.
         """
         now = self._newest + idle
         self._silent |= {
