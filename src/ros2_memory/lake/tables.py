@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import TimeWindow
 
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 29
+ROWS_VERSION: Final = 30
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _NS_PER_US: Final = 1_000

@@ -67,7 +67,7 @@ class ThingsBetween:
             after = self._seen(instance, self.later)
             shared = self._seen(instance, self.earlier)
             if before is None and after and shared and shared.stay.place != after.stay.place:
-                before = shared  # in bags of both windows, but elsewhere
+                before = shared  # in slices of both windows, but elsewhere
             if not self._counts(instance, before, after):
                 continue
             if before and after and before.stay.place == after.stay.place:
@@ -92,7 +92,7 @@ class ThingsBetween:
         )
 
     def _counts(self, instance: Instance, before: _Seen | None, after: _Seen | None) -> bool:
-        """Whether a thing was seen there, and was not known to be there before both windows."""
+        """Whether a thing was seen there; in the later window alone, if it had not been there."""
         if before is None and after is not None:
             known = {each.place for each in instance.stays if each.first < self.earlier.stop}
             if after.stay.place in known:

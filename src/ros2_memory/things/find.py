@@ -289,22 +289,26 @@ class _Finder:
         """Returns how many of a label are at one place, where messages have several at once.
 
         Places are no finer than the noise of far detections, but two of one message are never one.
-        A bag counts where each was seen at least half as often as the one seen most.
+        A slice counts where each was seen at least half as often as the one seen most.
         """
         spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
         many = counts >= _FEWEST_BESIDE
         of = spots[many]
         order = np.argsort(of[:, Spot.SLICE], kind="stable")
-        bags, together, often = of[order, Spot.SLICE], of[order, Spot.TOGETHER], counts[many][order]
-        begins = np.flatnonzero(np.diff(bags, prepend=-1))
+        slices, together, often = (
+            of[order, Spot.SLICE],
+            of[order, Spot.TOGETHER],
+            counts[many][order],
+        )
+        begins = np.flatnonzero(np.diff(slices, prepend=-1))
         numbers: list[int] = []
         if len(begins):
-            sizes = np.diff(begins, append=len(bags))
+            sizes = np.diff(begins, append=len(slices))
             most = np.repeat(np.maximum.reduceat(often, begins), sizes)
             beside = np.add.reduceat((2 * often >= most).astype(np.int64), begins)
             at_once = np.maximum.reduceat(together, begins)
             numbers = np.minimum(beside, at_once).tolist()
-        # What most bags have, so that no single one with a false detection counts.
+        # What most slices have, so that no single one with a false detection counts.
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None
 

@@ -2,8 +2,8 @@
 
 A label that is a small share of another's detections at a place, and is never in one message with
 it there, is that other thing under a wrong name. The stays that are left are linked into as few
-things as explain them: a stay that was seen to have ended may go on elsewhere. A label whose stays
-are many and short is of something that moves by itself: it has a track, and no places.
+things as explain them: a stay that was seen to have ended may go on elsewhere. A label of people or
+pets, or one whose stays are many and short, moves by itself: it has a track, and no places.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ _HALO_SHARE: Final = 0.2
 _TINY_SHARE: Final = 0.1
 _BESIDE_SHARE: Final = 0.2
 _SEVERAL_SHARE: Final = 0.1
-"""Where so many bags have several of a label at one place, it is no single thing that moves."""
+"""Where so many slices have several of a label at one place, it is no single thing that moves."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -77,9 +77,11 @@ class PlacedStay:
         first, last: of its detections (ns); `firm_first` and `firm_last` of those that are beyond
             doubt.
         left: the time by which it was seen to be gone; None if it was not.
+        count: of its detections.
         spots: rows of `Sights.spots`, in order of time.
         spellings: how often it was seen under each label.
         place: its number.
+        stay: when it was there, by slices.
         weak: whether it was seen too rarely to be a thing.
         also: how often it was seen under the labels of other things.
     """
@@ -178,7 +180,7 @@ class Estimate:
         return bool(self.poor[rows[self.sights.spots[rows, Spot.LAST].argmax()]])
 
     def place_of(self, stay: PlacedStay, rows: Ints) -> tuple[float, float, float]:
-        """Returns the mean place (m) of some spots of a stay, by what it was when all are poor."""
+        """Returns the mean place (m) of some spots of a stay; of all of it if these are poor."""
         rows = rows[~self.poor[rows]]
         if not len(rows):
             return stay.x / 1000, stay.y / 1000, stay.z / 1000
@@ -248,9 +250,9 @@ def estimate(
     min_score: float = 0.0,
     go_on: Callable[[], None] = lambda: None,
 ) -> Estimate:
-    """Returns the things in the sights of bags that are in order of time.
+    """Returns the things in the sights of slices that are in order of time.
 
-    `epochs` has the coordinate system of each bag: bags of different ones are separate.
+    `epochs` has the coordinate system of each slice: slices of different ones are separate.
     Detections whose score lies below `min_score`, to 0.05, do not count. `go_on` is called again
     and again; what it raises ends the estimate.
     """
@@ -312,7 +314,7 @@ class _Seen:
         counts: how many detections of each spot count.
         poor: which spots were seen while localisation was poor: these move nothing.
         hits: the hits of these, by spot; `starts` is where each spot's begin.
-        groups: of each spot a number; those of one bag, topic and label have the same.
+        groups: of each spot a number; those of one slice, topic and label have the same.
         side: of each spot, the mean of the unit vectors to it from where it was seen.
     """
 
@@ -437,7 +439,7 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
 
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
-    """Returns at which places bags have several spots of a label: things that stand together."""
+    """Returns at which places slices have several spots of a label: things that stand together."""
     width = int(groups.max(initial=0)) + 1
     distinct = np.bincount(np.unique(place * width + groups) // width)
     several: Flags = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
@@ -461,8 +463,8 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     for place, stay in stays_at(seen.cells, group.evidence):
         go_on()
         spots = group.places[place]
-        bag = every[spots, Spot.SLICE]
-        inside = spots[(bag >= stay.first_bag) & (bag <= stay.last_bag)]
+        own = every[spots, Spot.SLICE]
+        inside = spots[(own >= stay.first_slice) & (own <= stay.last_slice)]
         group.stays.append(_placed(seen, place, stay, inside))
 
 
@@ -500,7 +502,7 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
 def _fold(
     groups: Sequence[_Group], seen: _Seen, keys: Sequence[str], go_on: Callable[[], None]
 ) -> None:
-    """Removes stays that are other things under a wrong name, or the noise around one."""
+    """Removes stays that are other things under a wrong name, noise around one, or too rare."""
     every = [(group, stay) for group in groups for stay in group.stays]
     hosts = _Hosts(every, seen, keys)
     gone: set[int] = set()
@@ -546,7 +548,7 @@ class _Hosts:
         self._columns = table[self._order].T
 
     def of(self, nth: int) -> Iterator[tuple[int, int]]:
-        """Yields their numbers, in order, and how often each was seen in the bags of the stay."""
+        """Yields their numbers, in order, and how often each was seen in the slices of the stay."""
         group, stay = self._every[nth]
         start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
         x, y, first, last, epoch, weak = self._columns[:, start:stop]
@@ -555,12 +557,12 @@ class _Hosts:
         near &= (epoch == group.epoch) & (weak == 0)
         beside: Counter[str] | None = None
         found = zip(self._order[start:stop][near].tolist(), away[near].tolist(), strict=True)
-        for other, metres in sorted(found):
+        for other, away_mm in sorted(found):
             host_group, _ = self._every[other]
             if other == nth:
                 continue
             if host_group is not group:
-                if metres > _SAME_PLACE_MM:
+                if away_mm > _SAME_PLACE_MM:
                     continue
                 beside = self._beside_of(stay) if beside is None else beside
                 if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
@@ -575,8 +577,8 @@ class _Hosts:
         return counts
 
     def _seen_during(self, host: int, stay: Stay) -> int:
-        bags, counts = self._hits[host]
-        start, stop = np.searchsorted(bags, (stay.first_bag, stay.last_bag + 1))
+        slices, counts = self._hits[host]
+        start, stop = np.searchsorted(slices, (stay.first_slice, stay.last_slice + 1))
         return int(counts[stop] - counts[start])
 
 
@@ -677,14 +679,15 @@ def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None
     """Adds what was seen while localisation was poor to the things that it may have been."""
     for row in np.setdiff1d(group.rows, seen.firm(group.rows)).tolist():
         spot, n = seen.sights.spots[row], int(seen.counts[row])
-        here = [
-            (math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]), nth)
-            for nth, each in enumerate(instances)
+        # Of each thing the last stay that had begun by then.
+        begun = [
+            stay
+            for each in instances
             for stay in [stay for stay in each.stays if stay.first <= spot[Spot.LAST]][-1:]
         ]
-        away, nth = min(here, default=(math.inf, 0))
-        if away <= GATE_MM:
-            stay = [stay for stay in instances[nth].stays if stay.first <= spot[Spot.LAST]][-1]
+        away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in begun]
+        if away_mm and min(away_mm) <= GATE_MM:
+            stay = begun[away_mm.index(min(away_mm))]
             stay.spots = np.sort(np.append(stay.spots, row))
             stay.last = max(stay.last, int(spot[Spot.LAST]))
             stay.count += n

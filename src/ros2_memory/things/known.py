@@ -50,7 +50,8 @@ class KnownThings:
         labels: maps labels to keys.
         frames: by epoch, the frame of its places; epoch 0 is the map.
         has_map: whether any sights are in the map.
-        since: how far back it reaches, where not all bags could be read in time; else None.
+        since: how far back it reaches, where not all bags could be read in time, or there are too
+            many sightings; else None.
         crowded: whether it begins there because there are too many sightings before.
         until: where it ends; later sightings are none of it.
         later: the things by all sightings, of an estimate that ends before the last one.

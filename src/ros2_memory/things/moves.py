@@ -1,7 +1,7 @@
 """Where a thing was moved a little: the stays at one place, as steps in a series of sightings.
 
-A sighting is where something was seen in one bag: the mean of some looks. It is off by the noise of
-each look; by that of its *visit*, whose looks share their error of localisation; and by the side
+A sighting is where something was seen in one slice: the mean of some looks. It is off by the noise
+of each look; by that of its *visit*, whose looks share their error of localisation; and by the side
 that it is seen from, since detectors are biased along their view. A regression of all visits on the
 side and on a step says how large the step is, and how exactly that is known.
 """

@@ -32,7 +32,7 @@ _FEW: Final = 25.0
 """So few detections, far away, may scatter as widely."""
 _MAX_PLACES: Final = 512
 _FULL_WEIGHT: Final = 10
-"""A spot of more detections weighs no more: all of one bag share its error of localisation."""
+"""A spot of more detections weighs no more: all of one slice share its error of localisation."""
 
 
 def places_of(x: Ints, y: Ints, n: Ints) -> Ints:

@@ -1,5 +1,6 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
+What was seen is known by slice (`analysis.sights`): 10 s of the clock.
 A *cell* is a pose of the robot, to 25 cm and 10 degrees, from which the place was seen at least
 once. How often a message from a cell has the label, while it is there, is its rate. A look from
 such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is evidence
@@ -39,39 +40,48 @@ if TYPE_CHECKING:
 _FALSE_RATE: Final = 0.01
 """How often a message has a label at a place where there is no such thing."""
 _SWITCH: Final = 4.0
-"""Natural logarithm of the odds against a change between two bags."""
-_MOST_BY_BAG: Final = 10.0
-"""What one bag can add to the evidence: its messages share their errors."""
+"""Natural logarithm of the odds against a change between two slices."""
+_MOST_BY_SLICE: Final = 10.0
+"""What one slice can add to the evidence: its messages share their errors."""
 _STANDING: Final = 0.2
 """A robot that stands looks at the same thing behind the same obstacle."""
 _LEAST_BLIND: Final = -2.0
+"""A look with hits, from where the place is hardly seen, says no more against it."""
 _CLEAR: Final = 1.5
+"""A slice with less is not the first or the last of a stay, unless all have less."""
 _FIRM: Final = 5.0
-"""A bag with evidence above this has more than one detection, which is hardly ever false."""
+"""A slice with evidence above this has more than one detection, which is hardly ever false."""
+_UNPLACED_HIT: Final = 2.0
+"""What a hit from an unknown pose adds."""
 _PRIOR: Final = 0.5
+"""Hits, and messages without one, that each cell is taken to have had before (Jeffreys' prior)."""
 _MISSED_BY_CHANCE: Final = 0.01
 _LEFT_BY_CHANCE: Final = 0.05
 _FEWEST_HITS: Final = 3
 _RARE_OF: Final = 20
+"""A cell with fewer hits sees a place only if it has no more messages than so many for each."""
 _LEAST_RATE: Final = 0.1
+"""In looks with a hit, a cell that sees a place has one in as many of the messages, at least."""
 _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
+"""A cell of so many looks that has hits in less than this share of what others have is blocked."""
 _VIEW_SHARE: Final = 0.02
+"""What lies farther out at each side of a field of view is mistaken."""
 
 
 class Cells:
-    """The looks of all bags by cell: which looks were from where.
+    """The looks of all slices by cell: which looks were from where.
 
     Args:
-        sights: of all bags, in order of time.
-        epoch: by bag, which odometry its poses are in; the same for all that are in a map.
+        sights: of all slices, in order of time.
+        epoch: by slice, which odometry its poses are in; the same for all that are in a map.
         poor: which looks are not where they seem to be; those say nothing of others.
     """
 
     def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
         looks = sights.looks
         # Looks of single places are picked thousands of times: from whole columns that is faster.
-        self.bag, self.n, self.first, self.last, self.topic = (
+        self.slice, self.n, self.first, self.last, self.topic = (
             np.ascontiguousarray(looks[:, each])
             for each in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
         )
@@ -81,7 +91,7 @@ class Cells:
         _, self.cell = distinct_rows(
             (
                 self.topic + poor * (len(sights.topics) + 1),
-                epoch[self.bag],
+                epoch[self.slice],
                 looks[:, Look.X] // CELL_MM,
                 looks[:, Look.Y] // CELL_MM,
                 looks[:, Look.YAW] // CELL_DECIDEG,
@@ -94,7 +104,7 @@ class Cells:
         self._starts = np.cumsum(self.looks_in) - self.looks_in
         after, before = order[1:], order[:-1]
         goes_on = self.cell[after] == self.cell[before]
-        goes_on &= self.bag[after] - self.bag[before] <= 1
+        goes_on &= self.slice[after] - self.slice[before] <= 1
         self._goes_on = np.zeros(len(order), bool)
         self._goes_on[after] = goes_on
         self._before = np.zeros(len(order), np.int64)
@@ -106,15 +116,17 @@ class Cells:
         looks = self._by_cell[in_ranges(self._starts[cell], self.looks_in[cell])]
         return _keys(np.repeat(_place(cells), self.looks_in[cell]), looks)
 
-    def looks_during(self, bags: Ints) -> Ints:
-        """Returns all looks of some bags of places, by bag."""
-        first, last = (np.searchsorted(self.bag, _number(bags), side) for side in ("left", "right"))
+    def looks_during(self, slices: Ints) -> Ints:
+        """Returns all looks of some slices of places, by slice."""
+        first, last = (
+            np.searchsorted(self.slice, _number(slices), side) for side in ("left", "right")
+        )
         looks = in_ranges(first, last - first)
-        return _keys(np.repeat(_place(bags), last - first), looks)
+        return _keys(np.repeat(_place(slices), last - first), looks)
 
-    def looked_in(self, bag: int) -> Ns | None:
-        """Returns when the first look of a bag ended; None without any."""
-        first, last = np.searchsorted(self.bag, (bag, bag + 1))
+    def looked_in(self, number: int) -> Ns | None:
+        """Returns when the first look of a slice ended; None without any."""
+        first, last = np.searchsorted(self.slice, (number, number + 1))
         return int(self.last[first:last].min()) if first < last else None
 
     def cells_of(self, looks: Ints) -> Ints:
@@ -124,7 +136,7 @@ class Cells:
     def repeated_misses(self, looks: Ints, hits: Ints) -> Flags:
         """Returns which looks without a hit repeat the previous one, which had none either.
 
-        The one before, from the same cell, is no older than the bag before.
+        The one before, from the same cell, is no older than the slice before.
         """
         again: Flags = (hits == 0) & self._goes_on[_number(looks)]
         rows = np.flatnonzero(again)
@@ -132,8 +144,8 @@ class Cells:
         again[rows] = ~_are_in(looks[hits > 0], before)
         return again
 
-    def seen_at(self, looks: Ints, x: float, y: float) -> tuple[Floats, Floats]:
-        """Returns how far (mm) and in which direction (degrees from ahead) a place was."""
+    def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
+        """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
         dx, dy = x - self.x[looks], y - self.y[looks]
         bearing = (np.degrees(np.arctan2(dy, dx)) - self.yaw[looks] + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
@@ -178,13 +190,13 @@ class Evidence(NamedTuple):
     """The evidence for the places of a label: the looks at each, and those that saw it there.
 
     Looks are from cells that saw it at least once. Of a cell that does not see it, but for a false
-    detection once in a while, only those are here that are in a bag in which it was seen.
+    detection once in a while, only those are here that are in a slice in which it was seen.
 
     Attributes:
         looks: their places and numbers, as keys in order.
         cell: of each look; cells are numbered for each place.
         hits: how many messages of each of these looks have the label there.
-        blind: the places and bags, as keys in order, of hits by messages without a known pose.
+        blind: the places and slices, as keys in order, of hits by messages without a known pose.
         times: how many hits each of these has.
         fair: whether a look that has no hit could have: from a cell that sees the place, and with
             the place well inside the field of view.
@@ -212,15 +224,15 @@ class Evidence(NamedTuple):
 
 
 class Stay(NamedTuple):
-    """A time at a place: the bags of the first and the last sighting, and what came after.
+    """A time at a place: the slices of the first and the last sighting, and what came after.
 
-    `messages` are those of the looks that saw it. `firm_first` and `firm_last` are the bags between
-    which single detections, which may be false, are not needed to see it there.
-    `left` is the bag by which it was seen to be gone (chance of missing it below 5 %), or None.
+    `messages` are those of the looks that saw it. Between the slices `firm_first` and `firm_last`
+    single detections, which may be false, are not needed to see it there.
+    `left` is the slice by which it was seen to be gone (chance of missing it below 5 %), or None.
     """
 
-    first_bag: int
-    last_bag: int
+    first_slice: int
+    last_slice: int
     firm_first: int
     firm_last: int
     hits: int
@@ -231,7 +243,7 @@ class Stay(NamedTuple):
 def evidence_at(
     cells: Cells, view: dict[int, FieldOfView], places: Floats, rows: Ints, place: Ints
 ) -> Evidence:
-    """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the bag.
+    """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
 
     `place` has the number of the place of each row.
     """
@@ -243,8 +255,8 @@ def evidence_at(
     known, cell_of = np.unique(cells.cells_of(hit), return_inverse=True)
     sees = _sees(cells, known, cell_of, looked, hits_of)
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
-    hit_bags = _keys(_place(hit), cells.bag[_number(hit)])
-    beside = cells.looks_during(_distinct(np.concatenate((hit_bags, blind))))
+    hit_slices = _keys(_place(hit), cells.slice[_number(hit)])
+    beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
     beside = beside[_are_in(known, cells.cells_of(beside))]
     looks = _distinct(np.concatenate((beside, cells.looks_from(known[sees]))))
     cell = np.searchsorted(known, cells.cells_of(looks))
@@ -264,7 +276,7 @@ _BITS: Final = 32
 
 
 def _keys(place: Ints, number: Ints) -> Ints:
-    """Returns pairs of a place and the number of a look, a cell or a bag as one number each."""
+    """Returns pairs of a place and the number of a look, a cell or a slice as one number each."""
     keys: Ints = (place << _BITS) | number
     return keys
 
@@ -325,10 +337,10 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     n, blind, times = cells.n[looks], evidence.blind, evidence.times
     hit = np.flatnonzero(evidence.hits)  # few of them all
     hits = evidence.hits[hit]
-    bag = _keys(_place(evidence.looks), cells.bag[looks])
-    bags = _distinct(np.concatenate((bag, blind)))
-    at, blind = np.searchsorted(bags, bag), np.searchsorted(bags, blind)
-    seen = np.bincount(at[hit], hits, len(bags))
+    own = _keys(_place(evidence.looks), cells.slice[looks])
+    slices = _distinct(np.concatenate((own, blind)))
+    at, blind = np.searchsorted(slices, own), np.searchsorted(slices, blind)
+    seen = np.bincount(at[hit], hits, len(slices))
     seen[blind] += times
     there = np.flatnonzero((seen > 0)[at])
     # For each cell, how often it sees the thing while that is there.
@@ -341,27 +353,27 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
     again = cells.repeated_misses(evidence.looks, evidence.hits)
     np.multiply(odds, _STANDING, out=odds, where=again)
-    by_bag = np.bincount(at, odds, len(bags)).astype(np.float64)
-    messages = np.bincount(at[hit], n[hit], len(bags))
-    by_bag[blind] += 2.0 * times
+    by_slice = np.bincount(at, odds, len(slices)).astype(np.float64)
+    messages = np.bincount(at[hit], n[hit], len(slices))
+    by_slice[blind] += _UNPLACED_HIT * times
     messages[blind] += times
-    by_bag = by_bag.clip(-_MOST_BY_BAG, _MOST_BY_BAG)
-    for place, start, stop, end in _present(by_bag, _place(bags)):
+    by_slice = by_slice.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE)
+    for place, start, stop, end in _present(by_slice, _place(slices)):
         inside = np.flatnonzero(seen[start:stop]) + start
-        clear = inside[by_bag[inside] >= _CLEAR]
+        clear = inside[by_slice[inside] >= _CLEAR]
         if not len(inside):
             continue
         # A false detection or two beside a stay are no part of it.
         inside = clear if len(clear) else inside
         first, last = int(inside[0]), int(inside[-1])
-        firm = inside[by_bag[inside] >= _FIRM]
+        firm = inside[by_slice[inside] >= _FIRM]
         firm = firm if len(firm) else inside
-        gone = np.cumsum(by_bag[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
-        left = int(_number(bags[firm[-1] + 1 + gone.argmax()])) if gone.any() else None
-        ends = bags[[first, last, firm[0], firm[-1]]]
-        first_bag, last_bag, firm_first, firm_last = _number(ends).tolist()
+        gone = np.cumsum(by_slice[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
+        left = int(_number(slices[firm[-1] + 1 + gone.argmax()])) if gone.any() else None
+        ends = slices[[first, last, firm[0], firm[-1]]]
+        first_slice, last_slice, firm_first, firm_last = _number(ends).tolist()
         hit_count, count = (int(each[first : last + 1].sum()) for each in (seen, messages))
-        yield place, Stay(first_bag, last_bag, firm_first, firm_last, hit_count, count, left)
+        yield place, Stay(first_slice, last_slice, firm_first, firm_last, hit_count, count, left)
 
 
 def chance_of_missing(
@@ -376,9 +388,9 @@ def chance_of_missing(
     looks, and when the chance fell below 1 %; None where it did not.
     """
     looks, hits = _number(evidence.looks), evidence.hits
-    bag = cells.bag[looks]
-    during = (bag >= stay.first_bag) & (bag <= stay.last_bag) & (cells.last[looks] <= after)
-    during |= (bag >= stay.first_bag) & (bag <= stay.last_bag) & (hits > 0)
+    own = cells.slice[looks]
+    during = (own >= stay.first_slice) & (own <= stay.last_slice) & (cells.last[looks] <= after)
+    during |= (own >= stay.first_slice) & (own <= stay.last_slice) & (hits > 0)
     since = (cells.first[looks] > after) & evidence.fair & ~during
     return _missed(cells, evidence, during, since)
 
@@ -390,8 +402,8 @@ def missed_in(cells: Cells, evidence: Evidence, stay: Stay, window: tuple[Ns, Ns
     chance of 1 %.
     """
     looks = _number(evidence.looks)
-    bag, first = cells.bag[looks], cells.first[looks]
-    during = (bag >= stay.first_bag) & (bag <= stay.last_bag)
+    own, first = cells.slice[looks], cells.first[looks]
+    during = (own >= stay.first_slice) & (own <= stay.last_slice)
     inside = (first >= window[0]) & (cells.last[looks] < window[1])
     _, _, crossed = _missed(cells, evidence, during, inside & evidence.fair & ~during)
     return crossed is not None
@@ -436,18 +448,18 @@ def _missed(
     return math.exp(chance), messages, crossed
 
 
-def _present(by_bag: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]:
-    """Yields the likeliest runs of bags in which a thing was there.
+def _present(by_slice: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]:
+    """Yields the likeliest runs of slices in which a thing was there.
 
-    As the place, [start, stop), and where the bags of this place end.
+    As the place, [start, stop), and where the slices of this place end.
     """
     ends = np.append(np.flatnonzero(place[1:] != place[:-1]) + 1, len(place)).tolist()
     if not len(place):
         return
-    # Runs of one sign have one state: fewer steps than bags.
-    changes = np.flatnonzero(np.diff(by_bag >= 0)) + 1
+    # Runs of one sign have one state: fewer steps than slices.
+    changes = np.flatnonzero(np.diff(by_slice >= 0)) + 1
     starts = np.union1d([0, *ends[:-1]], changes)
-    sums, starts = np.add.reduceat(by_bag, starts).tolist(), starts.tolist()
+    sums, starts = np.add.reduceat(by_slice, starts).tolist(), starts.tolist()
     begin = 0
     for end in ends:
         stop = bisect_left(starts, end)
@@ -460,7 +472,7 @@ def _present(by_bag: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]
 
 
 def _states(sums: Sequence[float]) -> Sequence[bool]:
-    """Returns in which runs of bags a thing was there, by the evidence of each."""
+    """Returns in which runs of slices a thing was there, by the evidence of each."""
     absent, present = 0.0, -_SWITCH / 4
     came_from: list[tuple[bool, bool]] = []
     for value in sums:

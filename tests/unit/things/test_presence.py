@@ -41,7 +41,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     whole = _with_every_look(cells, found, hits)
     left_out = np.setdiff1d(whole.looks, found.looks)
     seen_in = {bag for bag, *_ in hits.tolist()}
-    assert not seen_in & {*cells.bag[left_out].tolist()}
+    assert not seen_in & {*cells.slice[left_out].tolist()}
     assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
     assert [*stays_at(cells, found)] == [*stays_at(cells, whole)]
     for _, stay in stays_at(cells, found):
