@@ -28,7 +28,14 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAli
 
 from pydantic import Field, StrictBool
 
-from ros2_memory.bag_dir.json_files import Count, Int64, JsonDocument, JsonLog, until_changed
+from ros2_memory.bag_dir.json_files import (
+    MOST_BYTES,
+    Count,
+    Int64,
+    JsonDocument,
+    JsonLog,
+    until_changed,
+)
 from ros2_memory.bag_dir.layout import (
     DELETED_FILE,
     ERASING_FILE,
@@ -275,7 +282,7 @@ class Superseded:
     bags: dict[str, str] = field(default_factory=dict)
 
 
-SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded)
+SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded, most_bytes=MOST_BYTES)
 
 
 def read_superseded(bag_dir: Path) -> Superseded:
@@ -483,7 +490,7 @@ class Erasure:
         return self.window_of(topic, log_time, publish_time) is not None
 
 
-ERASING: Final = JsonDocument(ERASING_FILE, Erasure)
+ERASING: Final = JsonDocument(ERASING_FILE, Erasure, most_bytes=MOST_BYTES)
 
 # screened.json
 
@@ -585,7 +592,7 @@ class Gate(NamedTuple):
 
 OPEN_GATE: Final = Gate(ScreenState())
 """Holds nothing back."""
-SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
+SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState, most_bytes=MOST_BYTES)
 
 
 @until_changed(SCREENED_FILE)
