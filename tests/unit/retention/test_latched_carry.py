@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,6 +19,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
+from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.noting_reader import fail_reading
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -278,6 +280,18 @@ class TestTheBagOfCarriedMessages:
         now.at = 86_401 * S
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
+
+    def test_what_lies_behind_a_damaged_part_of_a_bag_is_carried(self, tmp_path: Path) -> None:
+        recording(tmp_path, "rec", (), drive(T0 + 10 * S, T0 + 20 * S))
+        lost, left = frame(T0, "laser", 0.1), frame(T0 + 8 * S, "camera", 0.2)
+        damaged = write_mcap(
+            tmp_path / "rec" / "rec_0.mcap",
+            [lost, *drive(T0 + S, T0 + 8 * S), left],
+            replace(LAYOUT, chunk_size=400),
+        )
+        spoil_chunk(damaged, 0)
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0 + 8 * S]
 
     @pytest.mark.parametrize("kind", [BagError, BagUnreachableError])
     def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(
