@@ -11,8 +11,10 @@ from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
+from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.retention import saved_moments
 from tests.support.bags import McapLayout, Msg, boolean, text
+from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
 
 if TYPE_CHECKING:
@@ -302,6 +304,23 @@ class TestFaults:
         robot.look()
         assert robot.spans() == [(1, 9)]
         assert (robot.record().fired, robot.record().moments) == (1, 1)
+
+    def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot = watched(tmp_path)
+        robot.begin(T0)
+        bad = robot.split(seconds(0, 10, {2}))
+        robot.split(seconds(10, 20, {16}))
+        robot.clock.at = T0 + 40 * S
+        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+        fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
+        robot.close_all()
+        assert robot.logged("moments_not_minded")
+        assert robot.spans() == []
+        robot.now_s = 86_400.0
+        robot.look()
+        assert robot.spans() == [(11, 19)]
 
     def test_a_state_that_is_damaged_is_said_to_be_lost(self, tmp_path: Path) -> None:
         robot = watched(tmp_path)
