@@ -219,14 +219,17 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """Appends what is about to be deleted; nobody asks about a split that is still there.
 
     A file that is too long is written again: a row for each recording that is still there, and one
-    for all that have gone, whose files nothing lists any more.
+    for all that have gone, whose files nothing lists any more. Where it cannot be read at that
+    moment, it stays long until the next time.
 
     Raises:
         OSError: the file cannot be written.
     """
     if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
         return
-    known = read_deleted(bag_dir)
+    known = _deleted(bag_dir)
+    if known is None:
+        return
     there = {name for name in known if name and (bag_dir / name).is_dir()}
     gone = (span for name, row in known.items() if name not in there for span in row.spans)
     rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0

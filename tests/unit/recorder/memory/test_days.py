@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import operator
 import shutil
@@ -18,9 +19,12 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 from starlette.datastructures import QueryParams
 
+from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE
+from ros2_memory.bag_dir.durable_write import read_small_file
+from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
@@ -333,6 +337,28 @@ def test_what_stays_already_is_not_written_twice_and_hours_are_added(bag_dir: Pa
     both = messages_in(bag_dir / DAY_FILE)
     assert both[: len(first)] == first
     assert len(both) > len(first) + 60
+
+
+def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    days = days_of(bag_dir)
+    for name, second in (("rec_A", 0), ("rec_B", 7200)):
+        split(bag_dir, second, name=name)
+    own_all(bag_dir)
+    keep_all(days, bag_dir)
+
+    def failing(path: Path, *given: int) -> str:
+        if path.name == Path(SUPERSEDED_FILE).name:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return read_small_file(path, *given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(json_files, "read_small_file", failing)
+        with pytest.raises(OSError, match="Too many"):
+            keep_all(days, bag_dir, "rec_B")
+    keep_all(days, bag_dir, "rec_B")
+    assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
 
 
 def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
