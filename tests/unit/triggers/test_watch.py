@@ -322,6 +322,24 @@ class TestFaults:
         robot.look()
         assert robot.spans() == [(11, 19)]
 
+    def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
+
+        def failing(_: Path) -> None:
+            raise OSError(errno.EIO, "Input/output error")
+
+        monkeypatch.setattr(TRIGGERS, "read", failing)
+        robot.house = robot.new_house()
+        name = robot.begin(T0)
+        for begin in range(0, 50, 10):
+            robot.split(seconds(begin, begin + 10), name)
+        robot.split(seconds(500, 510), name)
+        robot.look()
+        assert [told["reason"] for told in robot.logged("moments_not_minded")]
+        assert len([*robot.bag_dir.glob("rec_*/*.mcap")]) == 4  # of 6; by age there would be one
+
     def test_a_state_that_is_damaged_is_said_to_be_lost(self, tmp_path: Path) -> None:
         robot = watched(tmp_path)
         (robot.bag_dir / TRIGGERS_FILE).write_text('{"format": 1, "rules": 7}')
