@@ -271,10 +271,12 @@ class TestFaults:
         bags.split(name, [mode(20, value=False), *words(20, 30)])
         fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
         fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
-        with pytest.raises(BagUnreachableError):
-            bags.end()
-        assert bags.served() == []
-        bags.now_s += 86_400
+        bags.live.clear()
+        for _ in range(24):
+            with pytest.raises(BagUnreachableError):
+                bags.step()
+            assert bags.served() == []
+            bags.now_s += 3540
         bags.end()
         assert [path.name for path in bags.served()] == [f"{name}_0.mcap", f"{name}_2.mcap"]
         assert f"{bad.name}: it cannot be opened" in (bags.screening.problem() or "")

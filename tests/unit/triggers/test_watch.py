@@ -317,9 +317,10 @@ class TestFaults:
         fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
         robot.close_all()
         assert robot.logged("moments_not_minded")
-        assert robot.spans() == []
-        robot.now_s = 86_400.0
-        robot.look()
+        for hour in range(1, 25):
+            assert robot.spans() == []
+            robot.now_s = hour * 3600.0
+            robot.look()
         assert robot.spans() == [(11, 19)]
 
     def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
