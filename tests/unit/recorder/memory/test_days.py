@@ -112,6 +112,7 @@ def house(
     now: int,
     *,
     max_age_h: float = 10**6,
+    max_bytes: int = 10**15,
     memory: MemoryDays | None = None,
     monotonic: Callable[[], float] = time.monotonic,
 ) -> Housekeeping:
@@ -120,7 +121,7 @@ def house(
         BagDirReader(McapReader()),
         McapWriter(),
         SettableClock(now),
-        RetentionLimits(10**15, round(max_age_h * HOUR), keeps_foreign=True),
+        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=True),
         is_synchronised=lambda: True,
         split_duration_s=60.0,
         static_topics=("/tf_static",),
@@ -665,6 +666,18 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
     monotonic.at = 90_000 * S
     keeper.apply()
     assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 40
+
+
+def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_dir: Path) -> None:
+    for nth in range(10):
+        split(bag_dir, 60 * nth)
+    split(bag_dir, 7200, name="rec_B")
+    own_all(bag_dir)
+    sizes = [path.stat().st_size for path in bag_dir.rglob("*.mcap")]
+    memory = days_of(bag_dir, writer=Failing(0))
+    max_bytes = sum(sizes) - min(sizes) // 2
+    house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
+    assert len([*bag_dir.glob("rec_*/*.mcap")]) == 10
 
 
 def unreachable(path: Path) -> BagError | None:
