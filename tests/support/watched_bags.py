@@ -78,6 +78,7 @@ class WatchedBags:
         self.limits = limits
         self.unrecorded: set[str] = set(limits.pop("unrecorded", ()))
         self.clock = SettableClock(T0)
+        self.now_s = 0.0
         self.own = OwnRecordings(bag_dir)
         self.names: list[str] = []
         self._splits = 0
@@ -89,7 +90,7 @@ class WatchedBags:
     def new_house(self) -> Housekeeping:
         """A housekeeper as a recorder that starts anew has one."""
         reader = BagDirReader(McapReader())
-        search = SplitSearch(reader, shipped_extractor(), self.rules)
+        search = SplitSearch(reader, shipped_extractor(), self.rules, monotonic=lambda: self.now_s)
         limits = RetentionLimits(
             self.limits.get("max_bytes", PLENTY),
             round(self.limits.get("max_age_h", 10**4) * 3600 * S),

@@ -117,17 +117,17 @@ def open_plain(path: Path | str, dir_fd: int | None = None) -> BinaryIO:
     return os.fdopen(descriptor, "rb")
 
 
-def read_small_file(path: Path | str) -> str:
-    """Returns the text of a regular file of at most `MAX_SMALL_FILE` bytes; never waits.
+def read_small_file(path: Path | str, most_bytes: int = MAX_SMALL_FILE) -> str:
+    """Returns the text of a regular file of at most so many bytes; never waits.
 
     Raises:
         OSError: the file cannot be read.
         ValueError: it is not a regular file, not UTF-8, or too large.
     """
     with open_plain(path) as stream:
-        data = stream.read(MAX_SMALL_FILE + 1)
-    if len(data) > MAX_SMALL_FILE:
-        raise ValueError(f"it is larger than {MAX_SMALL_FILE} bytes")
+        data = stream.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise ValueError(f"it is larger than {most_bytes} bytes")
     return data.decode("utf-8")
 
 

@@ -32,6 +32,7 @@ from zlib import crc32
 from pydantic import Field, TypeAdapter, ValidationError
 
 from ros2_memory.bag_dir.durable_write import (
+    MAX_SMALL_FILE,
     append_durably,
     flush,
     open_plain,
@@ -53,7 +54,8 @@ Count: TypeAlias = Annotated[int, Field(strict=True, ge=0, le=MAX_NS)]
 READABLE: Final = 0o644
 """Permissions of a file that the other program reads; it may run as another user."""
 
-_MOST_BYTES: Final = 64 << 20
+MOST_BYTES: Final = 64 << 20
+"""Of a log, and of a document that grows with the number of bags or messages."""
 _FORMAT: Final = 1  # of each document
 _SURROGATE: Final = re.compile(r"\\ud[89a-f]", re.IGNORECASE)
 _CHECK: Final = b', "crc32": "'
@@ -82,7 +84,7 @@ class JsonLog(Generic[_T]):
     """
 
     def __init__(
-        self, name: str, row: type[_T], *, most_bytes: int = _MOST_BYTES, is_brief: bool = False
+        self, name: str, row: type[_T], *, most_bytes: int = MOST_BYTES, is_brief: bool = False
     ) -> None:
         self.name = name
         self._adapter = TypeAdapter(row)
@@ -182,16 +184,25 @@ class JsonDocument(Generic[_T]):
         name: the path of the file in the bag directory.
         content: the dataclass.
         is_ascii: whether other characters are escaped, as paths need that are not UTF-8.
+        most_bytes: a longer file is not read.
 
     Attributes:
         current: returns the same as `read`, which it calls only once the file has changed; None
             where that fails.
     """
 
-    def __init__(self, name: str, content: type[_T], *, is_ascii: bool = True) -> None:
+    def __init__(
+        self,
+        name: str,
+        content: type[_T],
+        *,
+        is_ascii: bool = True,
+        most_bytes: int = MAX_SMALL_FILE,
+    ) -> None:
         self.name = name
         self._adapter = TypeAdapter(content)
         self._is_ascii = is_ascii
+        self._most_bytes = most_bytes
         self.current = until_changed(name)(self.read)
 
     def read(self, bag_dir: Path) -> _T | None:
@@ -202,7 +213,7 @@ class JsonDocument(Generic[_T]):
             ValueError: it is damaged, or of another format.
         """
         try:
-            text = read_small_file(state_path(bag_dir, self.name))
+            text = read_small_file(state_path(bag_dir, self.name), self._most_bytes)
         except FileNotFoundError:
             return None
         return parsed(self._adapter, text, _FORMAT)

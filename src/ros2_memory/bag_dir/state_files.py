@@ -28,7 +28,14 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAli
 
 from pydantic import Field, StrictBool
 
-from ros2_memory.bag_dir.json_files import Count, Int64, JsonDocument, JsonLog, until_changed
+from ros2_memory.bag_dir.json_files import (
+    MOST_BYTES,
+    Count,
+    Int64,
+    JsonDocument,
+    JsonLog,
+    until_changed,
+)
 from ros2_memory.bag_dir.layout import (
     DELETED_FILE,
     ERASING_FILE,
@@ -212,14 +219,17 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """Appends what is about to be deleted; nobody asks about a split that is still there.
 
     A file that is too long is written again: a row for each recording that is still there, and one
-    for all that have gone, whose files nothing lists any more.
+    for all that have gone, whose files nothing lists any more. Where it cannot be read at that
+    moment, it stays long until the next time.
 
     Raises:
         OSError: the file cannot be written.
     """
     if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
         return
-    known = read_deleted(bag_dir)
+    known = _deleted(bag_dir)
+    if known is None:
+        return
     there = {name for name in known if name and (bag_dir / name).is_dir()}
     gone = (span for name, row in known.items() if name not in there for span in row.spans)
     rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0
@@ -275,7 +285,7 @@ class Superseded:
     bags: dict[str, str] = field(default_factory=dict)
 
 
-SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded)
+SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded, most_bytes=MOST_BYTES)
 
 
 def read_superseded(bag_dir: Path) -> Superseded:
@@ -483,7 +493,7 @@ class Erasure:
         return self.window_of(topic, log_time, publish_time) is not None
 
 
-ERASING: Final = JsonDocument(ERASING_FILE, Erasure)
+ERASING: Final = JsonDocument(ERASING_FILE, Erasure, most_bytes=MOST_BYTES)
 
 # screened.json
 
@@ -585,7 +595,7 @@ class Gate(NamedTuple):
 
 OPEN_GATE: Final = Gate(ScreenState())
 """Holds nothing back."""
-SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState)
+SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState, most_bytes=MOST_BYTES)
 
 
 @until_changed(SCREENED_FILE)

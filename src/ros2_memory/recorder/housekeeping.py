@@ -378,7 +378,16 @@ class Housekeeping(Housekeeper):
             _log.error("moments_not_minded", reason=str(error))
 
     def _needed(self, snapshot: Snapshot) -> frozenset[str]:
-        return frozenset() if self._triggers is None else self._triggers.needed(snapshot)
+        """Returns the bags that rules may still need: all where the disk does not tell.
+
+        Then age deletes none, and the budget the oldest, so that the disk does not fill.
+        """
+        if self._triggers is None:
+            return frozenset()
+        try:
+            return self._triggers.needed(snapshot)
+        except OSError:  # which was reported when moments were minded
+            return frozenset(bag.file for bag in snapshot.bags)
 
     def _repair_recording(self, directory: Path) -> None:
         try:

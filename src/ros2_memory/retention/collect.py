@@ -24,6 +24,7 @@ from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import RETRIED_S, free_bytes
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
+    DeletionPlan,
     RetentionLimits,
     RetentionStock,
     StoredBag,
@@ -241,7 +242,7 @@ class GarbageCollector:
             going = plan.to_delete if self._memory is None else by_hours(plan, stock)
             to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
-                self._delete_all(to_delete, stock, snapshot, run, aged=plan.aged)
+                self._delete_all(to_delete, stock, snapshot, run, plan)
                 run.unshipped += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
@@ -322,8 +323,7 @@ class GarbageCollector:
         stock: RetentionStock,
         snapshot: Snapshot,
         run: _Pass,
-        *,
-        aged: Collection[str],
+        plan: DeletionPlan,
     ) -> None:
         saved = {file.inode for file in stock.saved}
         run.saved |= {
@@ -348,7 +348,7 @@ class GarbageCollector:
                 run.remaining.add(path)
                 run.waiting.add(path)
         going = [bag for bag in to_delete if bag.path not in run.remaining]
-        self._outlive(going, aged, stock, snapshot, run)
+        self._outlive(going, plan, stock, snapshot, run)
         going = [bag for bag in going if bag.path not in run.remaining]
         self._note(going)
         for bag in going:
@@ -359,12 +359,15 @@ class GarbageCollector:
     def _outlive(
         self,
         to_delete: Sequence[StoredBag],
-        aged: Collection[str],
+        plan: DeletionPlan,
         stock: RetentionStock,
         snapshot: Snapshot,
         run: _Pass,
     ) -> None:
-        """Writes what stays of bags. Where that fails, age waits for a day, the budget does not."""
+        """Writes what stays of bags. Where that fails, age waits for a day, the budget does not.
+
+        Then only the bags go that must, and not those that would go with them, in the same hour.
+        """
         if self._memory is None:
             return
         # A moment has all messages of its bags.
@@ -376,7 +379,9 @@ class GarbageCollector:
             now = self._monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
-            waiting = [bag for bag in to_delete if bag.path in aged and now - since < RETRIED_S]
+            must = {bag.path for bag in plan.to_delete}
+            must -= plan.aged if now - since < RETRIED_S else frozenset()
+            waiting = [bag for bag in to_delete if bag.path not in must]
             run.remaining |= {bag.path for bag in waiting}
             lost = len(to_delete) - len(waiting)
             _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 RETRIED_S: Final = 86_400.0
 """So long it is tried again what the disk refuses; after that it counts as lost."""
+_READ_BETWEEN_S: Final = 3600.0
+"""What is tried every minute and has not failed for so long was read, and fails anew."""
 
 
 def free_bytes(directory: Path) -> int:
@@ -95,9 +97,13 @@ class FailingFiles:
 
     def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._monotonic = monotonic
-        self._since: dict[Path, float] = {}
+        self._failed: dict[Path, tuple[float, float]] = {}
 
     def may_recover(self, path: Path) -> bool:
-        """Returns whether a file that fails now first failed less than `RETRIED_S` ago."""
+        """Returns whether a file that fails now has failed for less than `RETRIED_S`."""
         now = self._monotonic()
-        return now - self._since.setdefault(path, now) < RETRIED_S
+        first, last = self._failed.get(path, (now, now))
+        if now - last > _READ_BETWEEN_S:
+            first = now
+        self._failed[path] = first, now
+        return now - first < RETRIED_S

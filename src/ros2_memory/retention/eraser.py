@@ -222,11 +222,14 @@ class Eraser:
             erasure = replace(erasure, files=tuple(map(self._name, taken)), counts=counts)
         ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
+        linked: list[str] = []
         recordings = {holder.paths[0].parent for holder in survey.holders}
         left = {recording: left_in(recording, self._reader, taken) for recording in recordings}
         for holder in survey.holders:
             try:
-                self._erase_in(holder, erasure, left[holder.paths[0].parent], kept)
+                if line := self._erase_in(holder, erasure, left[holder.paths[0].parent]):
+                    again = any(map(self._may_change, self._files().get(holder.inode, ())))
+                    (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._name(holder.paths[0])}: {_reason_of(error)}")
         files = [self._bag_dir / name for name in erasure.files]
@@ -246,11 +249,12 @@ class Eraser:
                 for gone in erasure.counts
             ]
             append_losses(self._bag_dir, [loss for loss in losses if loss not in known])
+            # Another attempt takes nothing out of links elsewhere, as a backup has them.
             if not kept:
                 ERASING.remove(self._bag_dir)
         except (EpisodicError, OSError) as error:
             kept.append(_reason_of(error))
-        return Kept(tuple(kept), tuple(notes))
+        return Kept((*kept, *linked), tuple(notes))
 
     def _files(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
@@ -323,9 +327,8 @@ class Eraser:
         holder: Holder,
         erasure: Erasure,
         left_of: Mapping[str, Counter[str]],
-        kept: list[str],
-    ) -> None:
-        """Rewrites one file, under all its names.
+    ) -> str | None:
+        """Rewrites one file, under all its names; returns a line where other names are left.
 
         Raises:
             EpisodicError: it cannot be rewritten.
@@ -356,10 +359,11 @@ class Eraser:
             left = os.fstat(old.fileno()).st_nlink
         if left:
             links = counted(left, "more hard link", "more hard links")
-            kept.append(f"{self._name(path)}: all of it is still in {links} of it")
-        elif is_carried(path) and self._reader.summarize(path).empty:
+            return f"{self._name(path)}: all of it is still in {links} of it"
+        if is_carried(path) and self._reader.summarize(path).empty:
             path.unlink()
             flush(path.parent)
+        return None
 
     def _link(self, new: Path, path: Path, inode: Identity) -> None:
         """Puts a new file in place of one name of the old one."""

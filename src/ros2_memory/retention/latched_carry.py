@@ -288,24 +288,30 @@ class Carrier:
         return os.path.relpath(HardLinks(bag_dir).recorded_as(str(recording)), bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
-        """Yields the messages of these topics.
+        """Yields the messages of these topics; of a damaged bag, those that can be read.
 
         Raises:
             BagError: the bag of carried messages cannot be read. Its messages are nowhere else, so
                 it must not be replaced by a bag without them.
             BagUnreachableError: the disk fails to read a bag, and may recover.
         """
-        try:
-            yield from self._reader.records(path, topics, TimeWindow.everything())
-        except BagVanishedError:
-            return
-        except BagError as error:
-            if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
-                raise
-            if path == self.path:
-                reason = f"{error.reason}; move it away to give up its messages"
-                raise BagError(str(path), reason) from error
-            _log.warning("latched_not_read", path=str(path), reason=error.reason)
+        records = self._reader.records(path, topics, TimeWindow.everything())
+        while True:
+            try:
+                yield from records
+            except BagVanishedError:
+                return
+            except BagError as error:
+                if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
+                    raise
+                if path == self.path:
+                    reason = f"{error.reason}; move it away to give up its messages"
+                    raise BagError(str(path), reason) from error
+                _log.warning("latched_not_read", path=str(path), reason=error.reason)
+                if error.lost is None:
+                    return
+            else:
+                return
 
     def _fetched(
         self,

@@ -4,7 +4,8 @@ The monotonic clock starts again at every boot, so recorded time is added up and
 `.episodic/recorded.jsonl`: a line for each recording, about once a minute while it is written,
 with the total recorded time when it last grew. The last line of a recording counts. A recording
 without a line counts as recorded when it is first asked about: nothing shows that it is older. A
-damaged line is ignored, and named in the log.
+damaged line is ignored, and named in the log. While the disk fails to read the file, nothing counts
+as old and nothing is written: lines that count from 0 would make old what they are of.
 
 The dates of a recording are right if the clock was synchronised while it grew, and went along with
 the monotonic clock from its beginning. Those of a recording without a line are doubtful, unless
@@ -16,6 +17,7 @@ from __future__ import annotations
 import math
 import os
 import threading
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -65,6 +67,7 @@ class RecordedTime:
         self._recording: frozenset[str] = frozenset()
         self._saved_at_s = -math.inf
         self._reported: str | None = None
+        self._unread: OSError | None = None
 
     def note(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float, now: Ns
@@ -152,31 +155,44 @@ class RecordedTime:
         return self._last_grew_s[name]
 
     def _load(self) -> None:
+        """Reads the file once; where the disk fails, each call tries it again."""
         if self._loaded:
             return
-        self._loaded = True
-        last = {row.recording: row for row in self._read()}
-        self._last_grew_s = {name: row.recorded_s for name, row in last.items()}
-        self._right = {name for name, row in last.items() if row.clock_right}
-        if not self._last_grew_s:
+        try:
+            last = {row.recording: row for row in self._read()}
+        except OSError as error:
+            if self._unread is None:
+                _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
+            self._unread = error
             return
-        self._total_s = max(self._last_grew_s.values())
+        self._loaded, self._unread = True, None
+        self._right |= {name for name, row in last.items() if row.clock_right}
+        if not last:
+            return
         # The greatest is the total: it stays even if its recording is gone.
-        newest = max(self._last_grew_s, key=self._last_grew_s.__getitem__)
-        self._last_grew_s = {
-            name: recorded_s
-            for name, recorded_s in self._last_grew_s.items()
-            if name == newest or (self._bag_dir / name).is_dir()
+        newest = max(last.values(), key=attrgetter("recorded_s"))
+        # What grew while the file could not be read comes after all that it has.
+        since = {name: newest.recorded_s + grew for name, grew in self._last_grew_s.items()}
+        self._total_s += newest.recorded_s
+        self._last_grew_s = since | {
+            name: row.recorded_s
+            for name, row in last.items()
+            if row is newest or (self._bag_dir / name).is_dir()
         }
         self._lines = _MOST_LINES  # so that the next save leaves out what is gone
 
     def _read(self) -> list[Recorded]:
+        """Returns the rows of the file.
+
+        Raises:
+            OSError: there is one that cannot be read.
+        """
         try:
             lines = [*RECORDED.lines(self._bag_dir)]
         except FileNotFoundError:
             self._has_file = False
             return []
-        except (OSError, ValueError) as error:
+        except ValueError as error:
             _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
             return []
         if damaged := [line for line in lines if line.row is None]:
@@ -192,6 +208,8 @@ class RecordedTime:
     def _save(self) -> None:
         names = sorted(self._unsaved)
         try:
+            if self._unread is not None:
+                raise self._unread
             if self._lines + len(names) > _MOST_LINES:
                 RECORDED.replace(self._bag_dir, self._rows(self._last_grew_s))
                 self._lines = len(self._last_grew_s)

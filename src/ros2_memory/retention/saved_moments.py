@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 REPAIRED_WITHIN_NS: Final[Ns] = 600 * NS_PER_S
 """For so long a moment waits for a bag that a crash left open: its repair makes another file."""
 LONGEST_WAIT_NS: Final[Ns] = 2 * 3600 * NS_PER_S
-"""No split stays open for longer, unless another program writes it, or clocks differ."""
+"""No split stays open for longer, unless another program writes it, or clocks differ. For so long
+a link is tried again that the disk refuses."""
 
 SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S
 """A shorter time without a bag is not worth a sentence."""
@@ -193,6 +194,7 @@ class MomentKeeper:
         self._own = own
         self._queue = RequestQueue(bag_dir)
         self._links = HardLinks(bag_dir)
+        self._refused: set[Path] = set()  # moments of which the disk refused a link
         # Until the first call of `keep` shows that nothing is pending.
         self._waiting = True
 
@@ -330,13 +332,23 @@ class MomentKeeper:
     def _advance(
         self, before: StoredMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment:
-        """Continues a pending moment; its file lists what cannot be kept."""
+        """Continues a pending moment; its file lists what cannot be kept.
+
+        Where the disk refuses a link, as when it is full, the moment waits and it is tried again.
+        """
         need = self._needed(before.moment.request, snapshot)
         share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
             after = _linked(before, need, *self._link(before.folder, need.bags, share))
         except OSError as error:
-            after = _linked(before, need, [f"not all can be saved: {error.strerror or error}"], {})
+            reason = error.strerror or str(error)
+            if abs(self._clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
+                if before.folder not in self._refused:
+                    _log.error("moment_not_followed", path=str(before.folder), reason=reason)
+                self._refused.add(before.folder)
+                return before
+            after = _linked(before, need, [f"not all can be saved: {reason}"], {})
+        self._refused.discard(before.folder)
         if after.moment != before.moment:
             try:
                 write_saved_moment(after.folder, after.moment)

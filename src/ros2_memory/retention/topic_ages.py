@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import time
 from collections import Counter, defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -221,6 +222,8 @@ class TopicCutter:
         expired = self._expired()
         losses = [Loss(one.topic, one.first, one.last + 1, one.count, "expired") for one in going]
         EXPIRED.write(self._bag_dir, expired.then(bag, losses))
+        receipt = receipts.get(bag)
+        is_shipped = receipt is not None and receipt.size == before.st_size
         try:
             with rewritten(
                 self._bag_dir,
@@ -230,15 +233,18 @@ class TopicCutter:
                 takes=lambda topic, _logged, _published: topic in cut.topics,
                 expected=gone,
                 left_of=left,
-            ):
-                pass
+            ) as new:
+                # Before the bag is smaller: else `ship` would take what went out of the lake, too.
+                if receipt is not None and is_shipped:
+                    shipped = replace(receipt, size=new.stat().st_size)
+                    SHIPPED.append(self._bag_dir, [shipped])
         except (EpisodicError, OSError):
             EXPIRED.write(self._bag_dir, expired)
+            if receipt is not None and is_shipped:
+                with suppress(OSError):
+                    SHIPPED.append(self._bag_dir, [receipt])
             raise
         counts.left.update(left)
-        receipt = receipts.get(bag)
-        if receipt is not None and receipt.size == before.st_size:
-            SHIPPED.append(self._bag_dir, [replace(receipt, size=path.stat().st_size)])
         return gone
 
     def _expired(self) -> Expired:

@@ -51,6 +51,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
+from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.retention.repair import left_in, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
@@ -116,6 +117,7 @@ class Screening:
     ) -> None:
         self._monotonic = monotonic
         self._retry_s: dict[Path, float] = {}
+        self._failing = FailingFiles(monotonic)
         self._bag_dir = bag_dir
         self._rules = tuple(rules)
         self._reader = reader
@@ -185,8 +187,9 @@ class Screening:
         """Reads closed files, and releases those that can be released.
 
         Raises:
-            BagUnreachableError: the disk fails; the next step tries again.
-            OSError: likewise, or the state cannot be written, and nothing more is released.
+            BagUnreachableError: the disk fails to read a bag, and may recover; the next step tries
+                again.
+            OSError: the disk fails, or the state cannot be written, and nothing more is released.
         """
         with self._lock:
             before = self._loaded()
@@ -265,9 +268,9 @@ class Screening:
                 self._problems |= {f"{name}/{each.name}": str(error) for each in waiting}
                 self._retry_s[path] = now_s + RETRY_S
                 return found, False
-            except BagUnreachableError:
-                raise
             except BagError as error:
+                if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
+                    raise
                 _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
                 self._report(path, error)

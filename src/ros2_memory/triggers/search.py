@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import heapq
+import time
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.conditions import Condition, refusal_for
@@ -18,6 +19,7 @@ from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -129,6 +131,7 @@ class SplitSearch:
         reader: gives the messages that count, and decodes them.
         extractor: gives the values that conditions are tested on.
         rules: what to search for.
+        monotonic: a clock that never steps, in seconds.
     """
 
     def __init__(
@@ -136,7 +139,10 @@ class SplitSearch:
         reader: BagReader,
         extractor: SchemaExtractor,
         rules: Sequence[Rule],
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
+        self._failing = FailingFiles(monotonic)
         self._reader = reader
         self._extractor = extractor
         self._rules = [rule for rule in rules if rule.topic is not None]
@@ -152,7 +158,8 @@ class SplitSearch:
         searched.
 
         Raises:
-            BagUnreachableError: the disk fails; the state is useless then.
+            BagUnreachableError: the disk fails to read a bag, and may recover; the state is
+                useless then.
         """
         for rule in self._rules:
             record = state.rules.setdefault(rule.name, RuleRecord())
@@ -262,9 +269,9 @@ class SplitSearch:
                 (_Event(time, topic, part.recording, None) for time, topic in sorted(times)),
                 key=lambda event: event.time,
             )
-        except BagUnreachableError:
-            raise
         except BagError as error:
+            if isinstance(error, BagUnreachableError) and self._failing.may_recover(bag.path):
+                raise
             problem = f"not all could be searched: {bag.path.name}: {error.reason}"
             for rule in {rule.name for rules in watched.values() for rule in rules}:
                 state.rules[rule].problem = problem

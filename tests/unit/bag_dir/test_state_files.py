@@ -27,10 +27,16 @@ from ros2_memory.bag_dir.state_files import (
     RECORDED,
     SCREENED,
     SHIPPED,
+    SUPERSEDED,
     TRIGGERS,
+    ConditionInterval,
+    Erasure,
     Forgetting,
     Loss,
     Receipt,
+    RecordingScreen,
+    ScreenState,
+    Superseded,
     append_losses,
     append_receipts,
     read_deleted,
@@ -261,7 +267,6 @@ class TestDocuments:
             ('{"format": []}', "only 1 is known"),
             ('{"format": 1, "topics": 7, "rules": 7, "recordings": 7}', r"^\w+: "),
             (b"\xff", "utf-8"),
-            (" " * (2 << 20), "larger than"),
         ],
     )
     def test_a_damaged_or_newer_one_is_told(
@@ -270,6 +275,14 @@ class TestDocuments:
         laid(tmp_path, document, text)
         laid(tmp_path, document, content)
         with pytest.raises(ValueError, match=told):
+            document.read(tmp_path)
+
+    def test_one_that_is_too_long_is_told(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, document: Document, text: str
+    ) -> None:
+        laid(tmp_path, document, text)
+        monkeypatch.setattr(document, "_most_bytes", len(text.encode()) - 1)
+        with pytest.raises(ValueError, match="larger than"):
             document.read(tmp_path)
 
     def test_the_other_program_may_read_it_whatever_the_umask(
@@ -282,6 +295,27 @@ class TestDocuments:
         finally:
             os.umask(before)
         assert stat.S_IMODE(path.stat().st_mode) == 0o644
+
+
+T0 = 1_790_000_000 * 10**9
+WEEK = [f"rec_20261120T{n // 60:06}Z/rec_20261120T{n // 60:06}Z_{n}.mcap" for n in range(60_000)]
+FLICKER = [ConditionInterval(T0 + n, T0 + n, bool(n % 2)) for n in range(20_000)]
+
+
+@pytest.mark.parametrize(
+    ("document", "value"),
+    [
+        (ERASING, Erasure(("/camera",), ((T0, T0 + 1),), files=(*WEEK,))),
+        (SUPERSEDED, Superseded({}, dict.fromkeys(WEEK, "memory/20261120.thinned.mcap"))),
+        (SCREENED, ScreenState({"rec_A": RecordingScreen(heard={"privacy": FLICKER})})),
+    ],
+    ids=name_of,
+)
+def test_what_a_week_of_bags_or_a_condition_that_flickers_makes_is_read_back(
+    tmp_path: Path, document: Document, value: object
+) -> None:
+    document.write(tmp_path, value)
+    assert document.read(tmp_path) == value
 
 
 def test_a_file_is_read_again_once_it_has_changed_and_not_before(

@@ -231,11 +231,15 @@ def test_a_moment_that_is_kept_meanwhile_follows(
     assert traces(tmp_path, SAID) == []
 
 
-def test_a_hard_link_elsewhere_is_named(tmp_path: Path, bag_dir: Path, capsys: Capture) -> None:
+def test_a_hard_link_elsewhere_is_named_and_holds_nothing_up(
+    tmp_path: Path, bag_dir: Path, capsys: Capture
+) -> None:
     os.link(bag_dir / "rec_a" / "rec_a_1.mcap", tmp_path / "copy.mcap")
     assert forget(0, 100, "--topic", CAMERA) == 1
     assert "rec_a_1.mcap: all of it is still in 1 more hard link of it" in capsys.readouterr().out
     assert traces(bag_dir, SAID) == []
+    # While it is there, no bag is shipped, none leaves a day, and no topic is cut out of one.
+    assert ERASING.read(bag_dir) is None
 
 
 def test_counts_follow(bag_dir: Path) -> None:

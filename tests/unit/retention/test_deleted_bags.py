@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 from typing import TYPE_CHECKING, Any
 
@@ -160,6 +161,25 @@ def test_the_list_stays_short_however_long_the_robot_runs(
     assert (tmp_path / DELETED_FILE).stat().st_size < 21_000
     assert read_deleted(tmp_path)["here"].files == ("here_0.mcap",)
     assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [-50, 0, 7500]
+
+
+def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 300)
+
+    def failing(_: Path) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    for n in range(4):
+        at = T0 + n * 100 * S
+        with monkeypatch.context() as patched:
+            patched.setattr(DELETED, "rows", failing)
+            append_deleted(tmp_path, [deleted_of(f"rec_{n}", [("a_0.mcap", at, at + 9 * S)])])
+    assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [0, 100, 200, 300]
+    append_deleted(tmp_path, [deleted_of("rec_4", [("a_0.mcap", at + 100 * S, at + 109 * S)])])
+    assert [*read_deleted(tmp_path)] == [""]
+    assert len(deleted_spans(tmp_path)) == 5
 
 
 def test_a_split_in_which_the_clock_was_set_shows_no_time(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -18,6 +19,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import copied, files_in, keeper_of, reader_of_both
+from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import memory_of
 from tests.support.noting_reader import fail_reading
 from tests.support.shared_bags import RECORDED, needs_recorded
@@ -273,11 +275,57 @@ class TestTheBagOfCarriedMessages:
         at_home(tmp_path, splits=4)
         now = SettableClock(0)
         keeper = keeper_of(tmp_path, max_bytes=1, monotonic=lambda: now.now() / S)
-        keeper.apply()
-        assert (tmp_path / "rec" / "rec_0.mcap").exists()
-        now.at = 86_401 * S
+        for hour in range(24):
+            now.at = hour * 3600 * S
+            keeper.apply()
+            assert (tmp_path / "rec" / "rec_0.mcap").exists()
+        now.at = 86_400 * S
         keeper.apply()
         assert not (tmp_path / "rec" / "rec_0.mcap").exists()
+
+    def test_a_bag_that_failed_for_a_moment_days_ago_is_not_given_up_at_once(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        failing = set[str]()
+        too_many = BagUnreachableError("b_0.mcap", "it cannot be opened: Too many open files")
+        fail_reading(
+            monkeypatch, "records", lambda path: too_many if path.name in failing else None
+        )
+        now = SettableClock(0)
+        for nth, name in enumerate("abcd"):
+            start = T0 + nth * 10 * S
+            latched = [frame(start, name, 0.1)] if name in "ab" else []
+            recording(tmp_path, name, [*latched, *drive(start + S, start + 10 * S)])
+        size = (tmp_path / "a" / "a_0.mcap").stat().st_size
+        keeper = keeper_of(tmp_path, max_bytes=3 * size + 1000, monotonic=lambda: now.now() / S)
+
+        def passed(*, fails: bool) -> list[str]:
+            failing.update(["b_0.mcap"] if fails else ())
+            keeper.apply()
+            failing.clear()
+            return sorted(path.parent.name for path in tmp_path.rglob("*_0.mcap"))
+
+        assert passed(fails=True) == ["a", "b", "d"]
+        recording(tmp_path, "e", drive(T0 + 40 * S, T0 + 50 * S))
+        assert passed(fails=False) == ["b", "d", "e"]
+        now.at = 2 * 86_400 * S
+        recording(tmp_path, "f", drive(T0 + 50 * S, T0 + 60 * S))
+        assert "b" in passed(fails=True)
+        recording(tmp_path, "g", drive(T0 + 60 * S, T0 + 70 * S))
+        assert "b" not in passed(fails=False)
+        assert [each.log_time for each in records(tmp_path)] == [T0, T0 + 10 * S]
+
+    def test_what_lies_behind_a_damaged_part_of_a_bag_is_carried(self, tmp_path: Path) -> None:
+        recording(tmp_path, "rec", (), drive(T0 + 10 * S, T0 + 20 * S))
+        lost, left = frame(T0, "laser", 0.1), frame(T0 + 8 * S, "camera", 0.2)
+        damaged = write_mcap(
+            tmp_path / "rec" / "rec_0.mcap",
+            [lost, *drive(T0 + S, T0 + 8 * S), left],
+            replace(LAYOUT, chunk_size=400),
+        )
+        spoil_chunk(damaged, 0)
+        keep_only(tmp_path, "rec/rec_1.mcap")
+        assert [each.log_time for each in records(tmp_path)] == [T0 + 8 * S]
 
     @pytest.mark.parametrize("kind", [BagError, BagUnreachableError])
     def test_what_is_carried_is_not_replaced_while_it_cannot_be_read(

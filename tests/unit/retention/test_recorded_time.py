@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import errno
 import json
-from pathlib import Path
+from typing import TYPE_CHECKING, Never
 
 import pytest
 import structlog
 
+from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.log_lines import with_checks
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
 
 S = 10**9
 T0_S = 1_790_000_000.0
@@ -212,6 +218,35 @@ def test_a_link_in_place_of_its_folder_or_file_is_not_followed(tmp_path: Path) -
     recorded(RecordedTime(bag_dir), "b", 200)
     assert [path.name for path in elsewhere.iterdir()] == ["recorded.jsonl"]
     assert (elsewhere / "recorded.jsonl").read_text().count("\n") == 1
+
+
+def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folders(tmp_path, "a", "b", "c")
+    end = recorded(RecordedTime(tmp_path), "gone", 1000)
+    recorded(RecordedTime(tmp_path), "a", 100, since_s=end)
+    before = (tmp_path / FILE).read_text()
+
+    def failing(_: Path) -> Iterator[Never]:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    time = RecordedTime(tmp_path)
+    with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+        patched.setattr(RECORDED, "lines", failing)
+        end = recorded(time, "b", 200)
+        assert time.since("ab") == {"a": 0, "b": 0}
+        assert time.doubtful("ab") == {"a", "b"}
+        assert (tmp_path / FILE).read_text() == before
+    assert [each["event"] for each in captured] == [
+        "recorded_time_not_read",
+        "recorded_time_not_kept",
+    ]
+    recorded(time, "c", 100, since_s=end)
+    for each in (time, RecordedTime(tmp_path)):
+        found = each.since("abc")
+        assert found["a"] == pytest.approx(300 * S, abs=60 * S)
+        assert found["b"] == pytest.approx(100 * S, abs=60 * S)
 
 
 @needs_mounts

@@ -229,6 +229,35 @@ class TestOpenBags:
         assert "retention.max_moments_gb" in reported["missing"][0]
         assert len(in_moments(tmp_path)) == 2
 
+    @pytest.mark.parametrize("stays_full", [False, True])
+    def test_a_disk_that_is_full_when_a_split_closes_costs_nothing_unless_it_stays_so(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, stays_full: bool
+    ) -> None:
+        recording(tmp_path, A, 0, splits=2)
+        clock = SettableClock(T0 + 19 * S)
+        house = house_of(tmp_path, clock=clock)
+        kept(house, tmp_path, 0, 25, at=clock.at)
+        bag(tmp_path / A / f"{A}_2.mcap", 20)
+
+        def full(*_: object, **__: object) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
+            patched.setattr(os, "link", full)
+            for second in (26, 86):
+                clock.at = T0 + second * S
+                house.keep_moments()
+                assert told_of(tmp_path)["pending"] is True
+            if stays_full:
+                clock.at += LONGEST_WAIT_NS
+                house.keep_moments()
+        told = [each for each in captured if each["event"] == "moment_not_followed"]
+        assert [each["reason"] for each in told] == ["No space left on device"]
+        house.keep_moments()
+        missing = ["not all can be saved: No space left on device"]
+        assert told_of(tmp_path)["missing"] == (missing if stays_full else [])
+        assert len(in_moments(tmp_path)) == (2 if stays_full else 3)
+
     def test_a_bag_that_a_crash_left_open_is_kept_when_it_is_repaired(self, tmp_path: Path) -> None:
         recording(tmp_path, A, 0, splits=1)
         bag(tmp_path / A / f"{A}_1.mcap", 10, McapLayout(chunk_size=400, finish=False))

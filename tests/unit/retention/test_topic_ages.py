@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import tracemalloc
 from collections import Counter
@@ -17,11 +18,18 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import correct
-from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses, unshipped
+from ros2_memory.bag_dir.state_files import (
+    SHIPPED,
+    Receipt,
+    append_receipts,
+    read_losses,
+    unshipped,
+)
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention import repair
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.retention.topic_ages import PATIENCE_S, TopicAge, TopicCutter
 from ros2_memory.storage.base import BagWriter
@@ -294,6 +302,29 @@ def test_bags_wait_until_they_are_shipped_and_count_as_shipped_afterwards(bag_di
     house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert ["/speech" in counts_of(path) for path in old] == [False, True]
     assert unshipped(bag_dir, [(receipt.bag, old[0].stat().st_size)]) == frozenset()
+
+
+@pytest.mark.parametrize("step", ["receipt", "new name"])
+def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    path = bag_dir / "rec_A" / "rec_A_0.mcap"
+    receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
+    append_receipts(bag_dir, [receipt])
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
+    with monkeypatch.context() as patched:
+        patched.setattr(owner, name, full)
+        house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    assert counts_of(path)["/speech"] == 10
+    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
+    assert read_losses(bag_dir, MIN_NS, MAX_NS) == []
+    house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
+    assert "/speech" not in counts_of(path)
+    assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
 
 
 def test_a_damaged_list_of_what_went_is_named_and_replaced(bag_dir: Path) -> None:

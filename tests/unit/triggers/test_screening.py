@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, excluded_between, read_gate
-from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
 from ros2_memory.storage.mcap.writer import McapWriter
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
+from tests.support.noting_reader import fail_reading
 from tests.support.screened_bags import (
     LATCHED,
     T0,
@@ -259,6 +260,26 @@ class TestFaults:
         assert bags.seconds() == halves(0, 9)
         assert f"{name}_1.mcap" in (bags.screening.problem() or "")
         assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
+
+    def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        bags = ScreenedBags(tmp_path / "bags")
+        name = bags.begin(0)
+        bags.split(name, [mode(-2, value=False), *words(0, 10)])
+        bad = bags.split(name, [mode(10, value=False), *words(10, 20)])
+        bags.split(name, [mode(20, value=False), *words(20, 30)])
+        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+        fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
+        bags.live.clear()
+        for _ in range(24):
+            with pytest.raises(BagUnreachableError):
+                bags.step()
+            assert bags.served() == []
+            bags.now_s += 3540
+        bags.end()
+        assert [path.name for path in bags.served()] == [f"{name}_0.mcap", f"{name}_2.mcap"]
+        assert f"{bad.name}: it cannot be opened" in (bags.screening.problem() or "")
 
     def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(
         self, tmp_path: Path

@@ -11,8 +11,10 @@ from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import TRIGGERS_FILE
 from ros2_memory.bag_dir.state_files import TRIGGERS
+from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.retention import saved_moments
 from tests.support.bags import McapLayout, Msg, boolean, text
+from tests.support.noting_reader import fail_reading
 from tests.support.watched_bags import RESTART, SILENT, T0, S, WatchedBags, flag, rule
 
 if TYPE_CHECKING:
@@ -302,6 +304,42 @@ class TestFaults:
         robot.look()
         assert robot.spans() == [(1, 9)]
         assert (robot.record().fired, robot.record().moments) == (1, 1)
+
+    def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot = watched(tmp_path)
+        robot.begin(T0)
+        bad = robot.split(seconds(0, 10, {2}))
+        robot.split(seconds(10, 20, {16}))
+        robot.clock.at = T0 + 40 * S
+        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+        fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
+        robot.close_all()
+        assert robot.logged("moments_not_minded")
+        for hour in range(1, 25):
+            assert robot.spans() == []
+            robot.now_s = hour * 3600.0
+            robot.look()
+        assert robot.spans() == [(11, 19)]
+
+    def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
+
+        def failing(_: Path) -> None:
+            raise OSError(errno.EIO, "Input/output error")
+
+        monkeypatch.setattr(TRIGGERS, "read", failing)
+        robot.house = robot.new_house()
+        name = robot.begin(T0)
+        for begin in range(0, 50, 10):
+            robot.split(seconds(begin, begin + 10), name)
+        robot.split(seconds(500, 510), name)
+        robot.look()
+        assert [told["reason"] for told in robot.logged("moments_not_minded")]
+        assert len([*robot.bag_dir.glob("rec_*/*.mcap")]) == 4  # of 6; by age there would be one
 
     def test_a_state_that_is_damaged_is_said_to_be_lost(self, tmp_path: Path) -> None:
         robot = watched(tmp_path)

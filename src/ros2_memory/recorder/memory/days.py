@@ -31,7 +31,6 @@ from ros2_memory.bag_dir.state_files import (
     SUPERSEDED,
     Leaving,
     Superseded,
-    read_superseded,
 )
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
@@ -432,7 +431,9 @@ class MemoryDays:
         self._own.hold(self._folder, [path.name])
         name = str(path.relative_to(bag_dir))
         beside = self._write_beside(path, self._joined(path, records))
-        status, before = beside.stat(), read_superseded(bag_dir)
+        status, before = beside.stat(), Superseded()
+        with suppress(ValueError):  # a damaged list is replaced
+            before = SUPERSEDED.read(bag_dir) or before
         # Those that could not be deleted yet.
         left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
         listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}

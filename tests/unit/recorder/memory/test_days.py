@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import operator
 import shutil
@@ -18,9 +19,12 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 from starlette.datastructures import QueryParams
 
+from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE
+from ros2_memory.bag_dir.durable_write import read_small_file
+from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
@@ -108,6 +112,7 @@ def house(
     now: int,
     *,
     max_age_h: float = 10**6,
+    max_bytes: int = 10**15,
     memory: MemoryDays | None = None,
     monotonic: Callable[[], float] = time.monotonic,
 ) -> Housekeeping:
@@ -116,7 +121,7 @@ def house(
         BagDirReader(McapReader()),
         McapWriter(),
         SettableClock(now),
-        RetentionLimits(10**15, round(max_age_h * HOUR), keeps_foreign=True),
+        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=True),
         is_synchronised=lambda: True,
         split_duration_s=60.0,
         static_topics=("/tf_static",),
@@ -333,6 +338,28 @@ def test_what_stays_already_is_not_written_twice_and_hours_are_added(bag_dir: Pa
     both = messages_in(bag_dir / DAY_FILE)
     assert both[: len(first)] == first
     assert len(both) > len(first) + 60
+
+
+def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    days = days_of(bag_dir)
+    for name, second in (("rec_A", 0), ("rec_B", 7200)):
+        split(bag_dir, second, name=name)
+    own_all(bag_dir)
+    keep_all(days, bag_dir)
+
+    def failing(path: Path, *given: int) -> str:
+        if path.name == Path(SUPERSEDED_FILE).name:
+            raise OSError(errno.EMFILE, "Too many open files")
+        return read_small_file(path, *given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(json_files, "read_small_file", failing)
+        with pytest.raises(OSError, match="Too many"):
+            keep_all(days, bag_dir, "rec_B")
+    keep_all(days, bag_dir, "rec_B")
+    assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
 
 
 def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
@@ -641,6 +668,18 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
     assert len([*(bag_dir / "rec_A").glob("*.mcap")]) == 40
 
 
+def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_dir: Path) -> None:
+    for nth in range(10):
+        split(bag_dir, 60 * nth)
+    split(bag_dir, 7200, name="rec_B")
+    own_all(bag_dir)
+    sizes = [path.stat().st_size for path in bag_dir.rglob("*.mcap")]
+    memory = days_of(bag_dir, writer=Failing(0))
+    max_bytes = sum(sizes) - min(sizes) // 2
+    house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
+    assert len([*bag_dir.glob("rec_*/*.mcap")]) == 10
+
+
 def unreachable(path: Path) -> BagError | None:
     reason = "it cannot be opened: Too many open files"
     return BagUnreachableError(str(path), reason) if path.parent.name == "rec_A" else None
@@ -681,7 +720,7 @@ def test_what_the_disk_never_gives_holds_others_for_two_days_at_most(
     keeper.apply()
     assert not [*bag_dir.glob("memory/*.mcap")]
     # A day for its latched messages, then one for what stays of it.
-    for clock.at in (86_401 * S, 172_802 * S):
+    for clock.at in range(0, 172_802 * S, 3600 * S):
         keeper.apply()
     assert not [*bag_dir.glob("rec_[AC]/*.mcap")]
     [day] = bag_dir.glob("memory/*.mcap")
