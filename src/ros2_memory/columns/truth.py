@@ -198,10 +198,14 @@ class _LeafTest:
 
     @property
     def numbers(self) -> tuple[int | float, ...]:
-        """The numbers that are equal."""
+        """The numbers that are equal to a number of the leaf's kind."""
         if isinstance(self.test, Contains):
-            return self.test.equal.numbers if self.is_element else ()
-        return self.test.numbers if isinstance(self.test, Equals) else ()
+            equal = self.test.equal if self.is_element else None
+        else:
+            equal = self.test if isinstance(self.test, Equals) else None
+        if equal is None:
+            return ()
+        return equal.numbers if self.leaf.kind is Kind.REAL else equal.integers
 
     @property
     def is_needed(self) -> bool:

@@ -147,6 +147,8 @@ def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
     [
         (2**53 + 1, Equals(2**53 + 1), True),
         (2**53 + 1, Equals(float(2**53)), False),
+        (1_795_000_064, Equals(1_795_000_001), False),
+        (2**53, Equals(2**53 + 1), False),
         (2**53 + 1, Beyond(float(2**53), above=True), True),
         (2**63 - 1, Beyond(2.0**63, above=False), True),
         (2**63 - 1, Beyond(10**400, above=False), True),
