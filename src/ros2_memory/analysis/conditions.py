@@ -143,9 +143,9 @@ def _has_words(text: str, words: str) -> bool:
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    1 and 0 equal true and false. A number equals itself; a float also equals the number of which it
-    is the float32 rounding, since that is what such a field stores. Strings are compared without regard to case; one that
-    spells a boolean or a number equals that too, since planners put values in quotes.
+    1 and 0 equal true and false. A number equals itself, and a float that a float32 field stores of
+    it. Strings are compared without regard to case; one that spells a boolean or a number equals
+    that too, since planners put values in quotes.
     """
 
     value: Scalar
@@ -193,17 +193,27 @@ class Equals:
 
 @dataclass(frozen=True, slots=True)
 class Beyond:
-    """A number above or below a limit, the limit excluded; a boolean is no number."""
+    """A number above or below a limit, the limit excluded; a boolean is no number.
+
+    Excluded is also what a float32 field stores of the limit: 0.2 there is 0.2000000030.
+    """
 
     limit: int | float
     above: bool
 
+    @property
+    def stored(self) -> float:
+        """The limit as a float32 field stores it."""
+        return stored_as(self.limit)
+
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any number at any depth is on that side."""
+        stored = self.stored
         return any(
             leaf > self.limit if self.above else leaf < self.limit
             for leaf in leaves(value)
-            if isinstance(leaf, int | float) and not isinstance(leaf, bool)
+            if (isinstance(leaf, float) and leaf != stored)
+            or (isinstance(leaf, int) and not isinstance(leaf, bool))
         )
 
 
@@ -519,8 +529,8 @@ def _text_of(needle: Scalar) -> str | None:
 def stored_as(number: float) -> float:
     """Returns the number that a float32 field holds where this one was meant.
 
-    Itself where that is another number: from 24 bits on a float32 has no digits after the point, and
-    a Unix time would be that of a minute later.
+    Itself where that is another number: from 24 bits on a float32 has no digits after the point,
+    and a Unix time would be that of a minute later.
     """
     rounded = _float32(number)
     return number if rounded == 0.0 or _SINGLE_BELOW <= abs(number) < _EXACT_BELOW else rounded

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import (
@@ -172,10 +172,24 @@ def test_what_is_equal_to_a_text_contains_it(asked: str, value: JsonValue) -> No
 
 @given(st.floats(allow_nan=False), st.floats(allow_nan=False))
 def test_a_limit_is_not_part_of_either_side(limit: float, number: float) -> None:
+    assume(number != Beyond(limit, above=True).stored)
     assert Beyond(limit, above=True).matches([number]) == (number > limit)
     assert Beyond(limit, above=False).matches([number]) == (number < limit)
     assert not Beyond(limit, above=True).matches({"a": limit})
     assert not Beyond(limit, above=False).matches({"a": limit})
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.2, 0.7, 0.9, -0.8, 1.1, 36.6])
+def test_a_limit_as_a_float32_field_stores_it_is_not_part_of_either_side(limit: float) -> None:
+    stored = np.float32(limit)
+    for above in (True, False):
+        assert not Beyond(limit, above=above).matches({"percentage": float(stored)})
+        farther = np.nextafter(stored, np.float32(math.inf if above else -math.inf))
+        assert Beyond(limit, above=above).matches({"percentage": float(farther)})
+
+
+def test_an_integer_beside_a_limit_is_beyond_it() -> None:
+    assert Beyond(9_999_999.6, above=True).matches(10_000_000)
 
 
 @pytest.mark.parametrize("value", [True, None, "9", [], {}])
