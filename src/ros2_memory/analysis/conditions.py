@@ -45,6 +45,8 @@ _EXAMPLES: Final = {
     "below": 'condition_type "below", value 0.2, field "percentage"',
     "near_position": 'condition_type "near_position", value {"x": 1.5, "y": -0.2}',
 }
+_SINGLE_BELOW: Final = 2**24
+"""Whole numbers below this are float32s."""
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
 _SIDES: Final = {"above": True, "below": False}
@@ -141,9 +143,9 @@ def _has_words(text: str, words: str) -> bool:
 class Equals:
     """A boolean, number or string that some leaf of the value is equal to.
 
-    1 and 0 equal true and false. A number equals itself and its float32 rounding, which is what a
-    float32 field stores of it. Strings are compared without regard to case; one that spells a
-    boolean or a number equals that too, since planners put values in quotes.
+    1 and 0 equal true and false. A number equals itself, and a float that a float32 field stores of
+    it. Strings are compared without regard to case; one that spells a boolean or a number equals
+    that too, since planners put values in quotes.
     """
 
     value: Scalar
@@ -160,10 +162,15 @@ class Equals:
         return bool(meant) if meant is not None and meant in (0, 1) else None
 
     @cached_property
-    def numbers(self) -> tuple[int | float, ...]:
-        """The numbers that are equal."""
+    def integers(self) -> tuple[int | float, ...]:
+        """The number that an integer is equal to, if any."""
         meant = _meaning(self.value)
-        return () if meant is None else (meant, _float32(meant))
+        return () if meant is None else (meant,)
+
+    @cached_property
+    def numbers(self) -> tuple[int | float, ...]:
+        """The numbers that a float is equal to."""
+        return tuple(number for meant in self.integers for number in (meant, stored_as(meant)))
 
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any leaf at any depth is equal."""
@@ -179,23 +186,34 @@ class Equals:
         if isinstance(leaf, bool):
             return leaf is self.boolean
         if isinstance(leaf, int | float):
-            return any(leaf == number for number in self.numbers)
+            numbers = self.numbers if isinstance(leaf, float) else self.integers
+            return any(leaf == number for number in numbers)
         return isinstance(leaf, str) and leaf.casefold() == self.folded
 
 
 @dataclass(frozen=True, slots=True)
 class Beyond:
-    """A number above or below a limit, the limit excluded; a boolean is no number."""
+    """A number above or below a limit, the limit excluded; a boolean is no number.
+
+    Excluded is also what a float32 field stores of the limit: 0.2 there is 0.2000000030.
+    """
 
     limit: int | float
     above: bool
 
+    @property
+    def stored(self) -> float:
+        """The limit as a float32 field stores it."""
+        return stored_as(self.limit)
+
     def matches(self, value: JsonValue) -> bool:
         """Returns whether any number at any depth is on that side."""
+        stored = self.stored
         return any(
             leaf > self.limit if self.above else leaf < self.limit
             for leaf in leaves(value)
-            if isinstance(leaf, int | float) and not isinstance(leaf, bool)
+            if (isinstance(leaf, float) and leaf != stored)
+            or (isinstance(leaf, int) and not isinstance(leaf, bool))
         )
 
 
@@ -506,6 +524,16 @@ def _text_of(needle: Scalar) -> str | None:
         return json.dumps(needle)
     except ValueError:
         return None
+
+
+def stored_as(number: float) -> float:
+    """Returns the number that a float32 field holds where this one was meant.
+
+    Itself where that is another number: from 24 bits on a float32 has no digits after the point,
+    and a Unix time would be that of a minute later.
+    """
+    rounded = _float32(number)
+    return number if rounded == 0.0 or _SINGLE_BELOW <= abs(number) < _EXACT_BELOW else rounded
 
 
 def _float32(number: float) -> float:

@@ -198,10 +198,14 @@ class _LeafTest:
 
     @property
     def numbers(self) -> tuple[int | float, ...]:
-        """The numbers that are equal."""
+        """The numbers that are equal to a number of the leaf's kind."""
         if isinstance(self.test, Contains):
-            return self.test.equal.numbers if self.is_element else ()
-        return self.test.numbers if isinstance(self.test, Equals) else ()
+            equal = self.test.equal if self.is_element else None
+        else:
+            equal = self.test if isinstance(self.test, Equals) else None
+        if equal is None:
+            return ()
+        return equal.numbers if self.leaf.kind is Kind.REAL else equal.integers
 
     @property
     def is_needed(self) -> bool:
@@ -284,7 +288,7 @@ class _LeafTest:
         if isinstance(error, float) and error == 0.0:
             return Kept(passed, passed)
         near = np.isinf(error) | np.zeros(len(column), np.bool_)
-        for bound in (self.test.limit,) if isinstance(self.test, Beyond) else self.numbers:
+        for bound in self._bounds:
             with np.errstate(invalid="ignore"):  # infinity less infinity
                 near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
@@ -293,10 +297,20 @@ class _LeafTest:
         passed[among] = self._passed(exactly(among))
         return Kept(passed, passed)
 
+    @property
+    def _bounds(self) -> tuple[int | float, ...]:
+        """The numbers next to which the test comes out differently."""
+        if not isinstance(self.test, Beyond):
+            return self.numbers
+        return (self.test.limit, self.test.stored)
+
     def _passed(self, column: Numeric) -> Mask:
-        if isinstance(self.test, Beyond):
-            return beyond(column, self.test.limit, above=self.test.above)
-        return equal_to_any(column, self.numbers)
+        if not isinstance(self.test, Beyond):
+            return equal_to_any(column, self.numbers)
+        passed = beyond(column, self.test.limit, above=self.test.above)
+        if self.leaf.kind is Kind.REAL:
+            passed &= ~equal_to_any(column, (self.test.stored,))
+        return passed
 
     def _in_long_arrays(
         self, values: Values, level: Level, *, is_part: bool
@@ -334,7 +348,12 @@ class _LeafTest:
             perhaps |= is_rounded
         if isinstance(self.test, Beyond):
             limit, above = self.test.limit, self.test.above
-            surely = beyond(greatest - error if above else least + error, limit, above=above)
+            surely = np.logical_and.reduce(
+                [
+                    beyond(greatest - error if above else least + error, bound, above=above)
+                    for bound in (self._bounds if is_real else (limit,))
+                ]
+            )
             perhaps |= beyond(greatest + error if above else least - error, limit, above=above)
             perhaps |= is_real  # infinities are not among the finite ones
         for number in self.numbers:

@@ -28,6 +28,7 @@ from ros2_memory.counts.time_bins import TrueIntervals
 from ros2_memory.counts.values import count_values
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import reached
+from ros2_memory.history.held_values import held_at, held_until
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
@@ -150,7 +151,8 @@ def _by_events(
     parts, since = _events(view, topic, binned.counted)
     _note_limits(view, topic, parts)
     if wanted is not None:
-        return _flag_held(parts, condition, _gaps_of(binned, topic), wanted=wanted), since
+        before = _met_before(binned, topic, condition) if since is None else None
+        return _flag_held(binned, topic, parts, condition, before, wanted=wanted), since
     return _label_held(parts, condition), since
 
 
@@ -206,22 +208,51 @@ def _of_labels(visible: IntervalTable, condition: Condition) -> IntervalTable:
 
 
 def _flag_held(
+    binned: BinnedWindow,
+    topic: str,
     parts: Sequence[TopicEvents],
     condition: Condition,
-    gaps: Sequence[tuple[Ns, Ns]],
+    before: bool | None,
     *,
     wanted: bool,
 ) -> TrueIntervals | None:
-    """Returns when a boolean held; None where it is not clear which boolean is meant."""
+    """Returns when a boolean held; None where it is not clear which boolean is meant.
+
+    `before`: whether it held when the window began, where an earlier message says so.
+    """
+    start, end = binned.counted.asked()
     events = joined_events([part.without_sights() for part in parts])
-    if events is None:
-        return TrueIntervals.of([])
-    flags, toggles = events.of_kind(FLAG)
-    meant = [each for each in flags if condition.field in {None, each.name}]
-    if len(meant) != 1:
-        return None
-    spans = _spans_of(meant[0], toggles, events.last, wanted=wanted)
+    spans: list[tuple[Ns, Ns, bool]] = []
+    if events is not None:
+        flags, toggles = events.of_kind(FLAG)
+        meant = [each for each in flags if condition.field in {None, each.name}]
+        if len(meant) != 1:
+            return None
+        last = held_until(binned.view, topic, events.last, max(events.last, end))
+        spans += _spans_of(meant[0], toggles, last, wanted=wanted)
+        if before is not None and meant[0].first != wanted:
+            spans += [(start, meant[0].at, False)] if before else []
+        elif before is not None:
+            [(since, stop, _), *later] = spans
+            spans = [(start, stop, False) if before else (since, stop, True), *later]
+    elif before:
+        spans.append((start, end, False))
+    spans.sort()
+    gaps = _gaps_of(binned, topic)
     return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
+
+
+def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:
+    """Returns whether what a latched topic said last before the window meets a condition.
+
+    None where it said nothing that still held when the window began.
+    """
+    view = binned.view
+    held = held_at(view, topic, binned.counted.asked()[0])
+    message = None if held is None else view.bags.decode(held)
+    if held is None or message is None:
+        return None
+    return condition.matches(view.extractor.exact(message, held.type))
 
 
 def _spans_of(

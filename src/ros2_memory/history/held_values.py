@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
@@ -268,6 +269,32 @@ def _ends_of_clocks(view: View) -> Iterator[Ns]:
 def is_text(view: View, topic: str) -> bool:
     """Returns whether all messages of a topic are plain texts."""
     return set(view.timeline.types_of(topic)) == {TEXT}
+
+
+def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
+    """Returns until when what a message at `last` stated held, at most until `end`.
+
+    On a latched topic to its next message, or until nothing was recorded. On another one to its
+    next message, too, and not at all after `last` where that comes later than `SILENCE_NS`.
+    """
+    lasting = view.limits.latching.is_latched(view.snapshot, topic)
+    stop = end if lasting else last + SILENCE_NS
+    following = view.stream.first([topic], TimeWindow(last + 1, stop + 1))
+    if lasting:
+        gaps = [begin for begin, _ in view.gaps(TimeWindow(last, end + 1)) if begin >= last]
+        ends = [end, *gaps, *([] if following is None else [following.time])]
+        return max(last, min(ends))
+    return last if following is None else max(last, min(following.time, end))
+
+
+def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
+    """Returns the message before a moment that still held then, on a latched topic."""
+    if not view.limits.latching.is_latched(view.snapshot, topic):
+        return None
+    before = view.stream.first([topic], TimeWindow(MIN_NS, moment), newest_first=True)
+    if before is None or held_until(view, topic, before.time, moment) < moment:
+        return None
+    return before
 
 
 def holds_on(view: View, topics: Iterable[str]) -> bool:

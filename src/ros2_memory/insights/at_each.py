@@ -6,7 +6,7 @@ Each is answered as if it were asked alone.
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime, time, timedelta
+from datetime import date, datetime, time, timedelta
 from functools import wraps
 from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
 
@@ -165,7 +165,20 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     # The hours of the day before may go on after midnight.
     days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
     spans = [
-        TimeWindow(*(ns_from_unix(datetime.combine(*at).timestamp()) for at in ends_of_day))
+        TimeWindow(*(ns_from_unix(_moment(*at)) for at in ends_of_day))
         for ends_of_day in (((day, begins), (day + over, ends)) for day in days)
     ]
     return [part for span in spans if not (part := window.intersect(span)).empty]
+
+
+def _moment(day: date, at: time) -> float:
+    """Returns a local time of a day in Unix seconds; of one that clocks skip, when they do."""
+    local = datetime.combine(day, at)
+    # By the time before clocks are put forward, what is skipped is later than by that after.
+    low, high = local.replace(fold=1).timestamp(), local.timestamp()
+    while high - low > 1:
+        middle = (low + high) // 2
+        ahead = datetime.fromtimestamp(middle).astimezone().utcoffset()
+        is_before = ahead == datetime.fromtimestamp(low).astimezone().utcoffset()
+        low, high = (middle, high) if is_before else (low, middle)
+    return high

@@ -28,6 +28,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
+from ros2_memory.history.held_values import held_at, held_until
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -54,7 +55,7 @@ from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
@@ -123,7 +124,10 @@ def find_matches(
     elif is_spoken:
         rows = _of_texts(view, topics[0], condition, scope, shown)
     else:
-        rows = _of_matches(view, ReverseSearch(view, topic, condition), scope, shown, fields)
+        search = ReverseSearch(view, topic, condition)
+        rows = _of_matches(view, search, scope, shown, fields)
+        if not scope.is_bounded:
+            view.notes.add(*_held_before(view, search, window))
     elapsed = elapsed_in(view, rows.searched)
     sightings = tuple(_finished(each, elapsed, other) for each in rows.sightings)
     episodes = tuple(_finished(each, elapsed, other) for each in rows.episodes)
@@ -273,6 +277,18 @@ def read_sightings(
     return spans, spans[0][0] if found.is_over else None
 
 
+def _held_before(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
+    """Yields which latched topics met a condition when a window began, by an earlier message."""
+    start = window.asked()[0]
+    for topic in search.topics:
+        before = held_at(view, topic, start)
+        if before is not None and search.matches(before):
+            yield (
+                f"{topic} met this already when the window began: what it said at "
+                f"{unix_text(before.time)} holds until its next message"
+            )
+
+
 def _newest(view: View, run: Run) -> StoredMessage | None:
     """Returns the last match; None where its bag was deleted since."""
     at = TimeWindow(run.last, run.last + 1)
@@ -282,17 +298,18 @@ def _newest(view: View, run: Run) -> StoredMessage | None:
 def _until(view: View, run: Run, scope: Scope) -> Ns:
     """Returns until when a state lasted: to the message that says otherwise, or the window's end.
 
-    To its last match where a silence, or the end of a scope, is next; so does a log entry.
+    To its last match where a silence, or the end of a scope, is next; so does a log entry. What a
+    latched topic states lasts through silences.
     """
     last, until = run.last, run.until
     if view.timeline.is_log(run.topic):
         return last
-    if until is None:
-        after = TimeWindow(last + 1, last + SILENCE_NS + 1)
-        found = view.stream.first([run.topic], after)
-        until = last if found is None else found.time
-    until = max(last, min(until, scope.window.asked()[1]))
-    return until if until - last <= SILENCE_NS and scope.holds_at(until) else last
+    end = scope.window.asked()[1]
+    if until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
+        until = held_until(view, run.topic, last, end)
+    else:
+        until = max(last, min(until, end)) if until - last <= SILENCE_NS else last
+    return until if scope.holds_at(until) else last
 
 
 def _sighting(

@@ -8,13 +8,16 @@ metres.
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Line, Waypoint, drawn, mean_speed
 from ros2_memory.core.arrays import rows_of, stacked
-from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.geometry import yaw
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
@@ -22,7 +25,7 @@ from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.farthest import farthest_from
-from ros2_memory.places.pose_frames import placed_waypoints
+from ros2_memory.places.pose_frames import NEWEST_POSE_NS, newest_pose, placed_waypoints
 from ros2_memory.places.where import parse_where, times_in_region
 from ros2_memory.results import DrivenInside
 
@@ -31,11 +34,14 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.view import View
     from ros2_memory.places.robot_tracks import Inside
 
 _SPEED_NS: Final[Ns] = NS_PER_S
 """Over so long a speed is measured: what is shorter is noise."""
 _FEWEST_WAYPOINTS: Final = 2
+_TURNED_RAD: Final = math.radians(10.0)
+"""More than a robot turns between two poses."""
 
 
 def driven_inside(
@@ -70,6 +76,7 @@ def driven_inside(
     inside = times_in_region(view, region, window)
     totals = totals_inside(way.line, inside)
     waypoints = way_inside(way.line, inside, max_waypoints)
+    waypoints = tuple(_as_turned(view, name, way.line, each) for each in waypoints)
     elapsed = elapsed_in(view, window)
     spans = [(each.start, each.stop) for each in inside]
     duration = elapsed.among(spans)
@@ -146,6 +153,23 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     inside = stacked([_part(line, span) for span in spans])
     found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
     return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
+
+
+def _as_turned(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
+    """Returns a waypoint with the heading of the newest pose then, where it has quite another.
+
+    Between vertices a heading is one between theirs, and the robot may have turned meanwhile
+    without turning off its way.
+    """
+    if waypoint.yaw_rad is None or np.isin(waypoint.time, line.times):
+        return waypoint
+    window = TimeWindow(max(waypoint.time - NEWEST_POSE_NS, MIN_NS), waypoint.time + 1)
+    _, pose = newest_pose(view, topic, window) or (None, None)
+    turn = None if pose is None else pose.orientation
+    if turn is None:
+        return dataclasses.replace(waypoint, yaw_rad=None)
+    off = math.remainder(yaw(turn) - waypoint.yaw_rad, math.tau)
+    return dataclasses.replace(waypoint, yaw_rad=yaw(turn)) if abs(off) > _TURNED_RAD else waypoint
 
 
 def _part(line: Line, span: Inside) -> Line:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import (
@@ -115,6 +115,11 @@ def test_what_a_value_contains_is_in_all_that_it_is_in(
         *((number, [number], True) for number in (0.9, 1e300, -1e300, 10**400, 1e-320, math.inf)),
         (0.9, 0.9000001, False),
         (2**53 + 1, 2**53 + 2, False),
+        # What a float32 would hold of it is another number.
+        *((1_795_000_001, {"order": other}, False) for other in (1_795_000_064, 1_795_000_064.0)),
+        *((2**53 + 1, other, False) for other in (2**53, 2**53 + 2)),
+        (9_999_999.6, 10_000_000, False),
+        (1e-50, 0.0, False),
         (1e300, math.inf, False),
         *(("docked", {"state": held}, True) for held in ("docked", "Docked", "DOCKED")),
         ("DOCKED", {"state": "docked"}, True),
@@ -143,7 +148,9 @@ def test_a_boolean_equals_no_other_number(asked: bool, number: float) -> None:
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False), st.floats(-1e-9, 1e-9))
 def test_a_number_equals_what_a_float32_field_stores_of_it(held: float, nudge: float) -> None:
     asked = held * (1 + nudge)
-    assert Equals(asked).matches(float(np.float32(asked)))
+    stored = float(np.float32(asked))
+    is_meant = stored != 0 and not 2**24 <= abs(asked) < 2**53
+    assert Equals(asked).matches(stored) is (is_meant or stored == asked)
 
 
 @given(asked_scalars)
@@ -165,10 +172,24 @@ def test_what_is_equal_to_a_text_contains_it(asked: str, value: JsonValue) -> No
 
 @given(st.floats(allow_nan=False), st.floats(allow_nan=False))
 def test_a_limit_is_not_part_of_either_side(limit: float, number: float) -> None:
+    assume(number != Beyond(limit, above=True).stored)
     assert Beyond(limit, above=True).matches([number]) == (number > limit)
     assert Beyond(limit, above=False).matches([number]) == (number < limit)
     assert not Beyond(limit, above=True).matches({"a": limit})
     assert not Beyond(limit, above=False).matches({"a": limit})
+
+
+@pytest.mark.parametrize("limit", [0.1, 0.2, 0.7, 0.9, -0.8, 1.1, 36.6])
+def test_a_limit_as_a_float32_field_stores_it_is_not_part_of_either_side(limit: float) -> None:
+    stored = np.float32(limit)
+    for above in (True, False):
+        assert not Beyond(limit, above=above).matches({"percentage": float(stored)})
+        farther = np.nextafter(stored, np.float32(math.inf if above else -math.inf))
+        assert Beyond(limit, above=above).matches({"percentage": float(farther)})
+
+
+def test_an_integer_beside_a_limit_is_beyond_it() -> None:
+    assert Beyond(9_999_999.6, above=True).matches(10_000_000)
 
 
 @pytest.mark.parametrize("value", [True, None, "9", [], {}])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from random import Random
 from typing import TYPE_CHECKING
 
@@ -147,6 +148,8 @@ def met(condition: Condition, type_name: str, *messages: object) -> list[bool]:
     [
         (2**53 + 1, Equals(2**53 + 1), True),
         (2**53 + 1, Equals(float(2**53)), False),
+        (1_795_000_064, Equals(1_795_000_001), False),
+        (2**53, Equals(2**53 + 1), False),
         (2**53 + 1, Beyond(float(2**53), above=True), True),
         (2**63 - 1, Beyond(2.0**63, above=False), True),
         (2**63 - 1, Beyond(10**400, above=False), True),
@@ -163,6 +166,19 @@ def test_integers_are_compared_exactly(
 ) -> None:
     kind = "std_msgs/msg/Int64"
     assert met(Condition(condition, "value"), kind, make(kind, data=value)) == [expected]
+
+
+@pytest.mark.parametrize("limit", [0.2, 0.7])
+def test_a_limit_is_not_beyond_itself_in_a_float32(limit: float) -> None:
+    kind, scans = "std_msgs/msg/Float32", "sensor_msgs/msg/LaserScan"
+    scan = message(scans, Random(3), is_odd=False)
+    scan.ranges = np.full(100, limit, np.float32)  # type: ignore[attr-defined]
+    for above, farther in ((True, 0.01), (False, -0.01)):
+        condition = Condition(Beyond(limit, above=above), "value")
+        both = (make(kind, data=limit), make(kind, data=limit + farther))
+        assert met(condition, kind, *both) == [False, True]
+        long = ColumnCondition(replace(condition, field="ranges"), EXTRACTOR)
+        assert not long.truth(drawn_of(scans, [scan]).table).surely.any()
 
 
 def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:

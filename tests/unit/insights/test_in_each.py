@@ -185,3 +185,28 @@ def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> Non
         assert json.dumps(reply).count("the positions are noisy") == 1
         sums = [row["path_sum_m"] for row in reply.get("windows", ())]
         assert len({*sums}) == len(sums)
+
+
+@pytest.mark.parametrize(
+    ("hours", "begins", "ends"),
+    [
+        ("02:30-03:30", "03:00", "03:30"),
+        ("01:30-02:15", "01:30", "03:00"),
+        ("02:10-02:50", None, None),
+        ("03:00-02:30", "03:00", "00:00"),
+    ],
+)
+def test_hours_that_clocks_skip_are_left_out_of_those_asked_for(
+    hours: str, begins: str | None, ends: str | None
+) -> None:
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setenv("TZ", "Europe/Berlin")
+        time.tzset()
+        day = [int(datetime(2026, 3, at).timestamp()) for at in (29, 30)]  # noqa: DTZ001
+        found = hours_of_days(TimeWindow(day[0] * S, day[1] * S), *_as_hours(hours))  # type: ignore[misc]
+        shown = [
+            [time.strftime("%H:%M", time.localtime(at // S)) for at in (each.start, each.stop)]
+            for each in found
+        ]
+    time.tzset()
+    assert shown[-1:] == ([] if begins is None else [[begins, ends]])

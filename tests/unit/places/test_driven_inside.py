@@ -132,3 +132,20 @@ def test_a_jump_out_of_a_place_and_back_adds_nothing_to_what_few_poses_drove_ins
     reply = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", where=where, **span)
     assert reply["distance_m"] == pytest.approx(1.2, abs=0.05)
     assert reply["max_speed"] == pytest.approx(0.2, abs=0.05)
+
+
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of_a_place(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Drives 0.5 m/s along x, and turns 0.3 rad/s meanwhile, as a holonomic robot may."""
+    messages = [odom(BEGIN + n * S // 10, n / 20, 0.0, 0.03 * n) for n in range(900)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 90}
+    where = {"x": [15, 20], "y": [-1, 1]}
+    inside = asked(memory, tmp_path, "trajectory_summary", where=where, **window)
+    assert len(inside["waypoints"]) == 2
+    for each in inside["waypoints"]:
+        there = asked(memory, tmp_path, "get_position_at", timestamp=each["timestamp"])
+        assert each["yaw_deg"] == there["yaw_deg"]

@@ -1,0 +1,77 @@
+"""How long a state lasts that one message states, and no other message repeats."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.memories import asked, each_way, memory_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+S = 10**9
+T0 = 1_790_000_000 * S
+DOCKED, BUMPER = "/docked", "/bumper"
+TOGGLES = ((0, False), (100, True), (400, False), (700, True))
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path) -> Path:
+    """1000 s of a robot that says latched when it docks, and every 4 s whether it bumped."""
+    messages = [odom(T0 + at * S, 0.0, 0.0) for at in range(0, 1001, 2)]
+    messages += [boolean(T0 + at * S, value, DOCKED) for at, value in TOGGLES]
+    messages += [boolean(T0 + at * S, at >= 700, BUMPER) for at in range(0, 1001, 4)]
+    messages.sort(key=lambda each: each.log_time)
+    for nth in range(2):
+        some = [each for each in messages if (each.log_time - T0) // (600 * S) == nth]
+        layout = McapLayout(latched=frozenset({DOCKED}))
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", some, layout)
+    return tmp_path
+
+
+def matches(bag_dir: Path, topic: str, first: float, last: float, **more: object) -> Any:
+    given = {"topic": topic, "condition_type": "equals", "start": T0 / S + first, **more}
+    recalls = bool(given.pop("recalls"))
+    memory = memory_of(bag_dir, recalls=recalls)
+    return asked(memory, bag_dir, "find_matches", value=True, end=T0 / S + last, **given)
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("topic", "first", "last", "held", "began"),
+    [
+        (DOCKED, 0, 1000, 600, 2),
+        (DOCKED, 0, 900, 500, 2),
+        (DOCKED, 50, 350, 250, 1),
+        (DOCKED, 300, 900, 300, 1),
+        (DOCKED, 750, 950, 200, 0),
+        (DOCKED, 450, 650, 0, 0),
+        (BUMPER, 0, 902, 202, 1),
+        (BUMPER, 0, 703, 3, 1),
+    ],
+)
+def test_a_state_lasts_until_a_message_says_otherwise_or_to_the_end_of_the_window(
+    bag_dir: Path, topic: str, first: int, last: int, held: int, began: int, *, recalls: bool
+) -> None:
+    counted = matches(bag_dir, topic, first, last, by="day", recalls=recalls)
+    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    assert (whole["seconds"], whole["count"]) == (held, began)
+
+
+@each_way
+def test_a_sighting_of_a_latched_topic_lasts_as_long_as_what_it_states(
+    bag_dir: Path, *, recalls: bool
+) -> None:
+    found = matches(bag_dir, DOCKED, 0, 900, recalls=recalls)["sightings"]
+    assert [each["duration_s"] for each in found] == [200, 300]
+
+
+@each_way
+def test_what_held_already_when_the_window_began_is_noted(bag_dir: Path, *, recalls: bool) -> None:
+    inside = matches(bag_dir, DOCKED, 750, 950, recalls=recalls)
+    assert inside["sightings"] == []
+    assert "/docked met this already when the window began" in " ".join(inside["notes"])
+    assert "notes" not in matches(bag_dir, DOCKED, 450, 650, recalls=recalls)
