@@ -21,6 +21,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.scan import blocks, scan
+from ros2_memory.messages.to_json import round_real
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -53,9 +54,11 @@ class Held(NamedTuple):
 
     @property
     def value(self) -> JsonValue:
-        """The value; of a message that has one part alone, that."""
+        """The value, as replies round it; of a message that has one part alone, that."""
         value: JsonValue = json.loads(self.word)
-        return next(iter(value.values())) if isinstance(value, dict) and len(value) == 1 else value
+        if isinstance(value, dict) and len(value) == 1:
+            [value] = value.values()
+        return round_real(value) if isinstance(value, float) else value
 
     @property
     def is_blank(self) -> bool:

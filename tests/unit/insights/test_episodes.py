@@ -10,7 +10,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.history import held_values
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
-from tests.support.bags import McapLayout, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 
@@ -172,6 +172,21 @@ def test_changes_are_one_row_for_each_value_with_what_held_at_the_start(memory: 
     assert few["notes"][0].startswith("the first 2 of 3 changes: to continue")
     docked = ask(memory, "get_topic_in_range", topic="/docked", changes=True, **window)
     assert [row["value"] for row in docked["changes"]] == [False, True]
+
+
+def test_numbers_are_written_as_everywhere_else(tmp_path: Path) -> None:
+    """A float32 holds 0.10000000149011612 where 0.1 was meant."""
+    write_mcap(
+        tmp_path / "a" / "a_0.mcap", [battery((BEGIN + n) * S, n // 5 / 10) for n in range(15)]
+    )
+    given = {"topic": "/battery_state", "start": BEGIN, "end": BEGIN + 14, "fields": ["percentage"]}
+    for stored in (False, True):
+        memory = memory_of(tmp_path)
+        memory = with_store(memory, tmp_path) if stored else memory
+        reply = ask(memory, "get_topic_in_range", changes=True, **given)
+        assert [row["value"] for row in reply["changes"]] == [0, 0.1, 0.2]
+        reply = ask(memory, "get_topic_in_range", by="value", **given)
+        assert {row[0] for row in reply["rows"]} == {"0", "0.1", "0.2"}
 
 
 @pytest.mark.parametrize(
