@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
@@ -117,13 +118,16 @@ def known_things(
         QueryTimeoutError: the call's time is over before any bag was read.
     """
     latest = view.snapshot.latest
-    known = _known_until(view, min_score, spellings, MAX_NS)
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
-    if (known.crowded or known.since is None) and until <= (latest or until):
-        then = _known_until(view, min_score, spellings, until)
-        if known.reaches_back(window):
+    every = _Loader(view, min_score, spellings)
+    known = every.known() if every.reaches(window.start) else None
+    if (known is None or known.crowded or known.since is None) and until <= (latest or until):
+        then = _Loader(view, min_score, spellings, until).known()
+        if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
         known = then
+    elif known is None:
+        known = every.known()
     if known.crowded or known.until < MAX_NS:
         view.notes.complete &= known.reaches_back(window)
         others = "other" if known.until < MAX_NS else "older"
@@ -131,27 +135,6 @@ def known_things(
             f"things are known{known.reach} only: there are too many sightings to compare {others} "
             "ones, which find_matches finds"
         )
-    return known
-
-
-def _known_until(
-    view: View, min_score: float, spellings: Mapping[str, Sequence[str]], until: Ns
-) -> KnownThings:
-    """Returns the things that were seen before a time; remembers those of now and of one other."""
-    timeline, scanner = view.timeline, view.memory.columns
-    described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
-    key = (min_score, described, view.limits.map_frame, view.pose_topic)
-    own = ("things", until == MAX_NS, *key)
-    before = scanner.things.get(own)
-    if before is not None and before[0] is timeline:
-        known = before[1]
-        if isinstance(known, KnownThings) and known.until == until:
-            return known
-    noted = view.notes.added
-    known = _Loader(view, key, until).load(min_score, Labels(spellings))
-    is_read = known.since is None or known.crowded
-    if is_read and not view.call.used_active and view.notes.added == noted:
-        scanner.things.put(own, (timeline, known), 1)
     return known
 
 
@@ -173,24 +156,80 @@ class _TakesTooLongError(Exception):
 
 
 class _Loader:
-    """Gathers the sights of all bags of a view, the newest first.
+    """Gathers the sights of all bags of a view, the newest first, and estimates things by them.
+
+    What was found last is remembered for each timeline: of all sightings, and of those before one
+    other time.
 
     Args:
         view: has the bags.
-        key: tells estimates with other settings apart.
+        min_score: detections with a lower score do not count.
+        spellings: other spellings of labels, by the name to be shown.
         until: later sights are left out.
     """
 
-    def __init__(self, view: View, key: tuple[Hashable, ...], until: Ns) -> None:
+    def __init__(
+        self,
+        view: View,
+        min_score: float,
+        spellings: Mapping[str, Sequence[str]],
+        until: Ns = MAX_NS,
+    ) -> None:
+        described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
+        key = (min_score, described, view.limits.map_frame, view.pose_topic)
         self._view = view
-        self._key = ("most spots", *key)
+        self._min_score = min_score
+        self._labels = Labels(spellings)
         self._until = until
+        self._own = ("things", until == MAX_NS, *key)
+        self._key = ("most spots", *key)
         self._since: Ns | None = None
+        self._noted = view.notes.added
 
-    def load(self, min_score: float, labels: Labels) -> KnownThings:
-        """Returns the things in all that could be read, and compared in time."""
+    def reaches(self, moment: Ns) -> bool:
+        """Returns whether there are not too many sightings after a moment to compare them.
+
+        Raises:
+            QueryTimeoutError: as by `known`.
+        """
+        before = self._remembered
+        if before is not None:
+            return isinstance(before, KnownThings) or before <= moment
+        parts, crowded = self._gathered
+        since = parts[0][0].start if crowded else moment
+        if since > moment:
+            self._remember(since)
+        return since <= moment
+
+    def known(self) -> KnownThings:
+        """Returns the things in all that could be read, and compared in time.
+
+        Raises:
+            QueryTimeoutError: the call's time is over before any bag was read.
+        """
+        before = self._remembered
+        if isinstance(before, KnownThings) and before.until == self._until:
+            return before
+        found = self._made()
+        if found.since is None or found.crowded:
+            self._remember(found)
+        return found
+
+    @property
+    def _remembered(self) -> KnownThings | Ns | None:
+        """The things that are known, or since when there are too many sightings."""
+        before = self._view.memory.columns.things.get(self._own)
+        if before is None or before[0] is not self._view.timeline:
+            return None
+        return before[1] if isinstance(before[1], KnownThings | int) else None
+
+    def _remember(self, found: KnownThings | Ns) -> None:
+        if not self._view.call.used_active and self._view.notes.added == self._noted:
+            self._view.memory.columns.things.put(self._own, (self._view.timeline, found), 1)
+
+    def _made(self) -> KnownThings:
+        parts, crowded = self._gathered
         most = self._most_spots
-        parts, crowded = self._newest(most)
         if self._since is not None:
             self._view.notes.complete = False
             self._view.notes.add(
@@ -200,7 +239,7 @@ class _Loader:
         while True:
             begun_s = time.monotonic()
             try:
-                found = self._known(parts, min_score, labels, crowded=crowded)
+                found = self._known(parts, crowded=crowded)
             except _TakesTooLongError:
                 most = max(sum(map(_spots, parts)) // _FEWER, 1)
                 self._remember_most(most)
@@ -220,8 +259,10 @@ class _Loader:
         kept = self._view.timeline, most
         self._view.memory.columns.things.put(self._key, kept, 1)
 
-    def _newest(self, most: int) -> tuple[list[list[Stretch]], bool]:
-        """Returns the newest stretches, in order, and whether they have so many spots already."""
+    @cached_property
+    def _gathered(self) -> tuple[list[list[Stretch]], bool]:
+        """The newest stretches, in order, and whether they have as many spots as are compared."""
+        most = self._most_spots
         parts: list[list[Stretch]] = []
         until = self._view.call.partial_after(READING_S)
         spots = 0
@@ -240,9 +281,7 @@ class _Loader:
             self._since = parts[-1][0].start
         return parts[::-1], False
 
-    def _known(
-        self, parts: Sequence[Sequence[Stretch]], min_score: float, labels: Labels, *, crowded: bool
-    ) -> KnownThings:
+    def _known(self, parts: Sequence[Sequence[Stretch]], *, crowded: bool) -> KnownThings:
         """Returns the things in some stretches.
 
         Raises:
@@ -265,12 +304,12 @@ class _Loader:
             [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],
             [sessions[each.session] for each in stretches for _ in each.sights],
         )
-        found = estimate(sights, labels, of_slice, min_score, go_on)
+        found = estimate(sights, self._labels, of_slice, self._min_score, go_on)
         since = self._since
         if crowded:
             since = max(stretches[0].start, MIN_NS if since is None else since)
         has_map = bool(sights.topics) and 0 in epochs
-        return KnownThings(found, labels, names, since, has_map, crowded, self._until)
+        return KnownThings(found, self._labels, names, since, has_map, crowded, self._until)
 
     def _epochs(self, stretches: Sequence[Stretch]) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each stretch, and the frame of each epoch.
