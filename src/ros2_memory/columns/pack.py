@@ -65,8 +65,8 @@ if TYPE_CHECKING:
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
 FORMAT: Final = 18
-"""Version of the file. Raise it with every change of its tables, of their bytes, and of what the
-fragments in them follow from: only those of sights have a version of their own."""
+"""Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
+by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096
 LEVEL: Final = 4
 """Of zstd. A blob of 10 s takes 0.5 ms; level 1 half of that and 7 % more bytes, level 6 0.8 ms and

@@ -64,7 +64,7 @@ _LEAST_RATE: Final = 0.1
 """In looks with a hit, a cell that sees a place has one in as many of the messages, at least."""
 _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
-"""A cell of so many looks that has hits in less than this share of what others have is blocked."""
+"""A cell with so many looks is blocked if its share of hits is below this part of the others'."""
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
 

@@ -62,7 +62,7 @@ def with_synonyms(
         if not are_two(pair) and _alternate(sights.spots, counts, epoch, [of[key] for key in pair]):
             group = groups[pair[0]] | groups[pair[1]]
             groups |= dict.fromkeys(group, group)
-    # A name that is used for two things says of neither which it is.
+    # A name that is used for two things does not tell them apart.
     names = {
         group: None if any(map(are_two, combinations(sorted(group), 2))) else min(group)
         for group in {*groups.values()}
