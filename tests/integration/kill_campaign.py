@@ -100,6 +100,7 @@ class Campaign:
 
     terms: Terms
     robot_late_s: float = 0.0
+    recorder_late_s: float = 0.0
     t0: int = 0
     faults: list[Fault] = field(default_factory=list)
     subscribed: dict[str, int] = field(default_factory=dict)
@@ -201,6 +202,7 @@ def run_campaign(terms: Terms, folder: Path, real: RealRecorder | None) -> Campa
             recorder = _record(site, terms)
             recorder.wait_for_state(RecorderState.RECORDING)
             recorder.stop()
+            campaign.recorder_late_s = max(each.late_s for each in site.recorders)
             _look_back(campaign, site, served)
     return campaign
 

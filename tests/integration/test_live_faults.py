@@ -61,6 +61,7 @@ def _run(folder: Path, watch: Watch) -> Campaigns:
         found = {name: future.result() for name, future in running.items()}
     for name, campaign in found.items():
         watch.report(f"the robot of {name}", campaign.robot_late_s)
+        watch.report(f"the recorders of {name}", campaign.recorder_late_s)
     return Campaigns(watch, found)
 
 

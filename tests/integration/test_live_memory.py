@@ -152,6 +152,7 @@ def _drive(drive: Drive, site: Machine, served: dict[str, Served], robot: Robot)
     drive.watch.report("the robot", robot.late_s)
     for recorder in (drive.rotating, drive.killed, drive.ten):
         recorder.stop()
+        drive.watch.report("a recorder", recorder.late_s)
     _look_back(drive, served)
 
 

@@ -115,6 +115,7 @@ def drive_once(folder: Path, watch: Watch, real: RealRecorder | None) -> Drive:
         watch.report("the robot", robot.late_s)
         for name, recorder in drive.recorders.items():
             recorder.stop()
+            watch.report(f"the recorder of {name}", recorder.late_s)
             files = bag_files(recorder.bag_dir)
             drive.files[name] = len(files)
             drive.recorded[name] = ticks(files, drive.t0, HZ)

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 _POLLING_S: Final = 0.1
 _DRAINING_S: Final = 0.1
+_LATE_S: Final = 0.1
+"""Messages that are taken later than this are near to being overtaken by those behind them."""
 
 
 def record(options: Options, signals: Signals) -> None:
@@ -56,6 +58,7 @@ class _Recorder:
         self._regex = re.compile(options.regex)
         self._asked: dict[str, Any] = {}  # what was asked for, by subscribed topic
         self._warned: set[str] = set()
+        self._late_s = 0.0  # how long a message had to wait, at worst
         self._seeking = True
         self._name = options.node_name
         self._node = rclpy.create_node(
@@ -123,6 +126,8 @@ class _Recorder:
     def _end(self) -> None:
         self._log("Pausing recording.")
         self._drain()
+        if self._late_s > _LATE_S:
+            _say("warn", self._name, f"Messages were taken late, by {self._late_s:.2f} s at worst")
         self._bag.close()
         self._log("Event publisher thread: Exiting")
         self._log("Recording stopped")
@@ -195,6 +200,8 @@ class _Recorder:
         self._asked[topic] = asked
 
         def take(payload: bytes, info: dict[str, int]) -> None:
+            waited_s = (time.time_ns() - info["received_timestamp"]) / 1e9
+            self._late_s = max(waited_s, self._late_s)
             self._taken.put((topic, payload, info, self._node.get_clock().now().nanoseconds))
 
         def warn(event: Any) -> None:
