@@ -16,6 +16,7 @@ from ros2_memory import results
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Trajectory
 from ros2_memory.bag_dir.layout import is_thinned
+from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -86,6 +87,7 @@ from ros2_memory.history.view import (
     open_moment,
     open_span,
     open_view,
+    search_window,
 )
 from ros2_memory.index.clock_faults import FUTURE_NS, ClockFault
 from ros2_memory.index.listed_splits import describe_absent
@@ -103,7 +105,7 @@ from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import Extracted
@@ -467,12 +469,19 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
     return tuple(rows)
 
 
-def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
+def data_time_range(
+    memory: Memory, call: Call, start_s: float | None = None, end_s: float | None = None
+) -> results.DataTimeRange:
     """Returns what the memory spans, where it has gaps, and which files do not answer.
 
     Bags that a wrong clock dated are listed, and neither begin nor end the span or a gap in it.
+    Gaps, silences and steps of the clock are those that a window overlaps.
+
+    Raises:
+        InvalidArgumentsError: the bounds make no window.
     """
     now = memory.clock.now()
+    window = search_window(TimeRange(start_s, end_s), now)
     view = View(memory, call, now if memory.limits.now == "wall" else None)
     view.bags.track_all_sources()
     snapshot = view.snapshot
@@ -481,17 +490,16 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
     _note_odd_bags(view)
-    if snapshot.timeline.thinned:
-        view.notes.add("silences and steps of the clock within the days of memory/ are not known")
+    view.notes.add(*_describe_unshown(view))
     view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
     undecodable = undecodable_topics(view)
-    steps = clock_steps(view)
+    steps = clock_steps(view, window)
     return results.DataTimeRange(
         earliest=snapshot.dating.earliest,
         latest=snapshot.dating.latest,
         now=memory.now(now, snapshot.latest, call),
         bags=len(snapshot.bags),
-        gaps=gaps_with_deleted(view, view.gaps(TimeWindow.everything())),
+        gaps=gaps_with_deleted(view, view.gaps(window)),
         incomplete=left_open(snapshot),
         active=snapshot.active,
         damaged=snapshot.damaged,
@@ -500,9 +508,19 @@ def data_time_range(memory: Memory, call: Call) -> results.DataTimeRange:
         notes=view.notes.sentences(),
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
-        silences=tuple(silences_of(memory, snapshot)),
+        silences=tuple(
+            each for each in silences_of(memory, snapshot) if window.overlaps(each.start, each.end)
+        ),
         clock_steps=steps,
     )
+
+
+def _describe_unshown(view: View) -> Iterator[str]:
+    """Yields a sentence on days of `memory/` of which no more is known than their messages."""
+    thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
+    if thinned and (since is None or thinned[0].start < since):
+        before = "" if since is None else f" before {unix_text(since)}"
+        yield f"silences and steps of the clock within the days of memory/{before} are not known"
 
 
 def _newest_beside(

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 DAY_S: Final = 86_400
 _LATER_S: Final = 60
 """A robot's clock is set by some seconds in its first days."""
-_BOUNDED: Final = frozenset({"find_things", "find_matches", "visits"})
+_BOUNDED: Final = frozenset({"data_time_range", "find_things", "find_matches", "visits"})
 
 
 def write_later_days(

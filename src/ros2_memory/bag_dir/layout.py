@@ -49,6 +49,8 @@ CARRY_FOLDER: Final = "latched"
 CARRY_FILE: Final = "carried.mcap"
 _CARRIED: Final = f"/{CARRY_FOLDER}/{CARRY_FILE}"
 MEMORY_FOLDER: Final = "memory"
+THINNED_NAME: Final = "thinned.json"
+THINNED_FILE: Final = f"{MEMORY_FOLDER}/{THINNED_NAME}"
 MOMENTS_FOLDER: Final = "moments"
 MOMENT_FILE: Final = "moment.json"
 OWN_FOLDER: Final = ".episodic"
@@ -68,7 +70,7 @@ EXPIRED_FILE: Final = f"{OWN_FOLDER}/expired.json"
 
 OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""
-RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE})
+RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE, THINNED_NAME})
 """Files beside the bags of a recording, which mean nothing without them."""
 BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 """Suffixes of bag files, whichever adapter reads them."""

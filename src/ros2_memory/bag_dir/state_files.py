@@ -13,7 +13,8 @@
     triggers.json      the recorder: how far the rules of `recording.keep_when` know the recordings
 
 What is about to be deleted is written before it is, so a kill hides nothing. Elsewhere are
-`recordings.jsonl` (`own_recordings`), and the folder of requests (`moment_file`).
+`recordings.jsonl` (`own_recordings`), the folder of requests (`moment_file`), and, beside the days
+that it completes, `memory/thinned.json`.
 """
 
 from __future__ import annotations
@@ -47,8 +48,10 @@ from ros2_memory.bag_dir.layout import (
     SCREENED_FILE,
     SHIPPED_FILE,
     SUPERSEDED_FILE,
+    THINNED_FILE,
     TRIGGERS_FILE,
     has_own_name,
+    utc_day,
 )
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -291,6 +294,47 @@ SUPERSEDED: Final = JsonDocument(SUPERSEDED_FILE, Superseded, most_bytes=MOST_BY
 def read_superseded(bag_dir: Path) -> Superseded:
     """Returns the bags that no longer count; none where the file cannot be read."""
     return SUPERSEDED.current(bag_dir) or Superseded()
+
+
+# memory/thinned.json
+
+
+@dataclass(frozen=True, slots=True)
+class Thinned:
+    """What bags showed that days have in place of them, and that is in no message of a day.
+
+    Attributes:
+        since: log time from which on it is known; None: of no bag.
+        silences: of each the topic, its first and last log time, for how long (ns) the robot was
+            on in it, and whether it went on.
+        pauses: in which the clock may have been set forward; log times of the messages around.
+        set_back: when the clock was set back, and by how much (ns).
+        left_open: the last log time of each bag that a crash left open.
+    """
+
+    since: Int64 | None = None
+    silences: tuple[tuple[str, Int64, Int64, Int64, StrictBool], ...] = ()
+    pauses: tuple[tuple[Int64, Int64], ...] = ()
+    set_back: tuple[tuple[Int64, Int64], ...] = ()
+    left_open: tuple[Int64, ...] = ()
+
+    def from_day(self, day: str) -> Thinned:
+        """Returns what does not end before a day (UTC), as names have it."""
+        return Thinned(
+            self.since,
+            tuple(each for each in self.silences if utc_day(each[2]) >= day),
+            tuple(each for each in self.pauses if utc_day(each[1]) >= day),
+            tuple(each for each in self.set_back if utc_day(each[0]) >= day),
+            tuple(each for each in self.left_open if utc_day(each) >= day),
+        )
+
+
+THINNED: Final = JsonDocument(THINNED_FILE, Thinned, most_bytes=MOST_BYTES)
+
+
+def read_thinned(bag_dir: Path) -> Thinned:
+    """Returns what is known of bags that days stand for; nothing where the file cannot be read."""
+    return THINNED.current(bag_dir) or Thinned()
 
 
 # leaving.json

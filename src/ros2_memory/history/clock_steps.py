@@ -22,6 +22,7 @@ from ros2_memory.analysis.clock_steps import (
 from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
 from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
 from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
+from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.columns.table import Texts
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -34,6 +35,7 @@ from ros2_memory.history.no_data import seconds
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import scan
 from ros2_memory.index.clock_faults import FaultyClock
+from ros2_memory.index.holes import Pause
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.view import View
-    from ros2_memory.index.holes import Pause
 
 _MOST_SUSPECTS: Final = 32
 """The newest suspects are looked at; each costs some milliseconds."""
@@ -154,12 +155,17 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         for fault in view.snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
+    deleted = (ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back)
     found = (_step_in(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:])
-    return sorted([*steps, *filter(None, found)])
+    return sorted({*steps, *deleted, *filter(None, found)})
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
-    return [pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])]
+    """Returns the pauses that bags show in a window, and those that deleted bags showed."""
+    found = {pause[:2]: pause for pause in view.snapshot.suspects}
+    for start, end in read_thinned(view.bag_dir).pauses:
+        found.setdefault((start, end), Pause(start, end, (), ran_on=True))
+    return sorted(pause for pause in found.values() if window.overlaps(*pause[:2]))
 
 
 def _note_pauses(view: View, window: TimeWindow) -> None:

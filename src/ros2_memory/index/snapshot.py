@@ -144,8 +144,9 @@ class Snapshot:
         return tuple(silences(self._presences, together, self.gaps))
 
     def shortest_silence(self, topic: str) -> Ns:
-        """Returns how long a topic of `silences` must have no message to count as silent."""
-        return shortest_silence(usual_period(self._presences[topic]) or 0)
+        """Returns how long a topic must have no message to count as silent."""
+        presence = self._presences.get(topic)
+        return shortest_silence((presence and usual_period(presence)) or 0)
 
     def longest_silence(self, topic: str) -> Ns:
         """Returns for how long others were recorded, at most, between two messages of a topic.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.analysis.silences import Silence
+from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.text import MAX_NAMED, listed
@@ -41,11 +42,27 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
     """
     latching, bag_dir = memory.limits.latching, memory.index.bag_dir
     latched: dict[str, bool] = {}
-    for each in snapshot.silences:
+    for each in _all_silences(bag_dir, snapshot):
         if each.topic not in latched:
             latched[each.topic] = latching.is_latched(snapshot, each.topic)
         if not latched[each.topic]:
             yield from _around_cut(bag_dir, snapshot, each)
+
+
+def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
+    """Returns those that bags show, and those that deleted bags showed, in order of time."""
+    shown: dict[str, list[Silence]] = {}
+    for each in snapshot.silences:
+        shown.setdefault(each.topic, []).append(each)
+    deleted = [
+        each
+        for each in map(Silence._make, read_thinned(bag_dir).silences)
+        # Until its bags are deleted, they show it as well.
+        if all(each.within(one.start, one.end) is None for one in shown.get(each.topic, ()))
+    ]
+    return sorted(
+        [*snapshot.silences, *deleted], key=lambda each: (each.start, each.end, each.topic)
+    )
 
 
 def _around_cut(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:

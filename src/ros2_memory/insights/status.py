@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
-from ros2_memory.bag_dir.state_files import describe_leaving
+from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -91,7 +91,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         gaps=gaps_with_deleted(view, gaps),
         stalled=(len(stalls), sum(end - start for start, end in stalls)),
         damaged=len(snapshot.damaged),
-        incomplete=snapshot.timeline.disk_use[1],
+        incomplete=snapshot.timeline.disk_use[1] + len(read_thinned(view.bag_dir).left_open),
         unread=len(snapshot.unread),
         budget=_budget(memory, snapshot, heartbeat, wall),
         moments=moments,

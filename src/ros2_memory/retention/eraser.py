@@ -32,6 +32,7 @@ from ros2_memory.bag_dir.layout import (
     COMPRESSED,
     HANDOVER_FILE,
     METADATA_FILE,
+    THINNED_FILE,
     bag_kind,
     is_carried,
     is_kept_apart,
@@ -40,9 +41,11 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import (
     ERASING,
+    THINNED,
     Erased,
     Erasure,
     Loss,
+    Thinned,
     append_losses,
     read_losses,
 )
@@ -241,6 +244,7 @@ class Eraser:
                     directories.opened(self._bag_dir, path.parent) as folder,
                 ):
                     os.unlink(repair_name(path.name), dir_fd=folder)
+            self._forget_silences(erasure)
             forgotten(erasure)
             # So that answers report it.
             known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
@@ -255,6 +259,28 @@ class Eraser:
         except (EpisodicError, OSError) as error:
             kept.append(_reason_of(error))
         return Kept((*kept, *linked), tuple(notes))
+
+    def _forget_silences(self, erasure: Erasure) -> None:
+        """Takes the silences of topics in the windows out of what is known of deleted bags.
+
+        Raises:
+            BagError: a recorder runs, which alone may write it then.
+            OSError: it cannot be read or written.
+        """
+        try:
+            thinned = THINNED.read(self._bag_dir) or Thinned()
+        except ValueError as error:
+            raise BagError(THINNED_FILE, f"it is damaged, delete it: {error}") from error
+        left = tuple(
+            silence
+            for silence in thinned.silences
+            if silence[0] not in erasure.topics
+            or not any(start <= silence[2] and silence[1] < stop for start, stop in erasure.windows)
+        )
+        if left != thinned.silences:
+            if self._recorder is not None:
+                raise BagError(THINNED_FILE, _of_recorder(self._recorder))
+            THINNED.write(self._bag_dir, replace(thinned, silences=left))
 
     def _files(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
@@ -286,10 +312,7 @@ class Eraser:
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
         elif (is_carried(path) or is_thinned(path)) and self._recorder is not None:
-            reason = (
-                f"only the recorder may change it while it runs: {self._recorder}; stop the "
-                "recorder, and forget again"
-            )
+            reason = _of_recorder(self._recorder)
         return reason
 
     def _may_change(self, path: Path) -> bool:
@@ -433,6 +456,13 @@ def _without(listed: MessageList, file: str, ids: Ids) -> MessageList:
     left = {topic: known for topic, known in topics.items() if known}
     others = {name: each for name, each in listed.items() if name != file}
     return {**others, file: left} if left else others
+
+
+def _of_recorder(reason: str) -> str:
+    return (
+        f"only the recorder may change it while it runs: {reason}; stop the recorder, and forget "
+        "again"
+    )
 
 
 def _reason_of(error: Exception) -> str:

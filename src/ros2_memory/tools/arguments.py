@@ -494,6 +494,13 @@ class NoArguments(Arguments):
     """No arguments."""
 
 
+class RecordedTimesArguments(Arguments):
+    """Of which window gaps, silences and steps of the clock are listed."""
+
+    start_s: _Start = None
+    end_s: _End = None
+
+
 class TopicListArguments(Arguments):
     """Which topics are listed."""
 

@@ -27,6 +27,7 @@ from ros2_memory.tools.arguments import (
     MotionArguments,
     NoArguments,
     PositionArguments,
+    RecordedTimesArguments,
     TopicAtArguments,
     TopicListArguments,
     TopicRangeArguments,
@@ -147,10 +148,11 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded times"),),
-        "The recorded time range, gaps, and the current time. "
+        "The recorded time range, the current time, and, of all or a window, the newest gaps, "
+        "silences and steps of the clock. "
         "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, null "
         "if nothing is recorded.",
-        NoArguments,
+        RecordedTimesArguments,
         queries.data_time_range,
     ),
     ToolDeclaration(

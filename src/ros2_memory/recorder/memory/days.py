@@ -23,14 +23,17 @@ from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
     LEAVING_FILE,
     MEMORY_FOLDER,
+    THINNED_FILE,
     memory_file,
     utc_day,
 )
 from ros2_memory.bag_dir.state_files import (
     LEAVING,
     SUPERSEDED,
+    THINNED,
     Leaving,
     Superseded,
+    Thinned,
 )
 from ros2_memory.columns.decode import decoded, pieces
 from ros2_memory.columns.detections import DetectionColumns
@@ -39,6 +42,7 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.recorder.memory.shown import beside, shown_by
 from ros2_memory.recorder.memory.thinning import (
     MINUTE_NS,
     TopicThinning,
@@ -177,7 +181,13 @@ class MemoryDays:
             raise BagError(str(self._folder), "messages are being forgotten: they must not stay")
         begun = time.perf_counter_ns()
         bags = [bag for bag in snapshot.bags if bag.file in paths]
-        chosen = self._chosen(snapshot, bags)
+        if not bags:
+            return
+        thinned = self._thinned()
+        shown = shown_by(thinned, snapshot, bags)
+        chosen = self._chosen(snapshot, bags, shown)
+        if shown != thinned:
+            THINNED.write(self._folder.parent, shown)
         # Whole bags, also across midnight: a bag is in one day, or in none.
         days: dict[str, list[BagFile]] = defaultdict(list)
         for bag in bags:
@@ -218,6 +228,7 @@ class MemoryDays:
                 break
             size -= path.stat().st_size
             self._delete(path)
+        self._forget_deleted()
         month_ago = "" if now is None else memory_file(utc_day(now - MONTH_NS))
         for path in self._days():
             if path.name < month_ago and path not in self._minutes:
@@ -228,6 +239,18 @@ class MemoryDays:
                 if not is_thinned and self._is_whole(path):
                     self._thin_to_minutes(path)
                     break
+
+    def _forget_deleted(self) -> None:
+        """Takes out of `thinned.json` what is older than all days; it goes with the last."""
+        thinned, days = self._thinned(), self._days()
+        if thinned.since is None:
+            return
+        if not days:
+            THINNED.remove(self._folder.parent)
+            return
+        left = thinned.from_day(days[0].name[: len(utc_day(0))])
+        if left != thinned:
+            THINNED.write(self._folder.parent, left)
 
     def _delete(self, path: Path) -> None:
         path.unlink()
@@ -275,8 +298,8 @@ class MemoryDays:
     def _delete_all(self, days: Sequence[Path]) -> None:
         for left in self._folder.glob(".*.thinned.mcap.tmp"):
             left.unlink()
-        for path in days:
-            path.unlink()
+        for path in [*days, self._folder.parent / THINNED_FILE]:
+            path.unlink(missing_ok=True)
         _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         with suppress(OSError):
             self._folder.rmdir()
@@ -289,7 +312,15 @@ class MemoryDays:
         found = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
         return sorted(path for path in found if self._own.owns_bag(path))
 
-    def _chosen(self, snapshot: Snapshot, bags: Sequence[BagFile]) -> _Chosen:
+    def _thinned(self) -> Thinned:
+        """Returns what is known of deleted bags; nothing, which is logged, of a damaged file."""
+        try:
+            return THINNED.read(self._folder.parent) or Thinned()
+        except ValueError as error:
+            _log.warning("memory_not_read", path=THINNED_FILE, reason=str(error))
+            return Thinned()
+
+    def _chosen(self, snapshot: Snapshot, bags: Sequence[BagFile], shown: Thinned) -> _Chosen:
         """Returns which messages of some bags stay."""
         chosen = _Chosen()
         thinned: dict[tuple[str, str], TopicThinning] = {}
@@ -309,6 +340,7 @@ class MemoryDays:
                 chosen.times[topic, kind].update(table.log_times.tolist())
             elif len(table):
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
+                chosen.times[topic, kind].update(beside(shown.pauses, table.log_times).tolist())
         for key, one in thinned.items():
             chosen.times[key].update(one.times().tolist())
         return chosen

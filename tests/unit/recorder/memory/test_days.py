@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import operator
+import os
 import shutil
 import time
 from collections import Counter
@@ -22,9 +23,9 @@ from starlette.datastructures import QueryParams
 from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.durable_write import read_small_file
-from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE
+from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE, THINNED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bag_dir.state_files import read_superseded
+from ros2_memory.bag_dir.state_files import read_superseded, read_thinned
 from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
@@ -69,9 +70,12 @@ DAY_FILE = "memory/20260921.thinned.mcap"
 
 
 def split(
-    bag_dir: Path, start: int, *, name: str = "rec_A", labels: Sequence[str] = ("mug",)
+    bag_dir: Path, start: int, *, name: str = "rec_A", labels: Sequence[str] | None = ("mug",)
 ) -> Path:
-    """A split of a minute that begins so many seconds after `T0`; the robot drives along x."""
+    """A split of a minute that begins so many seconds after `T0`; the robot drives along x.
+
+    With None in place of labels its detector says nothing.
+    """
     begin = T0 + start * S
     times = range(begin, begin + 60 * S, S // 5)
     messages: list[Msg] = [
@@ -80,7 +84,8 @@ def split(
     for at in times:
         messages.append(odom(at, (at - T0) / S / 4, 1.0))
         messages.append(boolean(at, (at - T0) // (30 * S) % 2 == 1))
-    messages += [detections(at, labels) for at in times[::5]]
+    if labels is not None:
+        messages += [detections(at, labels) for at in times[::5]]
     messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::5]]
     messages.append(text(begin + 7 * S, "the code is 4711"))
     messages.sort(key=lambda each: each.log_time)
@@ -319,9 +324,9 @@ def test_days_of_a_wrong_date_do_not_age_nor_any_by_an_unsure_clock(bag_dir: Pat
     both = ["19700101.thinned.mcap", "20260921.thinned.mcap"]
     days = days_of(bag_dir, limits=MemoryLimits(max_age_ns=30 * 86_400 * S))
     days.limit(None)
-    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == both
+    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == both
     days.limit(T0 + 60 * 86_400 * S)
-    assert [path.name for path in (bag_dir / "memory").iterdir()] == both[:1]
+    assert [path.name for path in (bag_dir / "memory").glob("*.mcap")] == both[:1]
 
 
 def test_what_stays_already_is_not_written_twice_and_hours_are_added(bag_dir: Path) -> None:
@@ -517,7 +522,8 @@ def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) 
     with pytest.raises(BagError):
         keep_all(days_of(bag_dir, writer=Failing(after)), bag_dir, "rec_B")
     assert (bag_dir / DAY_FILE).read_bytes() == before
-    assert [path.name for path in (bag_dir / "memory").iterdir()] == ["20260921.thinned.mcap"]
+    left = sorted(path.name for path in (bag_dir / "memory").iterdir())
+    assert left == ["20260921.thinned.mcap", "thinned.json"]
 
 
 def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
@@ -530,13 +536,13 @@ def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
     for day in range(4):
         keep_all(days, bag_dir, f"rec_{day}")
     names = [f"202609{number}.thinned.mcap" for number in (21, 22, 23, 24)]
-    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names
+    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names
     size = (bag_dir / DAY_FILE).stat().st_size
     now = T0 + 4 * 86_400 * S
     days_of(bag_dir, limits=MemoryLimits(max_age_ns=round(3.5 * 86_400) * S)).limit(now)
-    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names[1:]
+    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names[1:]
     days_of(bag_dir, limits=MemoryLimits(max_bytes=round(2.5 * size))).limit(now)
-    assert sorted(path.name for path in (bag_dir / "memory").iterdir()) == names[2:]
+    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names[2:]
     (bag_dir / "memory" / "mine.mcap").write_bytes(b"of somebody else")
     leaving = days_of(bag_dir, keeps=False, monotonic=iter((0.0, GRACE_S)).__next__)
     leaving.clear()
@@ -744,6 +750,98 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
     topics = {record.channel.topic for record in messages_in(bag_dir / DAY_FILE)}
     assert "/odom" in topics
     assert "/vision/scene/scene_objects" not in topics
+
+
+def blind_for_three_minutes(bag_dir: Path) -> None:
+    """Nine minutes of bags, in the middle three of which the detector is silent, and newer ones."""
+    for hour in (12, 29):
+        split(bag_dir, hour * 3600, name="rec_Z")
+    for nth in range(9):
+        split(bag_dir, 60 * nth, labels=None if nth in {3, 4, 5} else ("mug",))
+    own_all(bag_dir)
+
+
+def shown(bag_dir: Path) -> tuple[Any, ...]:
+    """What is reported besides messages: silences, steps of the clock, what a crash left open."""
+    times = reply_over(bag_dir, "data_time_range")
+    status = reply_over(bag_dir, "memory_status")
+    return times.get("silences"), times.get("clock_steps"), status.get("incomplete")
+
+
+def delete_all(bag_dir: Path) -> None:
+    """As retention does it, by age."""
+    for _ in range(3):
+        house(bag_dir, T0 + (29 * 3600 + 60) * S, max_age_h=24, memory=days_of(bag_dir)).apply()
+    assert not [*bag_dir.glob("rec_A/*.mcap")]
+
+
+def test_what_bags_show_besides_messages_is_known_when_they_are_gone(
+    bag_dir: Path, tmp_path: Path
+) -> None:
+    blind_for_three_minutes(bag_dir)
+    # The clock is set back by 5 s, and the last bag is left open.
+    split(tmp_path, 535).rename(bag_dir / "rec_A" / "rec_A_9.mcap")
+    last = split(tmp_path, 595).rename(bag_dir / "rec_A" / "rec_A_10.mcap")
+    last.write_bytes(last.read_bytes()[:-400])
+    os.utime(last, (T0 / S + 655,) * 2)
+    own_all(bag_dir)
+    before = shown(bag_dir)
+    [silence] = before[0]
+    assert silence["silent_s"] > 180
+    [step] = before[1]
+    assert step["step_s"] < -4
+    assert before[2] == 1
+    delete_all(bag_dir)
+    assert shown(bag_dir) == before
+    inside = {"start": silence["start"] + 60, "end": silence["end"]}
+    reply = reply_over(bag_dir, "data_time_range", **inside)
+    assert [each["topic"] for each in reply["silences"]] == ["/vision/scene/scene_objects"]
+    assert not reply["clock_steps"]
+
+
+def test_a_silence_is_forgotten_with_its_topic(
+    bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
+) -> None:
+    blind_for_three_minutes(bag_dir)
+    delete_all(bag_dir)
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
+    window = ("--start", T0 / S, "--end", T0 / S + 300)
+    exits(0, "forget", "--topic", "/odom", *window, "--yes")
+    assert read_thinned(bag_dir).silences
+    exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
+    assert not read_thinned(bag_dir).silences
+    assert not shown(bag_dir)[0]
+
+
+def test_what_bags_showed_goes_with_the_last_day_of_that_time(bag_dir: Path) -> None:
+    blind_for_three_minutes(bag_dir)
+    delete_all(bag_dir)
+    later = 2 * 86_400
+    for nth in range(9):
+        split(bag_dir, later + 60 * nth, name="rec_B")
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    limits = MemoryLimits(max_age_ns=86_400 * S)
+    days_of(bag_dir, limits=limits).limit(T0 + (later + 3600) * S)
+    assert not read_thinned(bag_dir).silences
+    days_of(bag_dir, limits=limits).limit(T0 + 10 * later * S)
+    assert [*(bag_dir / "memory").iterdir()] == []
+
+
+def test_days_whose_bags_nobody_looked_at_say_so(bag_dir: Path) -> None:
+    blind_for_three_minutes(bag_dir)
+    delete_all(bag_dir)
+    note = "silences and steps of the clock within the days of memory/ are not known"
+    assert note not in reply_over(bag_dir, "data_time_range").get("notes", ())
+    (bag_dir / THINNED_FILE).write_text("{")
+    assert note in reply_over(bag_dir, "data_time_range")["notes"]
+    split(bag_dir, 3600, name="rec_B")
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    [said] = [
+        each for each in reply_over(bag_dir, "data_time_range")["notes"] if "memory/ before" in each
+    ]
+    assert said.endswith("are not known")
 
 
 def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
