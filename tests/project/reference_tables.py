@@ -10,6 +10,7 @@ import ast
 import json
 import re
 import textwrap
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -107,8 +108,27 @@ def exit_table() -> str:
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
-    """Each tool: what it answers, its arguments, a call and the reply."""
-    return "\n\n".join(_tool(tool, replies[tool.name]) for tool in tools)
+    """Each tool: what it answers, its arguments, a call and the reply.
+
+    An argument that several tools describe alike stands once, before them. A tool that is another
+    one up to now, or some seconds ago, shows neither call nor reply.
+    """
+    whole = {tool.name: tool for tool in tools}
+    counted = Counter(
+        line
+        for name, tool in whole.items()
+        if _sibling(tool) is None
+        for line in _arguments(tool).values()
+    )
+    repeated = [line for line, number in counted.items() if number > 1]
+    meanings = Counter(line.partition(":")[0] for line in repeated)
+    common = [line for line in repeated if meanings[line.partition(":")[0]] == 1]
+    parts = ["### Arguments of several tools", "\n".join(f"- {line}" for line in common)]
+    for name, tool in whole.items():
+        sibling = _sibling(tool)
+        known = common if sibling is None else [*_arguments(whole[sibling]).values()]
+        parts.append(_tool(tool, None if sibling else replies[name], known))
+    return "\n\n".join(parts)
 
 
 def shown(reply: str) -> str:
@@ -137,31 +157,44 @@ def _laid_out(value: Any, indent: int = 0) -> str:
     return f"{opening}\n{inner}{joined}\n{' ' * indent}{closing}"
 
 
-def _tool(tool: Tool, reply: str) -> str:
-    what = tool.description.partition(" Example: ")[0]
+def _sibling(tool: Tool) -> str | None:
+    """The tool that this one is, but for the time that it asks about."""
+    found = re.match(r"As (\w+),", tool.description)
+    return found[1] if found else None
+
+
+def _arguments(tool: Tool) -> dict[str, str]:
+    """What each argument may hold and means."""
     properties: Any = tool.schema["properties"]
-    required: Any = tool.schema.get("required", [])
-    lines = [
-        f"- `{name}`: {_kind(schema)}{_need(name, schema, required)}. "
-        f"{schema.get('description', '')}".rstrip()
+    return {
+        name: f"`{name}`: {_kind(schema)}{_default(schema)}. {schema.get('description', '')}".rstrip()
         for name, schema in properties.items()
-    ]
-    arguments = "\n".join(lines) or "No arguments."
-    call = json.dumps(CALLS[tool.name], ensure_ascii=False)
-    return "\n\n".join(
-        (
-            f"### `{tool.name}`",
-            "\n".join(textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)),
-            arguments,
-            f"```json\n{call}\n```",
-            shown(reply),
-        )
-    )
+    }
 
 
-def _need(name: str, schema: Mapping[str, Any], required: Iterable[str]) -> str:
-    if name in required:
-        return ", required"
+def _tool(tool: Tool, reply: str | None, known: Iterable[str]) -> str:
+    what = tool.description.partition(" Example: ")[0]
+    required: Any = tool.schema.get("required", [])
+    names = {line.partition(":")[0].strip("`") for line in known}
+    lines, also = [], []
+    for name, line in _arguments(tool).items():
+        need = " (required)" if name in required else ""
+        if line in known or (reply is None and name in names):
+            also.append(f"`{name}`{need}")
+        else:
+            lines.append(f"- {line.replace(':', need + ':', 1)}")
+    if also:
+        where = "as there" if reply is None else "as above"
+        lines.append(f"- {where}: {', '.join(also)}")
+    wrapped = textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)
+    parts = [f"### `{tool.name}`", "\n".join(wrapped), "\n".join(lines) or "No arguments."]
+    if reply is not None:
+        call = json.dumps(CALLS[tool.name], ensure_ascii=False)
+        parts += [f"```json\n{call}\n```"] * (CALLS[tool.name] != {}) + [shown(reply)]
+    return "\n\n".join(parts)
+
+
+def _default(schema: Mapping[str, Any]) -> str:
     return f", default `{json.dumps(schema['default'])}`" if "default" in schema else ""
 
 
