@@ -167,8 +167,8 @@ def _arguments(tool: Tool) -> dict[str, str]:
     """What each argument may hold and means."""
     properties: Any = tool.schema["properties"]
     return {
-        name: f"`{name}`: {_kind(schema)}{_default(schema)}. {schema.get('description', '')}".rstrip()
-        for name, schema in properties.items()
+        name: f"`{name}`: {_kind(each)}{_default(each)}. {each.get('description', '')}".rstrip()
+        for name, each in properties.items()
     }
 
 
