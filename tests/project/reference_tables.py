@@ -337,14 +337,19 @@ def _is_log(node: ast.AST) -> bool:
 
 
 def event_list(page: str) -> str:
-    """The log events: levels, fields, and what the page says already that they mean."""
-    written = dict(re.findall(r"^- `(\w+)` \([^)]*\): (.+)$", page, re.MULTILINE))
+    """The log events by level, with their own fields, and what the page says that they mean."""
+    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
+    by_level: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
     every = events()
-    lines = []
     for name in dict.fromkeys(each.name for each in every):
         same = [each for each in every if each.name == name]
-        levels = ", ".join(dict.fromkeys(each.level for each in same))
+        at = {each.level for each in same}
+        worst, *others = [level for level in by_level if level in at]
         named = dict.fromkeys(field for each in same for field in each.fields)
-        fields = "".join(f", `{field}`" for field in named)
-        lines.append(f"- `{name}` ({levels}{fields}): {written.get(name, '?')}")
-    return "\n".join(lines)
+        told = [f"or {level}" for level in others]
+        told += [f"`{field}`" for field in named if field not in {"reason", "exception"}]
+        shown_fields = f" ({', '.join(told)})" if told else ""
+        by_level[worst].append(f"- `{name}`{shown_fields}: {written.get(name, '?')}")
+    return "\n\n".join(
+        f"## {level.capitalize()}\n\n" + "\n".join(lines) for level, lines in by_level.items()
+    )
