@@ -79,21 +79,24 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def lake_tables() -> str:
-    """The columns of each table of a lake."""
-    keys = [(f"`{name}`", *column) for name, column in KEYS.items()]
-    parts = [f"## Of all\n\n{table(('column', 'type', 'what it is'), keys)}"]
+    """The columns of each table of a lake; those that the page's head explains are passed over."""
+    keys = ((name, *told) for name, told in KEYS.items())
+    parts = [f"## Of all\n\n{_listed(keys)}"]
     for lake_table in TABLES.values():
-        rows = [
-            (f"`{name}`", *column)
-            for name, column in lake_table.columns.items()
-            if name not in KEYS
-        ]
-        columns = table(("column", "type", "what it is"), rows)
         order = ", ".join(f"`{name}`" for name in lake_table.order)
+        own = _listed(
+            (name, *told)
+            for name, told in lake_table.columns.items()
+            if name not in {*KEYS, "topic_key", "time"}
+        )
         parts.append(
-            f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{columns}"
+            f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{own}"
         )
     return "\n\n".join(parts)
+
+
+def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
+    return "\n".join(f"- `{name}` ({kind}): {meaning}" for name, kind, meaning in columns)
 
 
 def exit_table() -> str:
@@ -242,9 +245,15 @@ def documented_settings() -> str:
             for key in keys_of(folder / option, f"{group}.")
         ),
     ):
-        told = meaning.replace(" | ", ", ")
-        rows.append([f"`{key}`", _kind(_schema_of(key)), f"`{default}`", told])
-    return table(("key", "holds", "default", "meaning"), rows)
+        schema = _schema_of(key)
+        kind = "" if "enum" in schema else _kind(schema)  # its comment names the choices
+        if default == "null":
+            kind = f"or {kind.replace(' or `null`', '')}"
+        elif not any(word in kind for word in ("number", "null")):
+            kind = ""  # the default shows it
+        held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
+        rows.append([f"`{key}`", held, meaning.replace(" | ", ", ")])
+    return table(("key", "default, and what else it holds", "meaning"), rows)
 
 
 def keys_of(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
