@@ -347,7 +347,7 @@ def _is_log(node: ast.AST) -> bool:
 
 def event_list(page: str) -> str:
     """The log events by level, with their own fields, and what the page says that they mean."""
-    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
+    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?(.*)$", page, re.MULTILINE))
     by_level: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
     every = events()
     for name in dict.fromkeys(each.name for each in every):
@@ -358,7 +358,7 @@ def event_list(page: str) -> str:
         told = [f"or {level}" for level in others]
         told += [f"`{field}`" for field in named if field not in {"reason", "exception"}]
         shown_fields = f" ({', '.join(told)})" if told else ""
-        by_level[worst].append(f"- `{name}`{shown_fields}: {written.get(name, '?')}")
+        by_level[worst].append(f"- `{name}`{shown_fields}{written.get(name, ': ?')}")
     return "\n\n".join(
         f"## {level.capitalize()}\n\n" + "\n".join(lines) for level, lines in by_level.items()
     )
