@@ -100,14 +100,14 @@ def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
 
 
 def exit_table() -> str:
-    """Each command, what it is for, and what its exit codes say."""
+    """Each command, what it is for, and what its exit codes say, but for success."""
+    rows = []
+    for name, (_, purpose, codes) in COMMANDS.items():
+        failures = (f"{code}: {why}" for code, why in codes.items() if code)
+        rows.append((f"`{name}`", purpose, "; ".join(failures)))
     common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
-    rows = [
-        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in codes.items()))
-        for name, (_, purpose, codes) in COMMANDS.items()
-    ]
-    columns = ("command", "what it is for", "exit code")
-    return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."
+    columns = table(("command", "what it is for", "exit code"), rows)
+    return f"{columns}\n\nExit code 0 is success. Where nothing else is said, {common}."
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
