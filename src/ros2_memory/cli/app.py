@@ -142,7 +142,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "ship the bags of many robots into a lake of Iceberg tables",
         {
             0: "with --once: every closed bag is in the lake",
-            1: "with --once: some bags are not there, or could not be confirmed (stderr names them)",
+            1: "with --once: some bags are not, or may not be, in the lake (stderr names them)",
         },
     ),
     "recover": CommandEntry(
