@@ -148,7 +148,7 @@ def without_sizes(text: str) -> str:
 def _laid_out(value: Any, indent: int = 0) -> str:
     """JSON of which whatever fits stands in one line."""
     flat = json.dumps(value, ensure_ascii=False)
-    if len(flat) + indent <= 92 or not isinstance(value, dict | list) or not value:
+    if len(flat) + indent <= 116 or not isinstance(value, dict | list) or not value:
         return flat
     inner = " " * (indent + 2)
     if isinstance(value, dict):
@@ -252,8 +252,8 @@ def documented_settings() -> str:
         elif not any(word in kind for word in ("number", "null")):
             kind = ""  # the default shows it
         held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
-        rows.append([f"`{key}`", held, meaning.replace(" | ", ", ")])
-    return table(("key", "default, and what else it holds", "meaning"), rows)
+        rows.append(f"- `{key}` ({held}): {meaning.replace(' | ', ', ')}")
+    return "\n".join(rows)
 
 
 def keys_of(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
