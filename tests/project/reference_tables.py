@@ -96,7 +96,12 @@ def lake_tables() -> str:
 
 
 def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
-    return "\n".join(f"- `{name}` ({kind}): {meaning}" for name, kind, meaning in columns)
+    """A line for each column; such as have one type and meaning share it."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for name, kind, meaning in columns:
+        alike.setdefault((kind, meaning), []).append(f"`{name}`")
+    lines = (f"- {', '.join(names)} ({kind}): {told}" for (kind, told), names in alike.items())
+    return "\n".join(lines)
 
 
 def exit_table() -> str:
