@@ -167,7 +167,7 @@ def _laid_out(value: Any, indent: int = 0) -> str:
 
 def _sibling(tool: Tool) -> str | None:
     """The tool that this one is, but for the time that it asks about."""
-    found = re.match(r"As (\w+),", tool.description)
+    found = re.match(r"(?:Blocking\. )?As (\w+),", tool.description)
     return found[1] if found else None
 
 
@@ -213,29 +213,27 @@ def _kind(schema: Mapping[str, Any]) -> str:
     if "$ref" in schema:
         return "mapping"
     if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
+        return "/".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
     if schema.get("type") == [*TIME_KINDS]:
         return "time"
     if isinstance(schema.get("type"), list):
-        return " or ".join(_kind({**schema, "type": each}) for each in schema["type"])
-    kind = {
+        return "/".join(_kind({**schema, "type": each}) for each in schema["type"])
+    kind: str = {
         "array": "list of times" if schema.get("items") == {"type": [*TIME_KINDS]} else "list",
-        "boolean": "`true`, `false`",
-        "integer": "whole number",
         "null": "`null`",
         "string": "path" if schema.get("format") == "path" else "text",
     }.get(schema.get("type", ""), schema.get("type", ""))
     bounds = [
-        f"{word} {schema[key]:g}"
-        for key, word in (
-            ("exclusiveMinimum", "above"),
-            ("minimum", "at least"),
-            ("maximum", "at most"),
-            ("exclusiveMaximum", "below"),
+        f"{sign}{schema[key]:g}"
+        for key, sign in (
+            ("exclusiveMinimum", ">"),
+            ("minimum", "≥"),
+            ("maximum", "≤"),
+            ("exclusiveMaximum", "<"),
         )
         if key in schema
     ]
-    return " ".join([kind, ", ".join(bounds)]).strip()
+    return " ".join([kind, *bounds])
 
 
 def documented_settings() -> str:
@@ -253,8 +251,8 @@ def documented_settings() -> str:
         schema = _schema_of(key)
         kind = "" if "enum" in schema else _kind(schema)  # its comment names the choices
         if default == "null":
-            kind = f"or {kind.replace(' or `null`', '')}"
-        elif not any(word in kind for word in ("number", "null")):
+            kind = f"or {kind.replace('/`null`', '')}"
+        elif not any(word in kind for word in ("integer", "number", "null")):
             kind = ""  # the default shows it
         held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
         rows.append(f"- `{key}` ({held}): {meaning.replace(' | ', ', ')}")
