@@ -349,19 +349,28 @@ def _is_log(node: ast.AST) -> bool:
 
 
 def event_list(page: str) -> str:
-    """The log events by level, with their own fields, and what the page says that they mean."""
-    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?(.*)$", page, re.MULTILINE))
-    by_level: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
+    """The log events by level, with their own fields, and what the page says that they mean.
+
+    Those of which it says nothing, since their names do, stand together at the end of a level.
+    """
+    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
+    plain = {*re.findall(r"`(\w+)`", "".join(re.findall(r"^Also .+$", page, re.MULTILINE)))}
+    told: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
+    named: dict[str, list[str]] = {level: [] for level in told}
     every = events()
     for name in dict.fromkeys(each.name for each in every):
         same = [each for each in every if each.name == name]
-        at = {each.level for each in same}
-        worst, *others = [level for level in by_level if level in at]
-        named = dict.fromkeys(field for each in same for field in each.fields)
-        told = [f"or {level}" for level in others]
-        told += [f"`{field}`" for field in named if field not in {"reason", "exception"}]
-        shown_fields = f" ({', '.join(told)})" if told else ""
-        by_level[worst].append(f"- `{name}`{shown_fields}{written.get(name, ': ?')}")
-    return "\n\n".join(
-        f"## {level.capitalize()}\n\n" + "\n".join(lines) for level, lines in by_level.items()
-    )
+        worst, *others = [level for level in told if level in {each.level for each in same}]
+        fields = dict.fromkeys(field for each in same for field in each.fields)
+        inside = [f"or {level}" for level in others]
+        inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
+        shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
+        if name in plain and name not in written:
+            named[worst].append(shown_name)
+        else:
+            told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
+    parts = []
+    for level, lines in told.items():
+        also = [f"Also {', '.join(named[level])}."] if named[level] else []
+        parts += [f"## {level.capitalize()}", "\n".join(lines), *also]
+    return "\n\n".join(parts)
