@@ -354,7 +354,11 @@ def event_list(page: str) -> str:
     Those of which it says nothing, since their names do, stand together at the end of a level.
     """
     written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
-    plain = {*re.findall(r"`(\w+)`", "".join(re.findall(r"^Also .+$", page, re.MULTILINE)))}
+    plain = {
+        *re.findall(
+            r"`(\w+)`", "".join(re.findall(r"^Also .+?\.$", page, re.MULTILINE | re.DOTALL))
+        )
+    }
     told: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
     named: dict[str, list[str]] = {level: [] for level in told}
     every = events()
@@ -371,6 +375,6 @@ def event_list(page: str) -> str:
             told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
     parts = []
     for level, lines in told.items():
-        also = [f"Also {', '.join(named[level])}."] if named[level] else []
-        parts += [f"## {level.capitalize()}", "\n".join(lines), *also]
+        also = textwrap.wrap(f"Also {', '.join(named[level])}.", 116) if named[level] else []
+        parts += [f"## {level.capitalize()}", "\n".join(lines), "\n".join(also)]
     return "\n\n".join(parts)
