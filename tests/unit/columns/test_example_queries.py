@@ -80,10 +80,5 @@ def test_bytes_of_a_topic(file: Path) -> None:
     }
 
 
-def test_all_tables_and_their_columns_are_described(file: Path) -> None:
-    rows = dict(re.findall(r"^\| `(\w+)` \| (.+) \|$", section(), re.MULTILINE))
-    assert {*rows} == {*TABLES}
-    with closing(sqlite3.connect(file)) as base:
-        for table, described in rows.items():
-            names = {row[1] for row in base.execute(f"PRAGMA table_info({table})")} - {"id", "part"}
-            assert {name for name in names if f"`{name}`" not in described} == set(), table
+def test_all_tables_are_described() -> None:
+    assert [table for table in TABLES if f"`{table}`" not in section()] == []
