@@ -10,6 +10,7 @@ import ast
 import json
 import re
 import textwrap
+from collections import Counter
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
@@ -78,37 +79,64 @@ def table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def lake_tables() -> str:
-    """The columns of each table of a lake."""
-    keys = [(f"`{name}`", *column) for name, column in KEYS.items()]
-    parts = [f"## Of all\n\n{table(('column', 'type', 'what it is'), keys)}"]
+    """The columns of each table of a lake; those that the page's head explains are passed over."""
+    keys = ((name, *told) for name, told in KEYS.items())
+    parts = [f"## Of all\n\n{_listed(keys)}"]
     for lake_table in TABLES.values():
-        rows = [
-            (f"`{name}`", *column)
-            for name, column in lake_table.columns.items()
-            if name not in KEYS
-        ]
-        columns = table(("column", "type", "what it is"), rows)
         order = ", ".join(f"`{name}`" for name in lake_table.order)
+        own = _listed(
+            (name, *told)
+            for name, told in lake_table.columns.items()
+            if name not in {*KEYS, "topic_key", "time"}
+        )
         parts.append(
-            f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{columns}"
+            f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{own}"
         )
     return "\n\n".join(parts)
 
 
+def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
+    """A line for each column; such as have one type and meaning share it."""
+    alike: dict[tuple[str, str], list[str]] = {}
+    for name, kind, meaning in columns:
+        alike.setdefault((kind, meaning), []).append(f"`{name}`")
+    lines = (f"- {', '.join(names)} ({kind}): {told}" for (kind, told), names in alike.items())
+    return "\n".join(lines)
+
+
 def exit_table() -> str:
-    """Each command, what it is for, and what its exit codes say."""
+    """Each command, what it is for, and what its exit codes say, but for success."""
+    rows = []
+    for name, (_, purpose, codes) in COMMANDS.items():
+        failures = (f"{code}: {why}" for code, why in codes.items() if code)
+        rows.append((f"`{name}`", purpose, "; ".join(failures)))
     common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
-    rows = [
-        (f"`{name}`", purpose, "; ".join(f"{code}: {why}" for code, why in codes.items()))
-        for name, (_, purpose, codes) in COMMANDS.items()
-    ]
-    columns = ("command", "what it is for", "exit code")
-    return f"{table(columns, rows)}\n\nWhere nothing else is said, {common}."
+    columns = table(("command", "what it is for", "exit code"), rows)
+    return f"{columns}\n\nExit code 0 is success. Where nothing else is said, {common}."
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
-    """Each tool: what it answers, its arguments, a call and the reply."""
-    return "\n\n".join(_tool(tool, replies[tool.name]) for tool in tools)
+    """Each tool: what it answers, its arguments, a call and the reply.
+
+    An argument that several tools describe alike stands once, before them. A tool that is another
+    one up to now, or some seconds ago, shows neither call nor reply.
+    """
+    whole = {tool.name: tool for tool in tools}
+    counted = Counter(
+        line
+        for name, tool in whole.items()
+        if _sibling(tool) is None
+        for line in _arguments(tool).values()
+    )
+    repeated = [line for line, number in counted.items() if number > 1]
+    meanings = Counter(line.partition(":")[0] for line in repeated)
+    common = [line for line in repeated if meanings[line.partition(":")[0]] == 1]
+    parts = ["### Arguments of several tools", "\n".join(f"- {line}" for line in common)]
+    for name, tool in whole.items():
+        sibling = _sibling(tool)
+        known = common if sibling is None else [*_arguments(whole[sibling]).values()]
+        parts.append(_tool(tool, None if sibling else replies[name], known))
+    return "\n\n".join(parts)
 
 
 def shown(reply: str) -> str:
@@ -125,7 +153,7 @@ def without_sizes(text: str) -> str:
 def _laid_out(value: Any, indent: int = 0) -> str:
     """JSON of which whatever fits stands in one line."""
     flat = json.dumps(value, ensure_ascii=False)
-    if len(flat) + indent <= 92 or not isinstance(value, dict | list) or not value:
+    if len(flat) + indent <= 116 or not isinstance(value, dict | list) or not value:
         return flat
     inner = " " * (indent + 2)
     if isinstance(value, dict):
@@ -137,31 +165,44 @@ def _laid_out(value: Any, indent: int = 0) -> str:
     return f"{opening}\n{inner}{joined}\n{' ' * indent}{closing}"
 
 
-def _tool(tool: Tool, reply: str) -> str:
-    what = tool.description.partition(" Example: ")[0]
+def _sibling(tool: Tool) -> str | None:
+    """The tool that this one is, but for the time that it asks about."""
+    found = re.match(r"(?:Blocking\. )?As (\w+),", tool.description)
+    return found[1] if found else None
+
+
+def _arguments(tool: Tool) -> dict[str, str]:
+    """What each argument may hold and means."""
     properties: Any = tool.schema["properties"]
+    return {
+        name: f"`{name}`: {_kind(each)}{_default(each)}. {each.get('description', '')}".rstrip()
+        for name, each in properties.items()
+    }
+
+
+def _tool(tool: Tool, reply: str | None, known: Iterable[str]) -> str:
+    what = tool.description.partition(" Example: ")[0]
     required: Any = tool.schema.get("required", [])
-    lines = [
-        f"- `{name}`: {_kind(schema)}{_need(name, schema, required)}. "
-        f"{schema.get('description', '')}".rstrip()
-        for name, schema in properties.items()
-    ]
-    arguments = "\n".join(lines) or "No arguments."
-    call = json.dumps(CALLS[tool.name], ensure_ascii=False)
-    return "\n\n".join(
-        (
-            f"### `{tool.name}`",
-            "\n".join(textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)),
-            arguments,
-            f"```json\n{call}\n```",
-            shown(reply),
-        )
-    )
+    names = {line.partition(":")[0].strip("`") for line in known}
+    lines, also = [], []
+    for name, line in _arguments(tool).items():
+        need = " (required)" if name in required else ""
+        if line in known or (reply is None and name in names):
+            also.append(f"`{name}`{need}")
+        else:
+            lines.append(f"- {line.replace(':', need + ':', 1)}")
+    if also:
+        where = "as there" if reply is None else "as above"
+        lines.append(f"- {where}: {', '.join(also)}")
+    wrapped = textwrap.wrap(what, 100, break_long_words=False, break_on_hyphens=False)
+    parts = [f"### `{tool.name}`", "\n".join(wrapped), "\n".join(lines) or "No arguments."]
+    if reply is not None:
+        call = json.dumps(CALLS[tool.name], ensure_ascii=False)
+        parts += [f"```json\n{call}\n```"] * (CALLS[tool.name] != {}) + [shown(reply)]
+    return "\n\n".join(parts)
 
 
-def _need(name: str, schema: Mapping[str, Any], required: Iterable[str]) -> str:
-    if name in required:
-        return ", required"
+def _default(schema: Mapping[str, Any]) -> str:
     return f", default `{json.dumps(schema['default'])}`" if "default" in schema else ""
 
 
@@ -172,29 +213,27 @@ def _kind(schema: Mapping[str, Any]) -> str:
     if "$ref" in schema:
         return "mapping"
     if "anyOf" in schema:
-        return " or ".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
+        return "/".join(dict.fromkeys(_kind(each) for each in schema["anyOf"]))
     if schema.get("type") == [*TIME_KINDS]:
         return "time"
     if isinstance(schema.get("type"), list):
-        return " or ".join(_kind({**schema, "type": each}) for each in schema["type"])
-    kind = {
+        return "/".join(_kind({**schema, "type": each}) for each in schema["type"])
+    kind: str = {
         "array": "list of times" if schema.get("items") == {"type": [*TIME_KINDS]} else "list",
-        "boolean": "`true`, `false`",
-        "integer": "whole number",
         "null": "`null`",
         "string": "path" if schema.get("format") == "path" else "text",
     }.get(schema.get("type", ""), schema.get("type", ""))
     bounds = [
-        f"{word} {schema[key]:g}"
-        for key, word in (
-            ("exclusiveMinimum", "above"),
-            ("minimum", "at least"),
-            ("maximum", "at most"),
-            ("exclusiveMaximum", "below"),
+        f"{sign}{schema[key]:g}"
+        for key, sign in (
+            ("exclusiveMinimum", ">"),
+            ("minimum", "≥"),
+            ("maximum", "≤"),
+            ("exclusiveMaximum", "<"),
         )
         if key in schema
     ]
-    return " ".join([kind, ", ".join(bounds)]).strip()
+    return " ".join([kind, *bounds])
 
 
 def documented_settings() -> str:
@@ -209,9 +248,15 @@ def documented_settings() -> str:
             for key in keys_of(folder / option, f"{group}.")
         ),
     ):
-        told = meaning.replace(" | ", ", ")
-        rows.append([f"`{key}`", _kind(_schema_of(key)), f"`{default}`", told])
-    return table(("key", "holds", "default", "meaning"), rows)
+        schema = _schema_of(key)
+        kind = "" if "enum" in schema else _kind(schema)  # its comment names the choices
+        if default == "null":
+            kind = f"or {kind.replace('/`null`', '')}"
+        elif not any(word in kind for word in ("integer", "number", "null")):
+            kind = ""  # the default shows it
+        held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
+        rows.append(f"- `{key}` ({held}): {meaning.replace(' | ', ', ')}")
+    return "\n".join(rows)
 
 
 def keys_of(path: Path, prefix: str) -> Iterator[tuple[str, str, str]]:
@@ -304,14 +349,32 @@ def _is_log(node: ast.AST) -> bool:
 
 
 def event_list(page: str) -> str:
-    """The log events: levels, fields, and what the page says already that they mean."""
-    written = dict(re.findall(r"^- `(\w+)` \([^)]*\): (.+)$", page, re.MULTILINE))
+    """The log events by level, with their own fields, and what the page says that they mean.
+
+    Those of which it says nothing, since their names do, stand together at the end of a level.
+    """
+    written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
+    plain = {
+        *re.findall(
+            r"`(\w+)`", "".join(re.findall(r"^Also .+?\.$", page, re.MULTILINE | re.DOTALL))
+        )
+    }
+    told: dict[str, list[str]] = {"error": [], "warning": [], "info": [], "debug": []}
+    named: dict[str, list[str]] = {level: [] for level in told}
     every = events()
-    lines = []
     for name in dict.fromkeys(each.name for each in every):
         same = [each for each in every if each.name == name]
-        levels = ", ".join(dict.fromkeys(each.level for each in same))
-        named = dict.fromkeys(field for each in same for field in each.fields)
-        fields = "".join(f", `{field}`" for field in named)
-        lines.append(f"- `{name}` ({levels}{fields}): {written.get(name, '?')}")
-    return "\n".join(lines)
+        worst, *others = [level for level in told if level in {each.level for each in same}]
+        fields = dict.fromkeys(field for each in same for field in each.fields)
+        inside = [f"or {level}" for level in others]
+        inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
+        shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
+        if name in plain and name not in written:
+            named[worst].append(shown_name)
+        else:
+            told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
+    parts = []
+    for level, lines in told.items():
+        also = textwrap.wrap(f"Also {', '.join(named[level])}.", 116) if named[level] else []
+        parts += [f"## {level.capitalize()}", "\n".join(lines), "\n".join(also)]
+    return "\n\n".join(parts)

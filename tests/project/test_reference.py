@@ -121,7 +121,7 @@ def test_the_keys_that_a_reply_is_said_to_have_are_declared(name: str) -> None:
 
 def test_every_key_stands_there_with_its_default_and_what_it_may_hold() -> None:
     documented = reference.documented_settings()
-    named = set(re.findall(r"^\| `([\w.]+)` \|", documented, re.MULTILINE))
+    named = set(re.findall(r"^- `([\w.]+)` \(", documented, re.MULTILINE))
     assert named == reference.configured_keys(), "each key in config/ has a comment on its line"
     compare("configuration", "keys", documented)
 

@@ -54,25 +54,25 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     "info": CommandEntry(
         "info.info",
         "what is recorded: size, time range, gaps, damage, budget",
-        {0: "there are bags", 1: "there are none"},
+        {0: "there are bags", 1: "there are no bags"},
     ),
     "recordings": CommandEntry(
         "info.recordings",
         "every recording: start, length, size, storage, maker",
-        {0: "recordings are listed", 1: "there are none"},
+        {0: "recordings are listed", 1: "there are no recordings"},
     ),
     "cat": CommandEntry(
         "cat.cat",
         "the messages of a topic, as text, CSV or JSON lines",
         {
             0: "all messages were printed",
-            1: "there are none, or some could not be read (see stderr)",
+            1: "there are no messages, or some could not be read (see stderr)",
         },
     ),
     "plot": CommandEntry(
         "plot.plot",
         "draw the path, a signal, the timeline or the recap of a day",
-        {0: "the picture is written", 2: "it is not (stderr gives the reason)"},
+        {0: "the picture is written", 2: "no picture is written (stderr gives the reason)"},
     ),
     "watch": CommandEntry(
         "watch.watch",
@@ -142,7 +142,7 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
         "ship the bags of many robots into a lake of Iceberg tables",
         {
             0: "with --once: every closed bag is in the lake",
-            1: "with --once: some bags are not, or could not be confirmed (stderr names them)",
+            1: "with --once: some bags are not, or may not be, in the lake (stderr names them)",
         },
     ),
     "recover": CommandEntry(
