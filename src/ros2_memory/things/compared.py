@@ -92,11 +92,7 @@ class ThingsBetween:
         )
 
     def _counts(self, instance: Instance, before: _Seen | None, after: _Seen | None) -> bool:
-        """Whether a thing was seen there; in the later window alone, if it had not been there."""
-        if before is None and after is not None:
-            known = {each.place for each in instance.stays if each.first < self.earlier.stop}
-            if after.stay.place in known:
-                return False
+        """Whether a thing was seen there in either window."""
         frame = self.known.frames[instance.epoch]
         places = [seen.part.place for seen in (before, after) if seen is not None]
         if self.where is None:

@@ -133,6 +133,19 @@ def test_a_thing_is_missed_only_where_the_robot_looked_again(tmp_path: Path) -> 
     assert labels(compared(tmp_path / "after", after)) == {"not_looked_at": ["mug"]}
 
 
+def test_a_thing_that_was_brought_back_appeared(tmp_path: Path) -> None:
+    there, gone = looked(0, 30, HERE, MUG, BOOK), looked(30, 60, HERE, BOOK)
+    messages = [*there, *gone, *looked(60, 90, HERE, MUG, BOOK)]
+    window = {"with_start": BEGIN + 30, "with_end": BEGIN + 59}
+    reply = compared(tmp_path / "back", messages, **window)
+    assert labels(reply) == {"appeared": ["mug"]}
+    assert reply["things_unchanged"] == 1
+    # It was there before, but whether in the earlier window is not known.
+    away = [*there, *looked(30, 60, AWAY), *looked(60, 90, HERE, MUG, BOOK)]
+    unknown = compared(tmp_path / "away", away, **window)
+    assert labels(unknown) == {"not_looked_at": ["book", "mug"]}
+
+
 def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path: Path) -> None:
     reply = compared(tmp_path, moved_mug(), where="kitchen")
     assert labels(reply) == {"moved": ["mug"]}
