@@ -133,6 +133,15 @@ def test_a_thing_is_missed_only_where_the_robot_looked_again(tmp_path: Path) -> 
     assert labels(compared(tmp_path / "after", after)) == {"not_looked_at": ["mug"]}
 
 
+def test_a_thing_that_was_brought_back_in_between_is_not_missed(tmp_path: Path) -> None:
+    seen = [*looked(0, 30, HERE, MUG), *looked(30, 45, HERE)]
+    back = [*seen, *looked(45, 60, HERE, MUG), *looked(60, 90, AWAY)]
+    assert labels(compared(tmp_path / "away", back)) == {"not_looked_at": ["mug"]}
+    gone = [*seen, *looked(45, 60, HERE, MUG), *looked(60, 90, HERE)]
+    [mug] = compared(tmp_path / "gone", gone)["things"]["not_seen_where_expected"]
+    assert (mug["was"]["last_seen"], mug["missed_by"]) == (BEGIN + 29, BEGIN + 69)
+
+
 def test_a_thing_that_was_brought_back_appeared(tmp_path: Path) -> None:
     there, gone = looked(0, 30, HERE, MUG, BOOK), looked(30, 60, HERE, BOOK)
     messages = [*there, *gone, *looked(60, 90, HERE, MUG, BOOK)]
