@@ -397,6 +397,18 @@ def test_times_that_begin_together_have_no_things_to_compare(tmp_path: Path) -> 
     assert "things are not compared: the two times begin together" in reply["notes"]
 
 
+def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says_so(
+    tmp_path: Path,
+) -> None:
+    messages = [*looked(0, 60, HERE, MUG), *looked(60, 90, HERE, MUG, BOOK)]
+    within = {"start": BEGIN + 20, "end": BEGIN + 50, "with_start": BEGIN, "with_end": BEGIN + 89}
+    [note] = [each for each in compared(tmp_path, messages, **within)["notes"] if "things" in each]
+    assert note.startswith(f"things are not compared after {BEGIN + 50}")
+    until_its_end = ask(tmp_path, **{**within, "end": BEGIN + 89})
+    assert labels(until_its_end) == {"appeared": ["book"]}
+    assert not any("things" in each for each in until_its_end["notes"])
+
+
 def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
     many, gone, new = (
         [(f"{name}{nth:02}", 2.5 + nth % 6, 1.2 * (nth // 6) + y) for nth in range(24)]
