@@ -15,7 +15,13 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import unix_from_ns
-from ros2_memory.history.coverage import gap_around, note_unread, note_unrecorded, recording_gaps
+from ros2_memory.history.coverage import (
+    gap_around,
+    note_unread,
+    note_unrecorded,
+    recording_gaps,
+    unix_text,
+)
 from ros2_memory.history.driven_path import length_notes, resolve_path_topic
 from ros2_memory.history.view import View, clamped, open_view
 from ros2_memory.insights.drive import Drive, drive_in
@@ -134,6 +140,11 @@ def _things(
     if first.start == second.start:
         view.notes.add("things are not compared: the two times begin together")
         return frame, ComparedThings((), (), (), (), 0)
+    if second.stop < first.stop:
+        view.notes.add(
+            f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "
+            "times ends within the other"
+        )
     runs = {each.epoch for each in known.estimate.instances}
     if (
         len(runs) > 1

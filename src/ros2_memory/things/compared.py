@@ -92,11 +92,7 @@ class ThingsBetween:
         )
 
     def _counts(self, instance: Instance, before: _Seen | None, after: _Seen | None) -> bool:
-        """Whether a thing was seen there; in the later window alone, if it had not been there."""
-        if before is None and after is not None:
-            known = {each.place for each in instance.stays if each.first < self.earlier.stop}
-            if after.stay.place in known:
-                return False
+        """Whether a thing was seen there in either window."""
         frame = self.known.frames[instance.epoch]
         places = [seen.part.place for seen in (before, after) if seen is not None]
         if self.where is None:
@@ -119,11 +115,16 @@ class ThingsBetween:
             looked = missed_in(estimate.cells, evidence, after.stay.stay, (self.earlier.start, end))
             return "appeared" if looked else "not_looked_at", thing
         if before is not None and after is None:
-            _, looks, crossed = estimate.missing(instance, before.stay)
+            _, looks, crossed = estimate.missing(instance, self._last_there(instance, before))
             if crossed is None or crossed >= self.later.stop:
                 return "not_looked_at", thing
             return "missed", replace(thing, missed=crossed, looks=looks)
         return "moved", thing
+
+    def _last_there(self, instance: Instance, before: _Seen) -> PlacedStay:
+        """Returns a thing's last stay at its place of the earlier window, before the later one."""
+        stays = [each for each in instance.stays if each.place == before.stay.place]
+        return [each for each in stays if each.first < self.later.start][-1]
 
     def _seen(self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS) -> _Seen | None:
         estimate, frame = self.known.estimate, self.known.frames[instance.epoch]

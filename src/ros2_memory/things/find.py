@@ -15,7 +15,7 @@ from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, places_at
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
-from ros2_memory.history.coverage import being_written, describe_held
+from ros2_memory.history.coverage import note_unread
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
@@ -95,6 +95,7 @@ def find_things(
         found = [*beside.among(found, others)]
         if beside.label and not others:
             view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
+    note_unread(view, asked_for, nothing=not found, gaps=not found)
     things = tuple(replace(each.described(), near_m=each.near_m) for each in found[:limit])
     totals: Counter[str] = Counter()
     for each in found:
@@ -118,7 +119,6 @@ def find_things(
         all_counted=known.reaches_back(window),
         notes=(
             *view.notes.sentences(),
-            *describe_held(being_written(view.snapshot, asked_for)),
             *notes_on(view, known.by_all, question),
         ),
     )

@@ -190,6 +190,11 @@ def _tells_runs_and_no_speed(recorded: Any, got: Any) -> bool:
     return _tells_more(recorded, got, _SEVERAL_RUNS, _TOO_SHORT)
 
 
+def _tells_where_things_end(recorded: Any, got: Any) -> bool:
+    """Whether all that is new are notes on until when things are compared, or on several runs."""
+    return _tells_more(recorded, got, "things are not compared after", _SEVERAL_RUNS)
+
+
 def _tells_more(recorded: Any, got: Any, *new: str) -> bool:
     """Whether all that is new are sentences with some words."""
     known = recorded if isinstance(recorded, list) else []
@@ -401,6 +406,13 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
             only=_within(0.6),
         )
         for world in ("home_*", "robot_day_*")
+    ),
+    KnownWrong(
+        "*",
+        "* compare",
+        "/notes",
+        "that nothing is compared after the end of a window within the other is not said",
+        only=_tells_where_things_end,
     ),
     KnownWrong(
         "robot_day_*",

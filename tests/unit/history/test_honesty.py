@@ -71,6 +71,7 @@ def at(second: float) -> float:
     return T0_S + second
 
 
+SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
 TOUCHING: list[tuple[str, dict[str, Any]]] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": at(15), "tolerance_s": 30}),
     ("get_topic_in_range", {"topic": "/odom", "start": at(5), "end": at(25)}),
@@ -108,6 +109,19 @@ TOUCHING: list[tuple[str, dict[str, Any]]] = [
         },
     ),
     ("get_topic_at_time", {"topic": "/nowhere", "timestamp": at(5)}),
+    ("find_things", {}),
+    ("find_things", {"label": "dog"}),
+    ("find_matches", SEEN),
+    ("find_matches", {**SEEN, "by": "day"}),
+    ("find_matches", {**SEEN, "by": "label"}),
+    ("get_topic_in_range", {"topic": "/bumper", "start": at(0), "end": at(29), "changes": True}),
+    ("get_topic_in_range", {"topic": "/bumper", "start": at(0), "end": at(29), "by": "value"}),
+    ("trajectory_summary", {"start": at(0), "end": at(29), "by": "hour"}),
+    ("visits", {"x": 500, "y": 0}),
+    ("visits", {"x": 0.5, "y": 0, "by": "day", "start": at(0), "end": at(29)}),
+    ("recap", {"start": at(0), "end": at(29)}),
+    ("recap", {"around": at(25)}),
+    ("compare", {"start": at(12), "end": at(29), "with_start": at(0), "with_end": at(9)}),
 ]
 APART: list[tuple[str, dict[str, Any]]] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": at(5)}),
@@ -115,6 +129,9 @@ APART: list[tuple[str, dict[str, Any]]] = [
     ("get_position_at", {"timestamp": at(25)}),
     ("get_transform_at", {"parent": "odom", "child": "base_link", "timestamp": at(5)}),
     ("trajectory_summary", {"start": at(21), "end": at(29)}),
+    ("find_things", {"end": at(9)}),
+    ("find_things", {"label": "dog", "start": at(21)}),
+    ("compare", {"start": at(21), "end": at(29), "with_start": at(0), "with_end": at(8)}),
     (
         "find_last_match",
         {"topic": "/odom", "condition_type": "near_position", "value": {"x": 2.5, "y": 0}},
@@ -196,9 +213,6 @@ def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_futu
     later = asked(memory, tmp_path, "get_topic_in_range", **window, start=at(8000))
     assert later["reason"] == "outside_range"
     assert "in the future" in later["detail"]
-
-
-SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
 
 
 def test_a_bag_that_a_crash_left_open_is_reported_with_what_is_lost_of_it(tmp_path: Path) -> None:

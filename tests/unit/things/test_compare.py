@@ -133,6 +133,28 @@ def test_a_thing_is_missed_only_where_the_robot_looked_again(tmp_path: Path) -> 
     assert labels(compared(tmp_path / "after", after)) == {"not_looked_at": ["mug"]}
 
 
+def test_a_thing_that_was_brought_back_in_between_is_not_missed(tmp_path: Path) -> None:
+    seen = [*looked(0, 30, HERE, MUG), *looked(30, 45, HERE)]
+    back = [*seen, *looked(45, 60, HERE, MUG), *looked(60, 90, AWAY)]
+    assert labels(compared(tmp_path / "away", back)) == {"not_looked_at": ["mug"]}
+    gone = [*seen, *looked(45, 60, HERE, MUG), *looked(60, 90, HERE)]
+    [mug] = compared(tmp_path / "gone", gone)["things"]["not_seen_where_expected"]
+    assert (mug["was"]["last_seen"], mug["missed_by"]) == (BEGIN + 29, BEGIN + 69)
+
+
+def test_a_thing_that_was_brought_back_appeared(tmp_path: Path) -> None:
+    there, gone = looked(0, 30, HERE, MUG, BOOK), looked(30, 60, HERE, BOOK)
+    messages = [*there, *gone, *looked(60, 90, HERE, MUG, BOOK)]
+    window = {"with_start": BEGIN + 30, "with_end": BEGIN + 59}
+    reply = compared(tmp_path / "back", messages, **window)
+    assert labels(reply) == {"appeared": ["mug"]}
+    assert reply["things_unchanged"] == 1
+    # It was there before, but whether in the earlier window is not known.
+    away = [*there, *looked(30, 60, AWAY), *looked(60, 90, HERE, MUG, BOOK)]
+    unknown = compared(tmp_path / "away", away, **window)
+    assert labels(unknown) == {"not_looked_at": ["book", "mug"]}
+
+
 def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path: Path) -> None:
     reply = compared(tmp_path, moved_mug(), where="kitchen")
     assert labels(reply) == {"moved": ["mug"]}
@@ -373,6 +395,18 @@ def test_times_that_begin_together_have_no_things_to_compare(tmp_path: Path) -> 
     reply = compared(tmp_path, moved_mug(), start=BEGIN, end=BEGIN + 89)
     assert reply["things"] == {}
     assert "things are not compared: the two times begin together" in reply["notes"]
+
+
+def test_what_a_window_has_after_one_that_lies_in_it_is_not_compared_and_it_says_so(
+    tmp_path: Path,
+) -> None:
+    messages = [*looked(0, 60, HERE, MUG), *looked(60, 90, HERE, MUG, BOOK)]
+    within = {"start": BEGIN + 20, "end": BEGIN + 50, "with_start": BEGIN, "with_end": BEGIN + 89}
+    [note] = [each for each in compared(tmp_path, messages, **within)["notes"] if "things" in each]
+    assert note.startswith(f"things are not compared after {BEGIN + 50}")
+    until_its_end = ask(tmp_path, **{**within, "end": BEGIN + 89})
+    assert labels(until_its_end) == {"appeared": ["book"]}
+    assert not any("things" in each for each in until_its_end["notes"])
 
 
 def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
