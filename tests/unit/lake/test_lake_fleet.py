@@ -100,7 +100,7 @@ def test_what_is_not_shipped_yet_is_answered_from_the_robots_own_bags(tmp_path: 
         assert (found["total"], "from the lake" in str(found)) == (1, False)
     recap = reply(fleet, "recap", {"around": START_S + 12, "robot": "hall"})
     assert "the memory ends" not in str(recap)
-    light = {"topic": "/light", "condition_type": "contains", "value": "on"}
+    light: dict[str, object] = {"topic": "/light", "condition_type": "contains", "value": "on"}
     assert reply(fleet, "find_last_match", light)["matches"][0]["timestamp"] == START_S + 20
 
 

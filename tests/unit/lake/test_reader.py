@@ -9,6 +9,7 @@ from random import Random
 import numpy as np
 import pytest
 
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -17,7 +18,7 @@ from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import BagReader, Channel, Schema
-from tests.support.bags import Msg, detections, text, write_mcap
+from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import fleet_of, lake_robot, location, robot_bags, ship, store_columns
 
@@ -72,6 +73,30 @@ def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memo
 def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> list[int]:
     batches = reader.batches(path, [topic], window, bare=[topic])
     return sorted(time for batch in batches for time in batch.log_times.tolist())
+
+
+def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
+    engine: LakeEngine, tmp_path: Path
+) -> None:
+    names = ("one", "two")
+    for number, name in enumerate(names):
+        at = AT + 20 * number * NS_PER_S
+        messages = [odom(at + nth * NS_PER_S, nth / 9, 0.0) for nth in range(19)]
+        messages.append(detections(at + 5, ["cup"]))
+        write_mcap(tmp_path / "bags" / name / f"{name}_0.mcap", messages)
+    robot = robot_bags("hall", tmp_path / "bags")
+    for name, handover in zip(names, (Handover(next="two"), Handover(previous="one")), strict=True):
+        write_handover(tmp_path / "bags" / name, handover)
+    assert ship(tmp_path / "lake", [robot]).bags == 2
+    bags, lake = (
+        fleet_of({"hall": memory})
+        for memory in (robot.memory, lake_robot(tmp_path / "lake", engine))
+    )
+    asked: dict[str, object] = {"start": START_S, "end": START_S + 60}
+    for tool in ("trajectory_summary", "find_things"):
+        expected = reply(bags, tool, asked)
+        assert "error" not in expected
+        assert reply(lake, tool, asked) == expected
 
 
 def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
