@@ -58,18 +58,6 @@ ROBOT: Final = "robot"
 """The argument that names a robot."""
 _AHEAD_NS: Final[Ns] = 60 * NS_PER_S
 """Data that is newer than now by more was dated by a clock that runs ahead."""
-OF_LAKE: Final = frozenset(
-    {
-        "find_last_match",
-        "find_matches",
-        "find_things",
-        "get_value_when",
-        "visits",
-        "recap",
-        *TABLE_FOR_ALL,
-    }
-)
-"""The tools that are about all that was ever recorded, where they are given no time."""
 _TIMES: Final = ("start", "with_start", "timestamp", "timestamps", "around")
 _LENGTHS: Final = ("last_s", "seconds", "seconds_ago")
 """Arguments that say from when a question is: a time, or seconds before now."""
@@ -243,19 +231,16 @@ class _FleetQuestion:
 
     def _since(self, now: Ns) -> Ns | None:
         """Returns from when the question is; None where it is about the bags that there are."""
-        begins = [
-            now - ns_from_unix(length)
-            for length in map(self.given.get, _LENGTHS)
-            if isinstance(length, int | float)
-        ]
-        for value in map(self.given.get, _TIMES):
+        given = {name: value for name, value in self.given.items() if value is not None}
+        begins = [now - ns_from_unix(float(str(given[name]))) for name in _LENGTHS if name in given]
+        for value in (given[name] for name in _TIMES if name in given):
             for time in value if isinstance(value, list) else [value]:
-                with suppress(ValueError):  # a list as text: each of its times is looked for
-                    seconds = unix_from_text(time) if isinstance(time, str) else time
-                    if isinstance(seconds, int | float):
-                        begins.append(ns_from_unix(seconds))
-        ever = MIN_NS if self.tool.name in OF_LAKE else None
-        return min(begins, default=ever)
+                with suppress(ValueError):  # a list as text
+                    read = unix_from_text if isinstance(time, str) else float
+                    begins.append(ns_from_unix(read(str(time))))
+        # Without a time, searches are about all that there ever was.
+        has_time = self.tool.arguments.keys() & {*_TIMES, *_LENGTHS, "before"}
+        return min(begins, default=MIN_NS if has_time else None)
 
     def _begin_of(self, answer: OneAnswer, lake: FromLake) -> Ns:
         """Returns from when an answer is."""
