@@ -50,6 +50,8 @@ _MOST_WINDOWS: Final = 6
 """Times before the newest days that stay in memory."""
 _TOGETHER: Final = 64
 """Bags of a day whose messages are read together."""
+_NEAR_BYTES: Final = 4 << 20
+"""Packed messages that are read with those of a bag: of the bags before it, and of those after."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
 _HEAD_BYTES: Final = 200
@@ -425,13 +427,16 @@ class LakeReader(BagReader):
         """Returns the packed messages of a channel; None where they are gone.
 
         With it those of other `topics` are read, which are asked for next. Who has read one bag
-        and goes on, reads those beside it, too.
+        and goes on, reads those beside it, too, as many as may be in memory.
         """
         messages = self.index.lake.messages
         known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
         if known is None:
-            beside = [messages.get((*state, number)) for state in bag.together.items()]
-            bags = [*bag.together] if any(beside) else [bag.bag_id]
+            beside = (messages.get((*state, number)) for state in bag.together.items())
+            largest = max(map(len, filter(None, beside)), default=_NEAR_BYTES + 1)
+            near, ids = _NEAR_BYTES // (largest * len(topics)), [*bag.together]
+            at = ids.index(bag.bag_id)
+            bags = ids[max(at - near, 0) : at + near + 1]
             for row in self._select(_PACKED, bag, bags, topics=topics).to_pylist():
                 key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
                 messages.put(key, row["packed"], len(row["packed"]))
