@@ -141,24 +141,21 @@ class Robot:
             NotInLakeError: it needs messages that the lake does not have, nor the robot.
         """
         lake = self.lake
-
-        def own() -> tuple[T, FromLake | None]:
+        if lake is None:
             return ask(self.memory(), call), None
 
-        def shipped() -> tuple[T, FromLake | None]:
-            return own() if lake is None else _of_lake(lake, ask, call)
+        def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
+            return _of_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
 
-        if lake is None or not self._has_bags():
+        if not self._has_bags():
             # A folder that is there says best why nothing is, where nothing was shipped either.
-            is_known = not self.is_mounted or (lake and lake.index.snapshot().latest is not None)
-            return shipped() if is_known else own()
+            return answer(of_lake=not self.is_mounted or lake.index.snapshot().latest is not None)
         is_lakes = _lacks(self.memory(), lake, since)
-        first, second = (shipped, own) if is_lakes else (own, shipped)
         try:
-            return first()
+            return answer(of_lake=is_lakes)
         except (NoDataError, NotInLakeError) as error:
             try:
-                return second()
+                return answer(of_lake=not is_lakes)
             except NoDataError as other:
                 if isinstance(error, NoDataError) and error.reason in _UNKNOWN:
                     raise (error if other.reason in _UNKNOWN else other) from None
@@ -181,7 +178,8 @@ class Robot:
 
         Nothing is scanned for it.
         """
-        published = None if self._memory is None else self._memory.index.published
+        memory = self._memory or self.lake
+        published = None if memory is None else memory.index.published
         latest = None if published is None else published.latest
         return MIN_NS if latest is None else latest
 
