@@ -17,11 +17,13 @@ from ros2_memory.core.errors import (
     InvalidArgumentsError,
     LakeError,
     NoDataError,
+    NoDataReason,
     NotInLakeError,
     QueryTimeoutError,
     RefusedError,
 )
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.history.context import Call, Memory, Stages
@@ -40,6 +42,7 @@ _OF_ONE: Final = 0.4
 """The part of the time of a call that one robot of several may take."""
 _OF_ALL: Final = 0.9
 """The part that all may take together, or one alone; the rest is for merging the answers."""
+_UNKNOWN: Final = (NoDataReason.TOPIC_NOT_RECORDED, NoDataReason.EMPTY_MEMORY)
 _GRACE: Final = 0.05
 """How much later than its limit a robot counts as stuck: a disk that hangs heeds no limit."""
 
@@ -75,9 +78,9 @@ class FromLake(NamedTuple):
         latest = None if published is None else published.latest
         return cls(latest, None if call.older == MAX_NS else call.older)
 
-    def since(self, begin: Ns | None) -> FromLake:
-        """Returns that of an answer from a log time on; None stands for all times."""
-        is_whole = self.older is None or (begin is not None and begin > self.older)
+    def since(self, begin: Ns) -> FromLake:
+        """Returns that of an answer from a log time on."""
+        is_whole = self.older is None or begin > self.older
         return self._replace(older=None) if is_whole else self
 
     @property
@@ -122,37 +125,44 @@ class Robot:
             return self._memory
 
     def asked(
-        self, ask: Callable[[Memory, Call], T], call: Call, *, lake_first: bool
+        self,
+        ask: Callable[[Memory, Call], T],
+        call: Call,
+        since: Callable[[Ns], Ns | None] = lambda _: MIN_NS,
     ) -> tuple[T, FromLake | None]:
         """Returns what `ask` finds in a memory, and what to report with it if that is a lake's.
 
-        With `lake_first` the lake answers, where it has anything of the robot; the mounted memory
-        does where that needs messages that the lake does not have. Without, the mounted one does,
-        unless it has no bag, and the lake where that has no data, as retention deletes bags.
+        The lake answers where it has more of the time `since` (of now) than the robot's own bags,
+        and these do otherwise, or where it is None; where one has no answer, the other does.
 
         Raises:
-            NoDataError: none of the two has an answer; it is that of the mounted one, if any.
-            NotInLakeError: it needs such messages, and the robot has no bags of its own.
+            NoDataError: none of the two has an answer; it is that of the first one that knows the
+                topic.
+            NotInLakeError: it needs messages that the lake does not have, nor the robot.
         """
         lake = self.lake
         if lake is None:
             return ask(self.memory(), call), None
-        if lake_first or not self._has_bags():
-            if not self.is_mounted or lake.index.snapshot().latest is not None:
-                try:
-                    return _of_lake(lake, ask, call)
-                except NotInLakeError:
-                    if not self._has_bags():
-                        raise
-            return ask(self.memory(), call), None
+
+        def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
+            return _of_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
+
+        if not self._has_bags():
+            # A folder that is there says best why nothing is, where nothing was shipped either.
+            return answer(of_lake=not self.is_mounted or lake.index.snapshot().latest is not None)
+        is_lakes = _lacks(self.memory(), lake, since)
         try:
-            return ask(self.memory(), call), None
-        except NoDataError as error:
+            return answer(of_lake=is_lakes)
+        except (NoDataError, NotInLakeError) as error:
             try:
-                return _of_lake(lake, ask, call)
-            except NoDataError:
+                return answer(of_lake=not is_lakes)
+            except NoDataError as other:
+                if isinstance(error, NoDataError) and error.reason in _UNKNOWN:
+                    raise (error if other.reason in _UNKNOWN else other) from None
                 raise error from None
             except (RefusedError, LakeError, QueryTimeoutError) as failure:
+                if is_lakes or not isinstance(error, NoDataError):
+                    raise
                 notes = (*error.notes, f"the lake has no answer either: {failure}")
                 raise NoDataError(error.reason, error.detail, notes) from failure
 
@@ -168,9 +178,37 @@ class Robot:
 
         Nothing is scanned for it.
         """
-        published = None if self._memory is None else self._memory.index.published
+        memory = self._memory or self.lake
+        published = None if memory is None else memory.index.published
         latest = None if published is None else published.latest
         return MIN_NS if latest is None else latest
+
+
+def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
+    """Returns whether a lake has more of a time than a robot's own bags have.
+
+    What is newer than the lake does not count. Retention may delete any bag, or parts of it.
+
+    Raises:
+        EpisodicError: the lake cannot be read, and these bags do not reach back so far.
+    """
+    there = own.index.snapshot()
+    begin = since(own.now(own.clock.now(), there.latest))
+    if begin is None:
+        return False
+    try:
+        known = lake.index.snapshot()
+    except (RefusedError, LakeError):
+        if there.earliest is None or begin < there.earliest:
+            raise
+        return False
+    if known.older is not None and begin <= known.older:
+        return True
+    window = TimeWindow(begin, MIN_NS if known.latest is None else known.latest + 1)
+    here, shipped = (
+        sum(bag.size for bag in one.timeline.overlapping(window)) for one in (there, known)
+    )
+    return shipped > here
 
 
 def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:

@@ -7,6 +7,7 @@ several, their replies become one (`merging`), and what keeps a robot from answe
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, cast
@@ -27,6 +28,7 @@ from ros2_memory.core.timebase import (
     NS_PER_S,
     Ns,
     ns_from_unix,
+    unix_from_text,
     unix_rounded_up,
 )
 from ros2_memory.fleet.merging import (
@@ -56,10 +58,9 @@ ROBOT: Final = "robot"
 """The argument that names a robot."""
 _AHEAD_NS: Final[Ns] = 60 * NS_PER_S
 """Data that is newer than now by more was dated by a clock that runs ahead."""
-OF_LAKE: Final = frozenset(
-    {"find_last_match", "find_matches", "find_things", "visits", "recap", *TABLE_FOR_ALL}
-)
-"""The tools that ask a lake first, where there is one."""
+_TIMES: Final = ("start", "with_start", "timestamp", "timestamps", "around")
+_LENGTHS: Final = ("last_s", "seconds", "seconds_ago")
+"""Arguments that say from when a question is: a time, or seconds before now."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
 """Tools whose reply says itself that a bag directory is missing."""
 
@@ -155,8 +156,8 @@ class _FleetQuestion:
 
         def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
             one = partial(_answer, self.question)
-            answer, lake = robot.asked(one, own, lake_first=self.tool.name in OF_LAKE)
-            return answer, lake, own.now
+            answer, lake = robot.asked(one, own, self._since)
+            return answer, lake and lake.since(self._begin_of(answer, lake)), own.now
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
@@ -164,8 +165,7 @@ class _FleetQuestion:
         answer, lake, now = found
         notes: tuple[str, ...] = ()
         if lake is not None:
-            unseen = lake.since(_begin_of(self.given, answer, lake.latest)).notes
-            notes = (*shipped_to({robot.name: lake.latest}), *unseen)
+            notes = (*shipped_to({robot.name: lake.latest}), *lake.notes)
         return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
 
     def _of_all(self, robots: list[Robot], call: Call) -> OfFleet:
@@ -226,9 +226,28 @@ class _FleetQuestion:
                 value = {"now": unix_rounded_up(own.now), **value}
             return RobotReply(robot.name, value, latest, is_ahead), answer
 
-        (reply, answer), lake = robot.asked(ask, call, lake_first=self.tool.name in OF_LAKE)
-        begin = None if lake is None else _begin_of(self.given, answer, lake.latest)
-        return replace(reply, lake=lake and lake.since(begin))
+        (reply, answer), lake = robot.asked(ask, call, self._since)
+        return replace(reply, lake=lake and lake.since(self._begin_of(answer, lake)))
+
+    def _since(self, now: Ns) -> Ns | None:
+        """Returns from when the question is; None where it is about the bags that there are."""
+        given = {name: value for name, value in self.given.items() if value is not None}
+        begins = [now - ns_from_unix(float(str(given[name]))) for name in _LENGTHS if name in given]
+        for value in (given[name] for name in _TIMES if name in given):
+            for time in value if isinstance(value, list) else [value]:
+                with suppress(ValueError):  # a list as text
+                    read = unix_from_text if isinstance(time, str) else float
+                    begins.append(ns_from_unix(read(str(time))))
+        # Without a time, searches are about all that there ever was.
+        has_time = self.tool.arguments.keys() & {*_TIMES, *_LENGTHS, "before"}
+        return min(begins, default=MIN_NS if has_time else None)
+
+    def _begin_of(self, answer: OneAnswer, lake: FromLake) -> Ns:
+        """Returns from when an answer is."""
+        if isinstance(answer, Match) and answer.found is not None:
+            return answer.found.sample.time
+        begin = self._since(MIN_NS if lake.latest is None else lake.latest)
+        return MIN_NS if begin is None else begin
 
 
 @dataclass(eq=False)
@@ -259,18 +278,6 @@ class _Page:
         if self.oldest_first:
             return TimeWindow(MIN_NS, last + _SHOWN_NS)
         return TimeWindow(last - _SHOWN_NS, MAX_NS)
-
-
-def _begin_of(given: Mapping[str, object], answer: OneAnswer, latest: Ns | None) -> Ns | None:
-    """Returns from when an answer is: its match, or the start that was given; None if from ever."""
-    if isinstance(answer, Match) and answer.found is not None:
-        return answer.found.sample.time
-    start, last_s = given.get("start"), given.get("last_s", given.get("seconds"))
-    if isinstance(start, int | float):
-        return ns_from_unix(start)
-    if latest is None or not isinstance(last_s, int | float):
-        return None
-    return latest - ns_from_unix(last_s)
 
 
 def _answer(question: Question, memory: Memory, call: Call) -> OneAnswer:

@@ -110,6 +110,9 @@ class SnapshotSource(Protocol):
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that the directory's recorder did not make; None if not known."""
 
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """Returns the names of the recordings beside one that handovers join with it."""
+
 
 @dataclass(frozen=True, slots=True)
 class Memory:

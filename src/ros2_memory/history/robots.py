@@ -112,7 +112,7 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     found: list[Mixed] = []
     bags: Mapping[str, Sequence[BagFile]] | None = None
     steps = _steps_back(view)
-    for pair in overlapping_recordings(view.snapshot):
+    for pair in overlapping_recordings(view.snapshot, memory.index.joined_with):
         key = (pair.first, pair.second)
         before, topic = known.get(key, (None, None))
         by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])

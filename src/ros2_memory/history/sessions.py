@@ -17,7 +17,6 @@ from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import proxy
 
-from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.memo import Key
@@ -149,7 +148,8 @@ class Sessions:
         """Whether two recordings are of one session."""
         if self.of(one) == self.of(other):
             return True
-        return other.name in _neighbours(one) or one.name in _neighbours(other)
+        joined_with = self._view.memory.index.joined_with
+        return other.name in joined_with(one) or one.name in joined_with(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
         """Returns the session whose transforms hold for a message of a recording.
@@ -252,7 +252,7 @@ class Sessions:
         chains = components(
             (folder, f"{folder.rpartition('/')[0]}/{name}")
             for folder, path in (paths.items() if len(paths) > 1 else ())
-            for name in _neighbours(path)
+            for name in self._view.memory.index.joined_with(path)
         )
         return _Recorded(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
@@ -276,9 +276,3 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
 def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:
     """Returns how far a moment is from a span of time."""
     return max(span[0] - moment, moment - span[1], 0)
-
-
-def _neighbours(recording: Path) -> tuple[str, ...]:
-    """Returns the names of the recordings before and after one, joined with it by a handover."""
-    handover = read_handover(recording).handover
-    return tuple(filter(None, (handover.previous, handover.next)))

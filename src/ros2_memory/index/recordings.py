@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from weakref import WeakKeyDictionary
 
-from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import BAG_KINDS, MOMENTS_FOLDER, is_thinned
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
@@ -30,7 +29,7 @@ from ros2_memory.index.split_order import split_of, stem_of
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.index.snapshot import Snapshot
@@ -192,14 +191,17 @@ class Overlapping(NamedTuple):
         return first, second
 
 
-def overlapping_recordings(snapshot: Snapshot) -> tuple[Overlapping, ...]:
+def overlapping_recordings(
+    snapshot: Snapshot, joined_with: Callable[[Path], tuple[str, ...]]
+) -> tuple[Overlapping, ...]:
     """Returns the pairs of recordings that overlap and that no handover joins, in order of time.
 
+    `joined_with` returns the names of recordings that handovers join with one.
     Thinned days and bags that a wrong clock dated are left out. Those in a saved moment count with
     the recording that they were saved from.
     """
     overlaps = snapshot.timeline.memo.of(_OVERLAPS, partial(_long_overlaps, snapshot))
-    return tuple(each for each in overlaps if not _took_over(each))
+    return tuple(each for each in overlaps if not _took_over(each, joined_with))
 
 
 def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:
@@ -250,10 +252,8 @@ def _recorded_folder(folder: str) -> str:
     return f"{found['bag_dir']}/{found['recording']}" if found else folder
 
 
-def _took_over(pair: Overlapping) -> bool:
+def _took_over(pair: Overlapping, joined_with: Callable[[Path], tuple[str, ...]]) -> bool:
     """Returns whether a handover joins the two recordings."""
-    names = {pair.first.name, pair.second.name}
-    handovers = (read_handover(each).handover for each in (pair.first, pair.second))
-    return pair.first.parent == pair.second.parent and any(
-        names & {handover.previous, handover.next} for handover in handovers
-    )
+    one, other = pair.first, pair.second
+    is_named = other.name in joined_with(one) or one.name in joined_with(other)
+    return one.parent == other.parent and is_named

@@ -25,6 +25,7 @@ from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingA
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.history.context import Call, Memory, SnapshotSource
@@ -97,6 +98,10 @@ class OneSnapshot:
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """As above."""
         return self._index.foreign(snapshot)
+
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """As above."""
+        return self._index.joined_with(recording)
 
 
 def in_each(

@@ -50,13 +50,15 @@ _MOST_WINDOWS: Final = 6
 """Times before the newest days that stay in memory."""
 _TOGETHER: Final = 64
 """Bags of a day whose messages are read together."""
+_NEAR_BYTES: Final = 4 << 20
+"""Packed messages that are read with those of a bag: of the bags before it, and of those after."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
 _HEAD_BYTES: Final = 200
 _HEADS_BYTES: Final = 8 << 20
 
 _BAGS: Final = (
-    f"SELECT {', '.join(ShippedBag._fields)}, summary, counts FROM bags"  # noqa: S608 - constants
+    f"SELECT {', '.join(ShippedBag._fields)}, summary, counts, joined FROM bags"  # noqa: S608 - constants
     " ORDER BY start_ns, end_ns, bag_id"
 )
 _HEADS: Final = (
@@ -77,12 +79,14 @@ class LakeBag(NamedTuple):
         bag_id: its id there.
         day: the day that its rows are under.
         file: the bag, by the path that it had on the robot.
+        joined: the recordings that handovers join with its own.
         together: the states by id of the bags of that day that are read together.
     """
 
     bag_id: str
     day: date
     file: BagFile
+    joined: tuple[str, ...]
     together: dict[str, int]
 
 
@@ -95,12 +99,14 @@ class _Window:
         made_of: the files whose rows are the bags of each day.
         timeline: the bags of all.
         bags: these by their paths.
+        joined: names of recordings that handovers join with one, by its folder.
     """
 
     older: Ns | None = None
     made_of: Days = field(default_factory=dict)
     timeline: Timeline = field(default_factory=Timeline)
     bags: Mapping[str, LakeBag] = field(default_factory=dict)
+    joined: Mapping[Path, tuple[str, ...]] = field(default_factory=dict)
 
 
 def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date | None]:
@@ -202,6 +208,11 @@ class LakeIndex:
         del snapshot
         return None
 
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """Returns what the robot's handovers were when the bags were shipped."""
+        found = (window.joined.get(recording) for window in self._windows.values())
+        return next(filter(None, found), ())
+
     def bag(self, path: Path) -> LakeBag:
         """Returns the bag of a snapshot that has a path there.
 
@@ -227,7 +238,8 @@ class LakeIndex:
             timeline = known.timeline.changed(
                 _missing(known.bags, bags), _missing(bags, known.bags)
             )
-            window = _Window(window.older, made_of, timeline, bags)
+            joined = {bag.file.recording: bag.joined for bag in bags.values() if bag.joined}
+            window = _Window(window.older, made_of, timeline, bags, joined)
         # A new dict: other threads look for the bags of their answers in the old one.
         windows = {day: one for day, one in self._windows.items() if day != until} | {until: window}
         dated = [day for day in windows if day != date.max]
@@ -243,7 +255,7 @@ class LakeIndex:
         groups: dict[tuple[date, int], dict[str, int]] = {}
         found: dict[str, LakeBag] = {}
         for row in rows.to_pylist():
-            schema, counts = row.pop("summary"), row.pop("counts")
+            schema, counts, joined = map(row.pop, ("summary", "counts", "joined"))
             bag = ShippedBag(**row)
             path = f"{self.bag_dir}/{bag.file.removesuffix(COMPRESSED)}"
             # Another bag may have it, whose name was used again.
@@ -262,7 +274,9 @@ class LakeIndex:
             together = groups.setdefault((bag.day, of_day[bag.day] // _TOGETHER), {})
             together[bag.bag_id] = state
             of_day[bag.day] += 1
-            found[path] = LakeBag(bag.bag_id, bag.day, file, together)
+            found[path] = LakeBag(
+                bag.bag_id, bag.day, file, tuple(joined.split("/")) if joined else (), together
+            )
         return found
 
 
@@ -413,13 +427,16 @@ class LakeReader(BagReader):
         """Returns the packed messages of a channel; None where they are gone.
 
         With it those of other `topics` are read, which are asked for next. Who has read one bag
-        and goes on, reads those beside it, too.
+        and goes on, reads those beside it, too, as many as may be in memory.
         """
         messages = self.index.lake.messages
         known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
         if known is None:
-            beside = [messages.get((*state, number)) for state in bag.together.items()]
-            bags = [*bag.together] if any(beside) else [bag.bag_id]
+            beside = (messages.get((*state, number)) for state in bag.together.items())
+            largest = max(map(len, filter(None, beside)), default=_NEAR_BYTES + 1)
+            near, ids = _NEAR_BYTES // (largest * len(topics)), [*bag.together]
+            at = ids.index(bag.bag_id)
+            bags = ids[max(at - near, 0) : at + near + 1]
             for row in self._select(_PACKED, bag, bags, topics=topics).to_pylist():
                 key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
                 messages.put(key, row["packed"], len(row["packed"]))

@@ -98,9 +98,9 @@ def sha256_of(path: Path) -> str:
 def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
     """Returns what the rows of a bag depend on besides its bytes.
 
-    That is which of its messages count, the static transforms in force, what the robot is placed
-    by, the spellings of labels, the settings (`config`) and the topics whose `messages` are
-    shipped.
+    That is which of its messages count, the handovers of its recording, the static transforms in
+    force, what the robot is placed by, the spellings of labels, the settings (`config`) and the
+    topics whose `messages` are shipped.
     """
     counted = [
         (known.topic, known.type, known.count, known.first, known.last)
@@ -111,7 +111,10 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     statics = repr(static_at(static_transforms(view, among), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
     return _digest(
-        [ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted]
+        [
+            *(ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted),
+            *memory.index.joined_with(bag.recording),
+        ]
     )
 
 
@@ -176,6 +179,7 @@ class _BagRows:
                 **driven,
                 "summary": self._bag.summary.schema.to_json(),
                 "counts": self._bag.summary.packed,
+                "joined": "/".join(self._memory.index.joined_with(self._bag.recording)) or None,
             }
         )
         return self._rows

@@ -9,7 +9,7 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 from __future__ import annotations
 
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
@@ -48,7 +48,8 @@ log = get_logger(__name__)
 
 MOST_BAGS: Final = 2_000
 MOST_ROWS: Final = 200_000
-"""Of one batch: they are in memory until it is committed."""
+MOST_BYTES: Final = 64 << 20
+"""Of one batch: its rows are in memory, and their packed messages, until it is committed."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
 """A bag lies in the lake up to so far from where it begins and ends now: more of it counted."""
 
@@ -124,14 +125,15 @@ class Shipper:
         """
         done = Shipped()
         batch: list[_Ready] = []
-        rows = 0
+        rows = size = 0
         for robot in [robot for robot in self.robots if self._forget(robot, done)]:
             for ready in robot.ready(self, done):
                 batch.append(ready)
                 rows += sum(map(len, ready.rows.values()))
-                if len(batch) >= self.most_bags or rows >= MOST_ROWS:
+                size += sum(len(cast("bytes", row["packed"])) for row in ready.rows["channels"])
+                if len(batch) >= self.most_bags or rows >= MOST_ROWS or size >= MOST_BYTES:
                     self._commit(batch, done)
-                    batch, rows = [], 0
+                    batch, rows, size = [], 0, 0
         if batch:
             self._commit(batch, done)
         return done

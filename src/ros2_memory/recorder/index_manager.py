@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
+from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagFile, BagState
@@ -150,6 +151,11 @@ class IndexManager:
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Measures the bags that the recorder did not make; returns None if that is unknown."""
         return self._foreign.measured(snapshot, read_heartbeat(self.bag_dir).recordings)
+
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """Returns the recordings that a handover names as those before and after one."""
+        handover = read_handover(recording).handover
+        return tuple(filter(None, (handover.previous, handover.next)))
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the recorder's last heartbeat, live or not; None if it cannot be read."""

@@ -9,24 +9,27 @@ import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import Memory
 from ros2_memory.index.recordings import Overlapping, overlapping_recordings
-from ros2_memory.index.snapshot import Snapshot
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of
 
 T0 = 1_700_000_000
 
 
-def snapshot(folder: Path, spans: Mapping[str, Sequence[tuple[float, float]]]) -> Snapshot:
+def robot(folder: Path, spans: Mapping[str, Sequence[tuple[float, float]]]) -> Memory:
     """Bags of odometry at 10 Hz, by recording, from and until so many seconds."""
     for recording, times in spans.items():
         for number, (first, last) in enumerate(times):
             tenths = range(round(first * 10), round(last * 10) + 1)
             messages = [odom((T0 * 10 + n) * NS_PER_S // 10, 0.0, 0.0) for n in tenths]
             write_mcap(folder / recording / f"{number}.mcap", messages)
-    memory = memory_of(folder)
-    memory.index.refresh()
-    return memory.index.snapshot()
+    return memory_of(folder)
+
+
+def overlapping(memory: Memory) -> tuple[Overlapping, ...]:
+    index = memory.index
+    return overlapping_recordings(index.refresh(), index.joined_with)
 
 
 def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]:
@@ -38,40 +41,40 @@ def pairs(found: tuple[Overlapping, ...]) -> list[tuple[str, str, float, float]]
 
 def test_two_runs_at_once_are_named_with_the_time_that_they_share(tmp_path: Path) -> None:
     spans = {"a": [(0.0, 20.0), (20.1, 40.0)], "b": [(15.0, 30.0)], "c": [(50.0, 60.0)]}
-    assert pairs(overlapping_recordings(snapshot(tmp_path, spans))) == [("a", "b", 15.0, 30.0)]
+    assert pairs(overlapping(robot(tmp_path, spans))) == [("a", "b", 15.0, 30.0)]
 
 
 def test_splits_of_one_recording_may_overlap(tmp_path: Path) -> None:
-    assert overlapping_recordings(snapshot(tmp_path, {"a": [(0, 20), (5, 30)]})) == ()
+    assert overlapping(robot(tmp_path, {"a": [(0, 20), (5, 30)]})) == ()
 
 
 def test_a_hole_in_a_recording_is_no_part_of_it(tmp_path: Path) -> None:
     spans = {"a": [(0, 10), (100, 110)], "b": [(20, 90)]}
-    assert overlapping_recordings(snapshot(tmp_path, spans)) == ()
+    assert overlapping(robot(tmp_path, spans)) == ()
 
 
 def test_a_short_overlap_of_long_recordings_is_that_of_a_rotation(tmp_path: Path) -> None:
     spans = {"a": [(0.0, 60.0)], "b": [(55.0, 120.0)]}
-    assert overlapping_recordings(snapshot(tmp_path, spans)) == ()
+    assert overlapping(robot(tmp_path, spans)) == ()
 
 
 @pytest.mark.parametrize("side", ["previous", "next"])
 def test_however_long_a_handover_took_its_recordings_are_one(tmp_path: Path, side: str) -> None:
-    taken = snapshot(tmp_path, {"a": [(0, 60)], "b": [(5, 60)]})
-    assert len(overlapping_recordings(taken)) == 1
+    taken = robot(tmp_path, {"a": [(0, 60)], "b": [(5, 60)]})
+    assert len(overlapping(taken)) == 1
     if side == "next":
         write_handover(tmp_path / "a", Handover(next="b"))
     else:
         write_handover(tmp_path / "b", Handover(previous="a"))
-    assert overlapping_recordings(taken) == ()
+    assert overlapping(taken) == ()
 
 
 def test_what_is_kept_of_a_recording_is_a_part_of_it(tmp_path: Path) -> None:
     spans = {"a": [(0, 10)], "moments/20261120T080000Z-cup/a": [(5, 15)], "b": [(8, 20)]}
-    taken = snapshot(tmp_path, spans)
-    assert pairs(overlapping_recordings(taken)) == [("a", "b", 8.0, 15.0)]
+    taken = robot(tmp_path, spans)
+    assert pairs(overlapping(taken)) == [("a", "b", 8.0, 15.0)]
     write_handover(tmp_path / "b", Handover(previous="a"))
-    assert overlapping_recordings(taken) == ()
+    assert overlapping(taken) == ()
 
 
 def test_folders_of_one_name_are_told_apart() -> None:

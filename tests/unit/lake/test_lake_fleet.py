@@ -5,8 +5,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
+from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import anyio
 import pytest
@@ -87,6 +89,46 @@ def test_what_retention_deleted_of_a_mounted_robot_is_answered_from_the_lake(
     assert ("lake" in json.dumps(nothing)) is not left
 
 
+def test_what_is_not_shipped_yet_is_answered_from_the_robots_own_bags(tmp_path: Path) -> None:
+    write_bag(tmp_path / "hall", 0)
+    ship_from(tmp_path)
+    new = write_bag(tmp_path / "hall", 1)
+    write_mcap(new.with_name("rec_2.mcap"), [text((START_S + 20) * NS_PER_S, "on", "/light")])
+    fleet, cup = served(tmp_path), {**CUP, "robot": "hall"}
+    for begin in (START_S + 10, datetime.fromtimestamp(START_S + 10, UTC).isoformat()):
+        found = reply(fleet, "find_matches", {**cup, "start": begin})
+        assert (found["total"], "from the lake" in str(found)) == (1, False)
+    recap = reply(fleet, "recap", {"around": START_S + 12, "robot": "hall"})
+    assert "the memory ends" not in str(recap)
+    light: dict[str, object] = {"topic": "/light", "condition_type": "contains", "value": "on"}
+    assert reply(fleet, "find_last_match", light)["matches"][0]["timestamp"] == START_S + 20
+
+
+def test_what_begins_before_the_robots_own_bags_is_answered_from_the_lake(tmp_path: Path) -> None:
+    bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
+    write_mcap(bags[0].with_name("rec_2.mcap"), [text(START_S * NS_PER_S, "on", "/light")])
+    ship_from(tmp_path)
+    for bag in (bags[0], bags[0].with_name("rec_2.mcap")):
+        bag.unlink()
+    fleet = served(tmp_path)
+
+    def answer(tool: str, **given: object) -> Any:
+        return reply(fleet, tool, {"robot": "hall", **given})
+
+    chatter = {"topic": "/chatter", "start": START_S, "end": START_S + 20}
+    assert answer("get_topic_in_range", **chatter)["total"] == 6
+    assert answer("get_topic_in_range", **{**chatter, "start": START_S + 10})["total"] == 3
+    when = {"timestamps": [START_S + 1, START_S + 11]}
+    at_each = answer("get_topic_at_time", topic="/chatter", **when)
+    assert [row["value"] for row in at_each["results"]] == [{"value": "n1"}, {"value": "n101"}]
+    both = {"start": START_S + 10, "end": START_S + 12, "with_start": START_S}
+    assert "nothing was recorded" not in str(answer("compare", **both, with_end=START_S + 2))
+    light = {"condition_topic": "/light", "condition_type": "contains", "value": "on"}
+    assert answer("get_value_when", value_topic="/chatter", **light)["value"] == {"value": "n0"}
+    gone = answer("get_topic_at_time", topic="/light", timestamp=START_S + 12)
+    assert gone["reason"] == "outside_range"
+
+
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
     bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
     ship_from(tmp_path)
@@ -95,10 +137,11 @@ def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Pa
     for file in (tmp_path / "lake").rglob("*.parquet"):
         file.unlink()
     asked = {"robot": "hall", "topic": "/chatter"}
-    assert "notes" not in reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 11})
+    new = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 11})
+    assert (new["value"], "notes" in new) == ({"value": "n101"}, False)
     old = reply(fleet, "get_topic_at_time", {**asked, "timestamp": START_S + 1})
-    assert old["error"] == "no_data"
-    assert any("the lake has no answer either: " in note for note in old["notes"])
+    assert old["error"] == "refused"
+    assert old["detail"].startswith("the lake cannot be read")
 
 
 def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path: Path) -> None:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from random import Random
+from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pytest
 
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -17,9 +20,18 @@ from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import BagReader, Channel, Schema
-from tests.support.bags import Msg, detections, text, write_mcap
+from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
-from tests.support.lakes import fleet_of, lake_robot, location, robot_bags, ship, store_columns
+from tests.support.lakes import (
+    fleet_of,
+    lake_robot,
+    location,
+    robot_bags,
+    ship,
+    ship_from,
+    store_columns,
+    write_bag,
+)
 
 AT = START_S * NS_PER_S
 EVERYTHING = TimeWindow.everything()
@@ -72,6 +84,55 @@ def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memo
 def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> list[int]:
     batches = reader.batches(path, [topic], window, bare=[topic])
     return sorted(time for batch in batches for time in batch.log_times.tolist())
+
+
+@pytest.mark.parametrize("bags_near", [0, 2, 100])
+def test_bags_are_read_together_as_far_as_they_fit_into_memory(
+    engine: LakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bags_near: int
+) -> None:
+    for number in range(12):
+        write_bag(tmp_path / "hall", number)
+    ship_from(tmp_path)
+    memory, read = lake_robot(tmp_path / "lake", engine), list[pa.Table]()
+    select_from = engine.select
+
+    def select(sql: str, *given: Any) -> pa.Table:
+        found = select_from(sql, *given)
+        read.extend([found] if "packed" in found.column_names else [])
+        return found
+
+    monkeypatch.setattr(engine, "select", select)
+    monkeypatch.setattr("ros2_memory.lake.memory._NEAR_BYTES", 100 * bags_near)
+    for bag in memory.index.snapshot().bags:
+        assert [*memory.reader.batches(Path(bag.file), ["/chatter"], EVERYTHING)]
+    sizes = [len(data) for table in read for data in table["packed"].to_pylist()]
+    assert all(50 < size <= 100 for size in sizes)
+    assert max(table.num_rows for table in read) <= 2 * (2 * bags_near) + 1
+    assert len(sizes) <= 12 * 2.5
+
+
+def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
+    engine: LakeEngine, tmp_path: Path
+) -> None:
+    names = ("one", "two")
+    for number, name in enumerate(names):
+        at = AT + 20 * number * NS_PER_S
+        messages = [odom(at + nth * NS_PER_S, nth / 9, 0.0) for nth in range(19)]
+        messages.append(detections(at + 5, ["cup"]))
+        write_mcap(tmp_path / "bags" / name / f"{name}_0.mcap", messages)
+    robot = robot_bags("hall", tmp_path / "bags")
+    for name, handover in zip(names, (Handover(next="two"), Handover(previous="one")), strict=True):
+        write_handover(tmp_path / "bags" / name, handover)
+    assert ship(tmp_path / "lake", [robot]).bags == 2
+    bags, lake = (
+        fleet_of({"hall": memory})
+        for memory in (robot.memory, lake_robot(tmp_path / "lake", engine))
+    )
+    asked: dict[str, object] = {"start": START_S, "end": START_S + 60}
+    for tool in ("trajectory_summary", "find_things"):
+        expected = reply(bags, tool, asked)
+        assert "error" not in expected
+        assert reply(lake, tool, asked) == expected
 
 
 def test_messages_that_are_not_there_are_refused_and_their_times_are_not(

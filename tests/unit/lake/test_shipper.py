@@ -76,6 +76,16 @@ def _snapshots(folder: Path) -> dict[str, int]:
         return {name: len(lake.current(name).snapshots()) for name in TABLES}
 
 
+def test_a_batch_has_as_many_bytes_of_messages_as_memory_may_hold(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with shipping(tmp_path, [robot_bags("hall", fleet / "hall")], most_bags=100) as shipper:
+        monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
+        commits: list[None] = []
+        shipper.pause = lambda: commits.append(None)
+        assert shipper.run().bags == len(commits) == BAGS
+
+
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
     fleet: Path, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -114,7 +115,8 @@ def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: W
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     asked: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
-    *_, note = reply(world.both(), "find_last_match", asked)["notes"]
+    unmounted = [replace(robot, is_mounted=False) for robot in world.both().robots.values()]
+    *_, note = reply(Fleet(unmounted, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
         name: robot.memory().index.snapshot().latest for name, robot in world.lake.robots.items()
     }

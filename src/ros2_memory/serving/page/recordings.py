@@ -73,6 +73,10 @@ class OneRecording:
         """Returns the bags of a snapshot that the directory's recorder did not make."""
         return self._index.foreign(snapshot)
 
+    def joined_with(self, recording: Path) -> tuple[str, ...]:
+        """Returns the recordings that handovers join with one."""
+        return self._index.joined_with(recording)
+
 
 class Recordings:
     """The recordings of a memory, and a memory for each that is looked at. Thread-safe."""
