@@ -28,6 +28,7 @@ from ros2_memory.bootstrap_fleet import build_fleet
 from ros2_memory.cli.options import EXIT_NEGATIVE
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.malloc import share_one_arena
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -195,6 +196,7 @@ def _asked(place: Path, question: Question) -> Asked:
 
 def _dispatcher(settings: Settings) -> Dispatcher:
     """Returns what answers as the server does, having looked at all bags."""
+    share_one_arena()
     gc.set_threshold(NEW_OBJECTS)
     memory, fleet = build_memory(settings), build_fleet(settings)
     if fleet is None:

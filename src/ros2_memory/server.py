@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory import package_version
 from ros2_memory.core.logging_setup import configure_logging, get_logger
+from ros2_memory.core.malloc import share_one_arena
 from ros2_memory.core.text import counted
 from ros2_memory.serving.listen import CannotListenError, resolved
 
@@ -58,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     configuration or the command line is refused, or a token is missing where there must be one.
     """
     given = _parser().parse_args(argv)
+    share_one_arena()
     gc.disable()  # until the server is built: imports make many objects, and no garbage
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: sys.exit(0))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import threading
 import time
 from collections import deque
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
+
+from ros2_memory.core.malloc import return_free_memory
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -116,10 +117,3 @@ class LargeReads:
             block.has_turn = False
             self._queue.popleft()
             self._changed.notify_all()
-
-
-def return_free_memory() -> None:
-    """Returns memory that is free to the system, where the C library can."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:
-        trim(0)

@@ -62,7 +62,7 @@ _TIMES: Final = ("start", "with_start", "timestamp", "timestamps", "around")
 _LENGTHS: Final = ("last_s", "seconds", "seconds_ago")
 """Arguments that say from when a question is: a time, or seconds before now."""
 _REPORTS_ITSELF: Final = frozenset({"memory_status", "data_time_range"})
-"""Tools whose reply says itself that a bag directory is missing."""
+"""Tools about the bags that a robot has, which say themselves that its directory is missing."""
 
 
 _SHOWN_NS: Final[Ns] = NS_PER_S // 1000
@@ -239,8 +239,9 @@ class _FleetQuestion:
                     read = unix_from_text if isinstance(time, str) else float
                     begins.append(ns_from_unix(read(str(time))))
         # Without a time, searches are about all that there ever was.
-        has_time = self.tool.arguments.keys() & {*_TIMES, *_LENGTHS, "before"}
-        return min(begins, default=MIN_NS if has_time else None)
+        takes_time = self.tool.arguments.keys() & {*_TIMES, *_LENGTHS, "before"}
+        searches = takes_time and self.tool.name not in _REPORTS_ITSELF
+        return min(begins, default=MIN_NS if searches else None)
 
     def _begin_of(self, answer: OneAnswer, lake: FromLake) -> Ns:
         """Returns from when an answer is."""

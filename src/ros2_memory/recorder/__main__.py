@@ -7,7 +7,6 @@ recording.
 from __future__ import annotations
 
 import argparse
-import ctypes
 import signal
 import sys
 import time
@@ -37,6 +36,7 @@ from ros2_memory.config import (
 )
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.malloc import return_large_at_once, share_one_arena
 from ros2_memory.core.sd_notify import (
     READY,
     STOPPING,
@@ -64,8 +64,6 @@ TICK_S: Final = 0.2
 RECOVER_EVERY_S: Final = 60.0
 CACHE_MB: Final = 1
 """Every bag is read once: a cache of chunks would only take memory."""
-_MALLOPT: Final = {-8: 1, -3: 1 << 16, -1: 1 << 16}
-"""M_ARENA_MAX, M_MMAP_THRESHOLD and M_TRIM_THRESHOLD of the GNU C library."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
@@ -91,7 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             notify(READY)
             return 0
         try:
-            _return_freed_memory()
+            share_one_arena()
+            return_large_at_once()
             _record(settings)
         except ConfigError:
             raise
@@ -103,14 +102,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             # It came while the bag directory was put in order, which can be interrupted.
             return INTERRUPTED
     return 0
-
-
-def _return_freed_memory() -> None:
-    """Has the C library give back what is freed; by default it keeps some MB for each thread."""
-    with suppress(OSError, AttributeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        for option, value in _MALLOPT.items():
-            mallopt(option, value)
 
 
 def _record(settings: Settings) -> None:

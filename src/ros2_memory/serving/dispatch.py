@@ -27,8 +27,9 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.large_reads import LargeReads, return_free_memory
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.malloc import return_free_memory
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.text import abbreviate, shortened
 from ros2_memory.core.timebase import Deadline, Ns, ns_from_unix, unix_from_ns
