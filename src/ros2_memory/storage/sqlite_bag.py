@@ -25,6 +25,7 @@ from typing import IO, TYPE_CHECKING, Final
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
     ROS2_PROFILE,
@@ -173,9 +174,9 @@ class SqliteBags:
         orphans = sum(row[1] for row in rows) - sum(each.messages for each in totals)
         notes = [] if right else [_WRONG_INDEX]
         if orphans:
-            notes.append(f"{orphans} messages belong to no topic and were left out")
+            notes.append(f"left out: {counted(orphans, 'message')} of no topic")
         if impossible := sum(row[1] for row in found if row[5]):
-            notes.append(f"{impossible} messages bear no possible log time")
+            notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
         return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
 

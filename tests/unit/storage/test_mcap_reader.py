@@ -462,7 +462,7 @@ class TestWhatAWriterMayDo:
             reader = McapReader()
             summary = reader.summarize(path)
             assert (summary.count, summary.start, summary.end) == (1, 5, 5)
-            assert "2 messages bear no possible log time" in summary.notes
+            assert "left out: 2 messages without a possible log time" in summary.notes
             assert times(read(reader, path, "/t")) == [5]
 
     def test_messages_without_a_channel_are_left_out_and_reported(self, tmp_path: Path) -> None:
@@ -474,7 +474,7 @@ class TestWhatAWriterMayDo:
         path = raw_mcap(tmp_path / "a.mcap", fill)
         summary = McapReader().summarize(path)
         assert summary.count == 1
-        assert "1 messages belong to no declared channel and were left out" in summary.notes
+        assert "left out: 1 message of no declared channel" in summary.notes
 
 
 class TestBounds:

@@ -156,7 +156,7 @@ class TestSqliteSchemas:
         change(path, "UPDATE messages SET timestamp = 9223372036854775807 WHERE id = 2")
         summary = Rosbag2Reader().summarize(path)
         assert summary.count == len(read(Rosbag2Reader(), path)) == 2
-        assert summary.notes == ("1 messages bear no possible log time",)
+        assert summary.notes == ("left out: 1 message without a possible log time",)
 
     def test_a_message_that_the_index_has_elsewhere_is_found_where_it_is(
         self, tmp_path: Path
@@ -214,7 +214,7 @@ class TestSqliteSchemas:
         reader = Rosbag2Reader()
         summary = reader.summarize(path)
         assert summary.count == len(read(reader, path)) == 2
-        assert summary.notes == ("1 messages belong to no topic and were left out",)
+        assert summary.notes == ("left out: 1 message of no topic",)
 
     def test_a_message_that_was_compressed_by_itself_comes_plain(self, tmp_path: Path) -> None:
         plain = text(1, "hello " * 50)

@@ -124,4 +124,4 @@ def test_one_damaged_chunk_of_an_unfinished_file_is_left_out_and_reported(tmp_pa
     kept = set(range(20)) - set(range(lost.message_start_time, lost.message_end_time + 1))
     assert times(read(reader, path)) == sorted(kept)
     assert summary.count == len(kept)
-    assert any(note.startswith("1 damaged records were left out") for note in summary.notes)
+    assert any(note.startswith("left out: 1 damaged record (") for note in summary.notes)

@@ -14,6 +14,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import Closing, IntArray
 from ros2_memory.storage.cache import unshared_bytes
@@ -210,14 +211,14 @@ class _Scan:
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]
+        timed = sum(total.count for total in self.totals.values())
+        if orphans := timed - sum(total.count for total in totals.values()):
+            notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:
-            notes.append(f"{len(self.damaged)} damaged records were left out ({self.damaged[0]})")
-        counted = sum(total.count for total in self.totals.values())
-        orphans = counted - sum(total.count for total in totals.values())
-        if orphans:
-            notes.append(f"{orphans} messages belong to no declared channel and were left out")
-        if self.messages > counted:
-            notes.append(f"{self.messages - counted} messages bear no possible log time")
+            records = counted(len(self.damaged), "damaged record")
+            notes.append(f"left out: {records} ({self.damaged[0]})")
+        if untimed := self.messages - timed:
+            notes.append(f"left out: {counted(untimed, 'message')} without a possible log time")
         # Statistics that count what was left out are right.
         if self.stated is not None and not notes:
             notes.extend(disagreements(self.stated, totals))
