@@ -162,10 +162,13 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
     """Returns the pauses that bags show in a window, and those that deleted bags showed."""
-    found = {pause[:2]: pause for pause in view.snapshot.suspects}
-    for start, end in read_thinned(view.bag_dir).pauses:
-        found.setdefault((start, end), Pause(start, end, (), ran_on=True))
-    return sorted(pause for pause in found.values() if window.overlaps(*pause[:2]))
+    shown = {pause[:2]: pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])}
+    deleted = {
+        pause: Pause(*pause, (), ran_on=True)
+        for pause in read_thinned(view.bag_dir).pauses
+        if window.overlaps(*pause)
+    }
+    return sorted({**deleted, **shown}.values())
 
 
 def _note_pauses(view: View, window: TimeWindow) -> None:
