@@ -27,6 +27,7 @@ from ros2_memory.core.model import BagFile, JsonValue, Pose, Sample, TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    FUTURE_NS,
     MAX_NS,
     MIN_NS,
     NS_PER_S,
@@ -89,7 +90,6 @@ from ros2_memory.history.view import (
     open_view,
     search_window,
 )
-from ros2_memory.index.clock_faults import FUTURE_NS, ClockFault
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.fields import extremes_of
 from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
@@ -110,6 +110,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import Extracted
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
 A = TypeVar("A", results.Match, results.ValueWhen)

@@ -39,11 +39,11 @@ from ros2_memory.config import (
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
-from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import (

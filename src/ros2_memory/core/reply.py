@@ -35,6 +35,7 @@ from typing import (
 from ros2_memory.core.geometry import normalised, yaw
 from ros2_memory.core.text import named, quote, shortened
 from ros2_memory.core.timebase import (
+    FUTURE_NS,
     NS_PER_S,
     Ns,
     iso_local,
@@ -461,9 +462,16 @@ def _counted(known: tuple[int, bool]) -> JsonValue:
     return {"total" if is_all else "at_least": number}
 
 
-def _ago(at: Ns | None, scope: Scope) -> float:
-    """Returns how long ago a time was (s); 0 of what still goes on."""
-    return 0.0 if at is None else seconds(scope.now - at)
+def _ago(at: Ns | None, scope: Scope) -> float | Absent:
+    """Returns how long ago a time was (s); 0 of what still goes on, none of what is dated ahead."""
+    if at is None:
+        return 0.0
+    return Absent.ABSENT if at > scope.now + FUTURE_NS else seconds(scope.now - at)
+
+
+def _tenths_ago(at: Ns, scope: Scope) -> float | Absent:
+    ago_s = _ago(at, scope)
+    return ago_s if isinstance(ago_s, Absent) else round(ago_s, 1)
 
 
 def _lasted(times: Sequence[Ns]) -> float | None:
@@ -503,7 +511,7 @@ SECONDS: Final = unit(seconds, "_s")
 TENTHS_OF_S: Final = unit(lambda duration: round(seconds(duration), 1), "_s")
 MINUTES: Final = unit(lambda duration: round(duration / 60e9, 2))
 AGO: Final = Unit(_ago, takes_none=True)
-TENTHS_OF_S_AGO: Final = Unit(lambda at, scope: round(seconds(scope.now - at), 1))
+TENTHS_OF_S_AGO: Final = Unit(_tenths_ago)
 YAW: Final = Unit(lambda angle, _: {"yaw_deg": degrees(angle)}, is_spread=True, takes_none=True)
 """An angle (rad) under its own key."""
 XYZ: Final = vector("xyz", 4)

@@ -42,6 +42,9 @@ MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
 """The range of times: what a signed 64-bit nanosecond clock (and SQLite) can hold."""
 
+FUTURE_NS: Final[Ns] = 60 * NS_PER_S
+"""Dates this little ahead of the clock come from a clock that is being corrected."""
+
 
 def ns_from_unix(seconds: float) -> Ns:
     """Returns nanoseconds for Unix (or plain) seconds, rounded to nearest, limited to 64 bits.

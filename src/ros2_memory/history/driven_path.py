@@ -303,10 +303,8 @@ def length_notes(path: Trajectory) -> Iterator[str]:
             "the positions are noisy: distance_m leaves out what noise adds to the sum of all steps"
         )
     if path.avg_speed is None and path.poses:
-        yield (
-            f"{counted(path.poses, 'pose')} within {totals.duration_s:.3f} s: too short to say how "
-            "fast"
-        )
+        within = "" if path.poses == 1 else f" within {totals.duration_s:.3f} s"
+        yield f"{counted(path.poses, 'pose')}{within}: too short to say how fast"
     if totals.is_uncertain:
         yield (
             "the positions are more than 0.25 s apart, and noise or sharp turns are a large part "

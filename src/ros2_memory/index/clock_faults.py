@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 FIRST_BAGS_NS: Final[Ns] = 1_483_228_800 * NS_PER_S
 """2017-01-01, before the first release of ROS 2. Clocks without a battery start in 1970."""
-FUTURE_NS: Final[Ns] = 60 * NS_PER_S
-"""Dates this little ahead of the clock come from a clock that is being corrected."""
 FAR_BACK_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """Where a clock is set back by this much, the dates before or after that are wrong."""
 
@@ -113,6 +111,13 @@ class Dating:
     def misdated(self) -> frozenset[str]:
         """The paths of the bags that are left out of the span."""
         return frozenset(fault.bag.file for fault in self.faults if fault.misleads)
+
+    @property
+    def ahead_from(self) -> Ns:
+        """The log time from which on bags are dated after now; MAX_NS if none is."""
+        ahead = (fault for fault in self.faults if fault.kind is FaultyClock.AHEAD)
+        begins = (max(fault.bag.start, fault.bag.end - fault.by) for fault in ahead)
+        return min(begins, default=MAX_NS)
 
 
 def max_plausible(now: Ns) -> Ns:

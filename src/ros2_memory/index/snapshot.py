@@ -24,7 +24,7 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates
 from ros2_memory.index.holes import Pause, Rhythm, pauses_between
-from ros2_memory.index.segment import Segment
+from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.index.split_order import (
     Neighbours,
     StepBack,
@@ -159,6 +159,10 @@ class Snapshot:
             (stop - start - length_in(self.gaps, start, stop) for (_, start), (stop, _) in pauses),
             default=0,
         )
+
+    def totals(self, topic: str) -> list[TopicTotals]:
+        """Returns what correctly dated bags hold of a topic, in parts."""
+        return [one for part in self._dated for one in part.totals.get(topic, {}).values()]
 
     @cached_property
     def newest_stretch(self) -> Ns | None:

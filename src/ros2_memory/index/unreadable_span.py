@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS, max_plausible
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS, max_plausible
 
 if TYPE_CHECKING:
     from ros2_memory.index.split_order import Neighbours

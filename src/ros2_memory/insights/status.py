@@ -215,6 +215,9 @@ def missing_data(view: View) -> Iterator[str]:
     if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
+    if misdated := len(snapshot.dating.misdated):
+        bags = counted(misdated, "bag is", "bags are")
+        yield f"{bags} dated by a wrong clock; data_time_range has the details"
     yield from describe_absent(view.memory.absent_splits(snapshot))
     newest = max(snapshot.bags, key=lambda bag: bag.end, default=None)
     if newest is not None and (alone := view.memory.reader.times_alone(newest.path)):
@@ -238,11 +241,12 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     for topic in snapshot.timeline.topics():
         if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
-        stated = [*snapshot.timeline.totals(topic).values()]
+        stated = snapshot.totals(topic)
         messages = sum(each.messages for each in stated)
-        first, last = min(each.first for each in stated), max(each.last for each in stated)
+        last = max((each.last for each in stated), default=begin - 1)
         if messages < _MIN_MESSAGES or last < begin:
             continue
+        first = min(each.first for each in stated)
         usual = (last - first) // (messages - 1)
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
         is_long = latest - last > max(SILENT_AFTER_NS, longest)

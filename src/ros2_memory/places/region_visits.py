@@ -204,7 +204,7 @@ def _visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None)
 
     Its times are those of poses: of the first and the last one inside, and of the closest.
     """
-    is_there = newest is not None and one.stop >= newest and not one.left
+    is_there = newest is not None and one.start <= newest <= one.stop and not one.left
     distance_m, at = None, None
     if isinstance(where.region, Circle):
         distance_m, at = _closest(found, one, where.region)

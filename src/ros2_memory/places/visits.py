@@ -20,7 +20,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle
 from ros2_memory.core.spans import Spans, united
-from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, Ns, ns_from_unix
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import (
@@ -110,7 +110,7 @@ def visits(
             notes=view.notes.sentences(),
         )
     found = region_visits(view, placement.frame_id, place, window)
-    newest = _newest(view, topic, found.track, window)
+    newest = _newest(view, topic, found.track, window, now + FUTURE_NS)
     # A newer pose shows where the robot is now.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
     current = newest if newest is not None and newest >= stale else None
@@ -182,12 +182,13 @@ def _unknown(
     return elapsed.among(united(chain.from_iterable(every)))
 
 
-def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow) -> Ns | None:
-    """Returns the time of the newest pose, where the window reaches as far; else None."""
-    message = view.stream.newest(topic, TimeWindow.everything())
-    if message is None or not len(track.times) or window.stop <= message.time:
+def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns) -> Ns | None:
+    """Returns the time of the newest pose until `last`, where the window reaches as far."""
+    message = view.stream.newest(topic, TimeWindow(MIN_NS, last + 1))
+    if message is None or window.stop <= message.time:
         return None
-    return int(track.times[-1])
+    known = track.times[track.times <= last]
+    return int(known[-1]) if known.size else None
 
 
 def _within_asked(visit: Visit, window: TimeWindow) -> Visit:

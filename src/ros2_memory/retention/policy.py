@@ -32,8 +32,8 @@ from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,10 +12,11 @@ import numpy as np
 
 from ros2_memory.analysis.sights import SCORE_BINS, Ints, Score, Spot
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
-from ros2_memory.history.coverage import note_unread
+from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
@@ -30,7 +31,7 @@ from ros2_memory.things.unseen import Asked, notes_on
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 LIMIT: Final = 12
@@ -73,7 +74,9 @@ def find_things(
     wall = memory.clock.now()
     view = open_view(memory, call, min(search_window(span, wall).stop, wall))
     now = memory.now(wall, view.snapshot.latest, call)
-    asked_for = search_window(span, now)
+    whole = asked_for = search_window(span, now)
+    if end_s is None and whole.asked()[0] < (ahead := view.snapshot.dating.ahead_from):
+        asked_for = TimeWindow(whole.start, ahead)
     require_recorded(view, asked_for)
     window = clamped(view, asked_for)
     lowest = limits.min_score if min_score is None else min_score
@@ -83,7 +86,7 @@ def find_things(
         )
     note_robots(view, view.pose_topic, window)
     known = known_things(view, lowest, limits.labels, window)
-    view.notes.retract_outside(asked_for)
+    view.notes.retract_outside(whole)
     note_other_frames(view, known, region)
     asked = {known.labels.key(each): each for each in labels}
     places = places_asked(limits, region, known.frames)
@@ -95,7 +98,9 @@ def find_things(
         found = [*beside.among(found, others)]
         if beside.label and not others:
             view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
-    note_unread(view, asked_for, nothing=not found, gaps=not found)
+    note_unread(view, whole, nothing=not found, gaps=not found)
+    if not found and asked_for != whole:
+        view.notes.add(describe_misdated(view.snapshot.misdated))
     things = tuple(replace(each.described(), near_m=each.near_m) for each in found[:limit])
     totals: Counter[str] = Counter()
     for each in found:

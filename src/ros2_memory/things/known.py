@@ -119,10 +119,11 @@ def known_things(
     """
     latest = view.snapshot.latest
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
-    every = _Loader(view, min_score, spellings)
+    ahead = view.snapshot.dating.ahead_from
+    every = _Loader(view, min_score, spellings, ahead if window.stop <= ahead else MAX_NS)
     known = every.known() if every.reaches(window.start) else None
     if (known is None or known.crowded or known.since is None) and until <= (latest or until):
-        then = _Loader(view, min_score, spellings, until).known()
+        then = _Loader(view, min_score, spellings, MAX_NS, until).known()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
         known = then
@@ -165,7 +166,8 @@ class _Loader:
         view: has the bags.
         min_score: detections with a lower score do not count.
         spellings: other spellings of labels, by the name to be shown.
-        until: later sights are left out.
+        ahead: what is dated later is left out: a clock was wrong, unless that is asked for.
+        until: likewise, of an estimate of a time before.
     """
 
     def __init__(
@@ -173,13 +175,15 @@ class _Loader:
         view: View,
         min_score: float,
         spellings: Mapping[str, Sequence[str]],
+        ahead: Ns,
         until: Ns = MAX_NS,
     ) -> None:
         described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
-        key = (min_score, described, view.limits.map_frame, view.pose_topic)
+        key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view
         self._min_score = min_score
         self._labels = Labels(spellings)
+        self._ahead = ahead
         self._until = until
         self._own = ("things", until == MAX_NS, *key)
         self._key = ("most spots", *key)
@@ -267,7 +271,7 @@ class _Loader:
         until = self._view.call.partial_after(READING_S)
         spots = 0
         try:
-            for part in Watching(self._view).newest_first(self._until):
+            for part in Watching(self._view).newest_first(min(self._ahead, self._until)):
                 if spots >= most:
                     return parts[::-1], True
                 if parts and until.expired():

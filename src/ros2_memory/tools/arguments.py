@@ -245,7 +245,7 @@ _Name: TypeAlias = Annotated[str, Field(strict=True), AfterValidator(_check_name
 _AtLeast0: TypeAlias = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
 _Positive: TypeAlias = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
 _Tolerance: TypeAlias = Annotated[_AtLeast0, Field(description="Oldest age, s, e.g. 2 at 1 Hz.")]
-_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least score.")]
+_MinScore: TypeAlias = Annotated[_AtLeast0, Field(description="Least.")]
 # Times before 1970 are allowed: a search that reaches back too far finds all that is recorded.
 _UnixSeconds: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), AfterValidator(_check_unix)
@@ -460,7 +460,7 @@ class RecapTime(TimeArgument):
     """A window that ends now, a window between two times, or the seconds before a time."""
 
     replaces = "span"
-    text = "in the last_s seconds, between two times, or around a moment"
+    text = "in the last_s, between two times, or around a moment"
     either = ("last_s", "start", "around")
     last_s: Annotated[_Positive, Field(description="Up to now.", examples=[60])] | None = None
     start_s: _Time | None = Field(
@@ -666,7 +666,7 @@ _While: TypeAlias = Annotated[
     WithJsonSchema(
         {
             "anyOf": [{"type": "object"}, {"items": {"type": "object"}, "type": "array"}],
-            "description": "Counts only while another topic meets this, e.g. "
+            "description": "Only while a topic meets this, e.g. "
             '{"topic": "/is_docked", "condition_type": "equals", "value": false}; of a list, all.',
             "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],
         }
@@ -678,18 +678,16 @@ class MatchesArguments(ConditionArguments):
     """A condition on a topic, in a window or in all history."""
 
     fields: _Fields = ()
-    last_s: Annotated[_Positive, Field(description="The last seconds.")] | None = Field(
+    last_s: Annotated[_Positive, Field(description="Up to now.")] | None = Field(
         default=None, alias="seconds"
     )
     start_s: _Start = None
     end_s: _End = None
-    oldest_first: Annotated[bool, Field(strict=True, description="Oldest first, with total.")] = (
-        False
-    )
+    oldest_first: Annotated[bool, Field(strict=True, description="With total.")] = False
     limit: _Limit = 5
     by: _ByInMatches | None = None
-    beside: Annotated[_Name, Field(description="Also what this topic said during each.")] | None = (
-        Field(default=None, alias="with", examples=["/action"])
+    beside: Annotated[_Name, Field(description="What this topic said meanwhile.")] | None = Field(
+        default=None, alias="with", examples=["/action"]
     )
     where: _Where | None = None
     during: _While = Field(default=(), alias="while")

@@ -148,10 +148,8 @@ _DECLARATIONS = (
     ),
     ToolDeclaration(
         (ToolName("data_time_range", "Recorded times"),),
-        "The recorded time range, the current time, and, of all or a window, the newest gaps, "
-        "silences and steps of the clock. "
-        "Reply: {{earliest, latest, now, bags, gaps, silences, clock_steps, damaged, ...}}, null "
-        "if nothing is recorded.",
+        "The recorded range; gaps, silences and steps of the clock, of all or a window. "
+        "Reply: {{earliest, latest, now, gaps, ...}} or null.",
         RecordedTimesArguments,
         queries.data_time_range,
     ),
@@ -168,8 +166,8 @@ _DECLARATIONS = (
             ToolName("get_topic_in_range", "Topic over a window", Between),
             ToolName("get_topic_in_last", "Topic over the last seconds", Last),
         ),
-        "A topic's messages {when}: all up to max_samples, else so many, evenly spaced, "
-        "ends included. start and end alike: that minute. changes: what "
+        "A topic's messages {when}: all, or max_samples, evenly spaced; "
+        "start and end alike: that minute. changes: what "
         "held, [{{start, seconds, value}}]. Reply: {{topic, type, total, samples: [{{timestamp, "
         "value}}]}}; "
         "with fields {{..., fields, rows: [[timestamp, ...]], extremes: {{field: {{min, min_at, "

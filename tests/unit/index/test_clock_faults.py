@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS
 from ros2_memory.index.clock_faults import (
     FIRST_BAGS_NS,
-    FUTURE_NS,
     Dating,
     FaultyClock,
     check_dates,

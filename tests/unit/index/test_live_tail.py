@@ -198,7 +198,9 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
     if recall:
         tail.memory = with_store(tail.memory, tail.bag_dir)
     notes = tail.asked("get_topic_in_range", topic="/odom", start=T0 / S, end=T0 / S + 9)["notes"]
-    assert any(note.startswith("rec/rec_0.mcap: 1 damaged") for note in notes), notes
+    assert any(note.startswith("rec/rec_0.mcap: left out: 1 damaged record") for note in notes), (
+        notes
+    )
     assert not any("crash" in note for note in notes)
 
 

@@ -11,8 +11,8 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import RECORDED_FILE
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.index.clock_faults import FIRST_BAGS_NS, FUTURE_NS
+from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS
+from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
     RetentionLimits,
