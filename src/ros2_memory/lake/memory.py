@@ -54,6 +54,7 @@ _NEAR_BYTES: Final = 4 << 20
 """Packed messages that are read with those of a bag: of the bags before it, and of those after."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
+_GONE: Final = "it is not in the lake any more"
 _HEAD_BYTES: Final = 200
 _HEADS_BYTES: Final = 8 << 20
 
@@ -222,7 +223,7 @@ class LakeIndex:
         for window in self._windows.values():
             if found := window.bags.get(str(path)):
                 return found
-        raise BagVanishedError(str(path), "it is not in the lake any more")
+        raise BagVanishedError(str(path), _GONE)
 
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
@@ -408,20 +409,22 @@ class LakeReader(BagReader):
         return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
-        known = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
-        if known is not None:
-            return known
-        found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
-            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
-            more = tuple((key, value) for key, value in json.loads(row["metadata"]))
-            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
-            head = _Head(row["channel"], shared(channel), row["has_payloads"])
-            found[row["bag_id"]].append(head)
-        for bag_id, heads in found.items():
-            size = _HEAD_BYTES * (1 + len(heads))
-            self._heads.put((bag_id, bag.together[bag_id]), heads, size)
-        return found[bag.bag_id]
+        heads = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
+        if heads is None:
+            found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+            for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+                schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+                more = tuple((key, value) for key, value in json.loads(row["metadata"]))
+                channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
+                head = _Head(row["channel"], shared(channel), row["has_payloads"])
+                found[row["bag_id"]].append(head)
+            for bag_id, own in found.items():
+                self._heads.put((bag_id, bag.together[bag_id]), own, _HEAD_BYTES * (1 + len(own)))
+            heads = found[bag.bag_id]
+        if not heads and bag.file.summary.count:
+            # Deleted, or replaced under another id, since the index of this robot was read.
+            raise BagVanishedError(bag.file.file, _GONE)
+        return heads
 
     def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
         """Returns the packed messages of a channel; None where they are gone.
