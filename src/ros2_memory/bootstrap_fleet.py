@@ -205,7 +205,6 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
 
     shipped = lake_memory(
         LakeIndex(lake, name, WallClock()),
-        WallClock(),
         limits,
         extractor=shared.extractor,
         decoder=shared.reader,

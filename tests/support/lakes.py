@@ -154,7 +154,6 @@ def lake_robots(
     return {
         name: lake_memory(
             LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags),
-            clock,
             QuerySettings(),
             extractor=extractor(),
             decoder=decoder,

@@ -459,7 +459,6 @@ class LakeReader(BagReader):
 
 def lake_memory(
     index: LakeIndex,
-    clock: Clock,
     limits: QuerySettings,
     *,
     extractor: SchemaExtractor,
@@ -472,7 +471,6 @@ def lake_memory(
 
     Args:
         index: the robot's bags in the lake.
-        clock: the wall clock.
         limits: the settings of queries.
         extractor: knows the types of messages.
         decoder: decodes messages.
@@ -484,7 +482,7 @@ def lake_memory(
         index,
         LakeReader(index, decoder, large),
         extractor,
-        clock,
+        index.clock,
         # Nothing is recorded here, and nothing deleted.
         replace(limits, kept=None, recording="", screened=False),
         Scanner(store, index.bag_dir, settings, large),
