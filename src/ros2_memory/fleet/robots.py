@@ -205,10 +205,9 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     if known.older is not None and begin <= known.older:
         return True
     window = TimeWindow(begin, MIN_NS if known.latest is None else known.latest + 1)
-    here, shipped = (
-        sum(bag.size for bag in one.timeline.overlapping(window)) for one in (there, known)
-    )
-    return shipped > here
+    # By their beginnings: bags that were never shipped do not stand for those that are gone.
+    here = dict(sorted((bag.start, bag.size) for bag in there.timeline.overlapping(window)))
+    return any(bag.size > here.get(bag.start, 0) for bag in known.timeline.overlapping(window))
 
 
 def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
