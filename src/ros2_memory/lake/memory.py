@@ -228,7 +228,7 @@ class LakeIndex:
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
         known = self._windows.get(until, _Window())
-        of_robot = self.lake.days("bags", self.robot)
+        of_robot = self.lake.days("bags").get(self.robot, {})
         made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
         window = replace(known, older=None if day_before is None else end_of(day_before))
         if made_of != known.made_of:
@@ -451,8 +451,10 @@ class LakeReader(BagReader):
         """Returns the rows of a select over the channels of some bags of a day."""
         first, last = min(bags), max(bags)
         lake = self.index.lake
-        of_day = lake.days("channels", self.index.robot).get(bag.day, ())
-        files = [file for file in of_day if file.first <= last and first <= file.last]
+        of_robot = lake.days("channels").get(self.index.robot, {})
+        files = [
+            file for file in of_robot.get(bag.day, ()) if file.first <= last and first <= file.last
+        ]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)
 
