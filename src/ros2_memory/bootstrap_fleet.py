@@ -161,7 +161,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
     join = None if lake is None else partial(_robots_of, lake, settings, shared)
     found = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
     found.joined()
-    if lake is not None and not lake.robots():
+    if lake is not None and not lake.days("bags"):
         log.warning(
             "lake_empty",
             warehouse=settings.lake.warehouse,
@@ -176,7 +176,7 @@ def _robots_of(
 ) -> Iterator[Robot]:
     """Yields the robots of a lake besides the known ones."""
     lake.refresh(_JOINED_AGAIN_S)
-    for name in lake.robots():
+    for name in lake.days("bags"):
         if name not in known and is_robot_name(name):
             yield _robot(settings, name, shared, lake)
 
@@ -205,7 +205,6 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
 
     shipped = lake_memory(
         LakeIndex(lake, name, WallClock()),
-        WallClock(),
         limits,
         extractor=shared.extractor,
         decoder=shared.reader,

@@ -121,9 +121,9 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
     with where.opened() as catalog:
         engine = DuckdbEngine()
         lake = Lake(catalog, engine, where.translated)
-        assert lake.robots() == ["hall"]
+        assert [*lake.days("bags")] == ["hall"]
         sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
-        files = chain.from_iterable(lake.days("sightings", "hall").values())
+        files = chain.from_iterable(lake.days("sightings")["hall"].values())
         found = lake.select(sql, "sightings", files).to_pylist()
         engine.close()
     assert [row["label"] for row in found] == ["cup", "cup"]
@@ -154,7 +154,6 @@ def lake_robots(
     return {
         name: lake_memory(
             LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags),
-            clock,
             QuerySettings(),
             extractor=extractor(),
             decoder=decoder,

@@ -205,10 +205,9 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     if known.older is not None and begin <= known.older:
         return True
     window = TimeWindow(begin, MIN_NS if known.latest is None else known.latest + 1)
-    here, shipped = (
-        sum(bag.size for bag in one.timeline.overlapping(window)) for one in (there, known)
-    )
-    return shipped > here
+    # By their beginnings: bags that were never shipped do not stand for those that are gone.
+    here = dict(sorted((bag.start, bag.size) for bag in there.timeline.overlapping(window)))
+    return any(bag.size > here.get(bag.start, 0) for bag in known.timeline.overlapping(window))
 
 
 def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
@@ -314,7 +313,7 @@ class FanOut:
         left_s, begun_s = call.deadline.left_s(), time.monotonic()
         limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
         waiting = deque(robots)
-        running: dict[str, tuple[Future[T | EpisodicError], Call, float]] = {}
+        running: dict[str, tuple[Future[T | EpisodicError], Call, float, float]] = {}
         done: dict[str, T | EpisodicError] = {}
         while waiting or running:
             now_s = time.monotonic()
@@ -333,18 +332,18 @@ class FanOut:
                     used_thinned=False,
                 )
                 until_s = now_s + own_s + left_s * _GRACE
-                running[robot.name] = _asked(robot, work, own), own, until_s
+                running[robot.name] = _asked(robot, work, own), own, own_s, until_s
             # Without a deadline there is nothing to wake up for but an answer.
             first_s = min((until_s for *_, until_s in running.values()), default=now_s)
             futures = [future for future, *_ in running.values()]
             wait(futures, min(max(first_s - now_s, 0), threading.TIMEOUT_MAX), FIRST_COMPLETED)
-            for name, (future, own, until_s) in [*running.items()]:
+            for name, (future, own, own_s, until_s) in [*running.items()]:
                 if future.done():
                     done[name] = future.result()
                 elif time.monotonic() >= until_s:
                     self._is_done[name] = future.done
                     do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
-                    text = f"no answer in {limit_s:.3g} s; {do} a shorter window"
+                    text = f"no answer in {own_s:.3g} s; {do} a shorter window"
                     done[name] = QueryTimeoutError(text)
                 else:
                     continue

@@ -154,19 +154,16 @@ class _FleetQuestion:
             EpisodicError: it has none.
         """
 
-        def ask(_: Robot, own: Call) -> tuple[OneAnswer, FromLake | None, Ns | None]:
-            one = partial(_answer, self.question)
-            answer, lake = robot.asked(one, own, self._since)
-            return answer, lake and lake.since(self._begin_of(answer, lake)), own.now
+        def ask(_: Robot, own: Call) -> OfRobot:
+            answer, found = robot.asked(partial(_answer, self.question), own, self._since)
+            lake = self._reported(answer, found)
+            notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
+            return OfRobot(robot.name, robot.bag_dir, answer, notes, own.now)
 
         found = self.fan_out.ask([robot], ask, call)[robot.name]
         if isinstance(found, EpisodicError):
             raise found
-        answer, lake, now = found
-        notes: tuple[str, ...] = ()
-        if lake is not None:
-            notes = (*shipped_to({robot.name: lake.latest}), *lake.notes)
-        return OfRobot(robot.name, robot.bag_dir, answer, notes, now)
+        return found
 
     def _of_all(self, robots: list[Robot], call: Call) -> OfFleet:
         given = self.given
@@ -179,9 +176,8 @@ class _FleetQuestion:
             )
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        wanted = given.get("limit")
-        if wanted is None:
-            wanted = self.tool.arguments.get("limit", {}).get("default")
+        default = self.tool.arguments.get("limit", {}).get("default")
+        wanted = default if given.get("limit") is None else given["limit"]
         limit = int(wanted) if isinstance(wanted, int | float) else None
         oldest_first = given.get("oldest_first") is True
         page = _Page(limit, oldest_first=oldest_first)
@@ -227,7 +223,7 @@ class _FleetQuestion:
             return RobotReply(robot.name, value, latest, is_ahead), answer
 
         (reply, answer), lake = robot.asked(ask, call, self._since)
-        return replace(reply, lake=lake and lake.since(self._begin_of(answer, lake)))
+        return replace(reply, lake=self._reported(answer, lake))
 
     def _since(self, now: Ns) -> Ns | None:
         """Returns from when the question is; None where it is about the bags that there are."""
@@ -243,12 +239,14 @@ class _FleetQuestion:
         searches = takes_time and self.tool.name not in _REPORTS_ITSELF
         return min(begins, default=MIN_NS if searches else None)
 
-    def _begin_of(self, answer: OneAnswer, lake: FromLake) -> Ns:
-        """Returns from when an answer is."""
+    def _reported(self, answer: OneAnswer, lake: FromLake | None) -> FromLake | None:
+        """Returns what is to be reported of a lake, given from when its answer is."""
+        if lake is None:
+            return None
         if isinstance(answer, Match) and answer.found is not None:
-            return answer.found.sample.time
+            return lake.since(answer.found.sample.time)
         begin = self._since(MIN_NS if lake.latest is None else lake.latest)
-        return MIN_NS if begin is None else begin
+        return lake.since(MIN_NS if begin is None else begin)
 
 
 @dataclass(eq=False)

@@ -152,13 +152,14 @@ class Lake:
                 self._table("bags")
                 self._looked_at = time.monotonic()
 
-    def robots(self) -> list[str]:
-        """Returns the names of all robots that have bags, in order; no file of rows is read."""
-        return [*self._days("bags")]
+    def days(self, name: str) -> Mapping[str, Days]:
+        """Returns the files of a table by robot, in order; no file of rows is read.
 
-    def days(self, name: str, robot: str) -> Days:
-        """Returns the files of a robot in a table, in which no row of another one is."""
-        return self._days(name).get(robot, {})
+        In those of a robot no row of another one is.
+        """
+        with self._looking():
+            table = self._table(name)
+            return {} if table is None else self._partitions[name].look(table)
 
     def select(
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
@@ -170,11 +171,6 @@ class Lake:
         locations = tuple(file.location for file in files)
         found = DataFiles(TABLES[name].arrow_schema, locations, store)
         return self.engine.select(sql, name, found, parameters or {})
-
-    def _days(self, name: str) -> Mapping[str, Days]:
-        with self._looking():
-            table = self._table(name)
-            return {} if table is None else self._partitions[name].look(table)
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -15,7 +15,7 @@ import json
 import os
 import socket
 import uuid
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from pyiceberg.io import load_file_io
@@ -75,32 +75,27 @@ def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str |
 
     Raises:
         FileNotFoundError: there is none, and it is not to be made.
-        LakeError: it cannot be opened, or not be locked.
+        LakeError: it cannot be opened or locked.
     """
     path, holder = state_dir / LEASE_FILE, None
-    try:
-        if flags & os.O_CREAT:
-            state_dir.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise LakeError(f"{path} cannot be opened: {error.strerror}") from error
-    try:
-        fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
-    except BlockingIOError:
-        pid, host = read_holder(descriptor)
-        holder = "another process" if pid is None else f"process {pid} on {host}"
-    except OSError as error:
-        os.close(descriptor)
-        raise LakeError(
-            f"{path} cannot be locked: {error.strerror}; lake.state_dir must be on a file system "
-            "that supports locks"
-        ) from error
-    try:
+    with ExitStack() as opened:
+        try:
+            if flags & os.O_CREAT:
+                state_dir.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+            opened.callback(os.close, descriptor)
+            fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+        except BlockingIOError:
+            pid, host = read_holder(descriptor)
+            holder = "another process" if pid is None else f"process {pid} on {host}"
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            raise LakeError(
+                f"{path} cannot be opened or locked: {error.strerror}; lake.state_dir must be on a "
+                "file system that supports locks"
+            ) from error
         yield descriptor, holder
-    finally:
-        os.close(descriptor)
 
 
 class WarehouseLease:

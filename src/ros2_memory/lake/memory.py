@@ -54,6 +54,7 @@ _NEAR_BYTES: Final = 4 << 20
 """Packed messages that are read with those of a bag: of the bags before it, and of those after."""
 _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
+_GONE: Final = "it is not in the lake any more"
 _HEAD_BYTES: Final = 200
 _HEADS_BYTES: Final = 8 << 20
 
@@ -222,12 +223,12 @@ class LakeIndex:
         for window in self._windows.values():
             if found := window.bags.get(str(path)):
                 return found
-        raise BagVanishedError(str(path), "it is not in the lake any more")
+        raise BagVanishedError(str(path), _GONE)
 
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
         known = self._windows.get(until, _Window())
-        of_robot = self.lake.days("bags", self.robot)
+        of_robot = self.lake.days("bags").get(self.robot, {})
         made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
         window = replace(known, older=None if day_before is None else end_of(day_before))
         if made_of != known.made_of:
@@ -408,20 +409,22 @@ class LakeReader(BagReader):
         return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
-        known = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
-        if known is not None:
-            return known
-        found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
-            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
-            more = tuple((key, value) for key, value in json.loads(row["metadata"]))
-            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
-            head = _Head(row["channel"], shared(channel), row["has_payloads"])
-            found[row["bag_id"]].append(head)
-        for bag_id, heads in found.items():
-            size = _HEAD_BYTES * (1 + len(heads))
-            self._heads.put((bag_id, bag.together[bag_id]), heads, size)
-        return found[bag.bag_id]
+        heads = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
+        if heads is None:
+            found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+            for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+                schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+                more = tuple((key, value) for key, value in json.loads(row["metadata"]))
+                channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
+                head = _Head(row["channel"], shared(channel), row["has_payloads"])
+                found[row["bag_id"]].append(head)
+            for bag_id, own in found.items():
+                self._heads.put((bag_id, bag.together[bag_id]), own, _HEAD_BYTES * (1 + len(own)))
+            heads = found[bag.bag_id]
+        if not heads and bag.file.summary.count:
+            # Deleted, or replaced under another id, since the index of this robot was read.
+            raise BagVanishedError(bag.file.file, _GONE)
+        return heads
 
     def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
         """Returns the packed messages of a channel; None where they are gone.
@@ -448,15 +451,16 @@ class LakeReader(BagReader):
         """Returns the rows of a select over the channels of some bags of a day."""
         first, last = min(bags), max(bags)
         lake = self.index.lake
-        of_day = lake.days("channels", self.index.robot).get(bag.day, ())
-        files = [file for file in of_day if file.first <= last and first <= file.last]
+        of_robot = lake.days("channels").get(self.index.robot, {})
+        files = [
+            file for file in of_robot.get(bag.day, ()) if file.first <= last and first <= file.last
+        ]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)
 
 
 def lake_memory(
     index: LakeIndex,
-    clock: Clock,
     limits: QuerySettings,
     *,
     extractor: SchemaExtractor,
@@ -469,7 +473,6 @@ def lake_memory(
 
     Args:
         index: the robot's bags in the lake.
-        clock: the wall clock.
         limits: the settings of queries.
         extractor: knows the types of messages.
         decoder: decodes messages.
@@ -481,7 +484,7 @@ def lake_memory(
         index,
         LakeReader(index, decoder, large),
         extractor,
-        clock,
+        index.clock,
         # Nothing is recorded here, and nothing deleted.
         replace(limits, kept=None, recording="", screened=False),
         Scanner(store, index.bag_dir, settings, large),

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import Batch, Channel, Record
+    from ros2_memory.storage.base import Batch, Channel
 
 _MOST_OF_MESSAGE: Final = 512
 """Packed bytes of each message on average; of a channel with more the lake has the times alone."""
@@ -282,8 +282,10 @@ class _BagRows:
         """Adds whole messages, and the detections of the topics `seen`."""
         numbers = Counter[str]()
         topics, window = {*self._whole, *seen}, TimeWindow.everything()
-        for record in self._memory.reader.records(self._bag.path, topics, window):
+        reader, extractor = self._memory.reader, self._memory.extractor
+        for record in reader.records(self._bag.path, topics, window):
             topic = record.channel.topic
+            found: Sequence[Detection] = ()
             row = {
                 "topic": topic,
                 "type": record.channel.type,
@@ -291,7 +293,18 @@ class _BagRows:
                 "message": numbers[topic],
             }
             numbers[topic] += 1
-            found = self._decoded(record, row, is_seen=topic in seen)
+            try:
+                message = reader.decode(record)
+                shown = extractor.exact(message, record.channel.type)
+            except UndecodableError as error:
+                self._undecodable += topic in seen
+                value: Row = {"undecodable": error.reason}
+            else:
+                value = taken_apart(shown) if topic in self._whole else {}
+                found = detections_of(shown, extractor.frame(message)) if topic in seen else ()
+            if topic in self._whole:
+                whole = {**row, "publish_ns": record.publish_time, **value}
+                self._rows["messages"].append(whole)
             at = place_at(track, record.log_time) if found else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
@@ -306,24 +319,6 @@ class _BagRows:
                         **dict(zip("xyz", detection.place or (), strict=False)),
                     }
                 )
-
-    def _decoded(self, record: Record, row: Row, *, is_seen: bool) -> Sequence[Detection]:
-        """Returns the detections of a message, which is added whole if it is to be."""
-        is_whole = record.channel.topic in self._whole
-        found: Sequence[Detection] = ()
-        try:
-            message = self._memory.reader.decode(record)
-            shown = self._memory.extractor.exact(message, record.channel.type)
-        except UndecodableError as error:
-            self._undecodable += is_seen
-            value: Row = {"undecodable": error.reason}
-        else:
-            value = taken_apart(shown) if is_whole else {}
-            of_frame = self._memory.extractor.frame(message)
-            found = detections_of(shown, of_frame) if is_seen else ()
-        if is_whole:
-            self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
-        return found
 
     def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
         for seen in found.visible.intervals():

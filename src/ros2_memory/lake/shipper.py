@@ -113,8 +113,6 @@ class Shipper:
 
     def __post_init__(self) -> None:
         """Has everything looked at, in the bag directories and in the lake."""
-        for robot in self.robots:
-            robot.may_write = True
         self._look_again()
 
     def run(self) -> Shipped:
@@ -221,14 +219,12 @@ class RobotBags:
         memory: over its bag directory.
         reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
-        may_write: whether receipts could be written the last time.
     """
 
     name: str
     memory: Memory
     reader: BagReader
     config: str
-    may_write: bool = field(default=True, init=False)
 
     @property
     def bag_dir(self) -> Path:
@@ -421,11 +417,7 @@ class RobotBags:
             if missing:
                 append_receipts(self.bag_dir, missing)
                 known.update((receipt.bag, receipt) for receipt in missing)
-            self.may_write = True
         except OSError as error:
-            if self.may_write:
-                log.warning("receipts_not_written", robot=self.name, reason=str(error))
-            self.may_write = False
             done.problems.append(
                 f"{self.name}: no receipts can be written into {self.bag_dir} "
                 f"({error.strerror or error}): its recorder cannot wait for shipping"

@@ -139,7 +139,10 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 
 def _referenced(table: IcebergTable) -> set[str]:
-    """Returns the files that some version, branch or tag of a table refers to."""
+    """Returns the files that some version, branch or tag of a table refers to.
+
+    Statistics are not among them: this program writes none.
+    """
     metadata = table.metadata
     manifests = {
         manifest.manifest_path: manifest
@@ -148,7 +151,6 @@ def _referenced(table: IcebergTable) -> set[str]:
     }
     return {
         table.metadata_location,
-        *(statistics.statistics_path for statistics in metadata.statistics),
         *(snapshot.manifest_list for snapshot in metadata.snapshots),
         *manifests,
         *(

@@ -129,6 +129,19 @@ def test_what_begins_before_the_robots_own_bags_is_answered_from_the_lake(tmp_pa
     assert gone["reason"] == "outside_range"
 
 
+def test_a_bag_that_was_never_shipped_does_not_stand_for_one_that_only_the_lake_has(
+    tmp_path: Path,
+) -> None:
+    """As one of some size that is damaged, beside one that retention has deleted."""
+    bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
+    ship_from(tmp_path)
+    bags[0].unlink()
+    more = text((START_S + 5) * NS_PER_S, "x" * 100_000, "/light")
+    write_mcap(bags[0].with_name("rec_2.mcap"), [more])
+    asked = {"robot": "hall", "topic": "/chatter", "start": START_S, "end": START_S + 20}
+    assert reply(served(tmp_path), "get_topic_in_range", asked)["total"] == 6
+
+
 def test_a_lake_that_cannot_be_read_leaves_the_robot_its_own_answer(tmp_path: Path) -> None:
     bags = [write_bag(tmp_path / "hall", number) for number in range(2)]
     ship_from(tmp_path)

@@ -17,6 +17,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.memory import LakeIndex
 from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import BagReader, Channel, Schema
@@ -195,6 +196,23 @@ def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
         [*robot.reader.records(first.path, ["/even"], EVERYTHING)]
     filling.prune(robot.index.refresh().timeline)
     assert filling.store.paths() == ["r1/one_0.mcap"]
+
+
+def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
+    engine: LakeEngine, tmp_path: Path
+) -> None:
+    write_bag(tmp_path / "hall", 0)
+    ship_from(tmp_path)
+    robot = lake_robot(tmp_path / "lake", engine)
+    [bag] = robot.index.snapshot().bags
+    with location(tmp_path / "lake").writable() as tables:
+        forget_in_lake(tables, Tombstone("hall", bag.start, bag.end))
+    # As when another robot of the same lake is asked.
+    assert isinstance(robot.index, LakeIndex)
+    robot.index.lake.refresh()
+    for _ in range(2):
+        with pytest.raises(BagVanishedError):
+            [*robot.reader.records(bag.path, ["/chatter"], EVERYTHING)]
 
 
 def test_damaged_and_later_bytes_are_refused() -> None:
