@@ -139,10 +139,7 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 
 def _referenced(table: IcebergTable) -> set[str]:
-    """Returns the files that some version, branch or tag of a table refers to.
-
-    Statistics are not among them: this program writes none.
-    """
+    """Returns the files that some version, branch or tag of a table refers to."""
     metadata = table.metadata
     manifests = {
         manifest.manifest_path: manifest
@@ -151,6 +148,7 @@ def _referenced(table: IcebergTable) -> set[str]:
     }
     return {
         table.metadata_location,
+        *(statistics.statistics_path for statistics in metadata.statistics),
         *(snapshot.manifest_list for snapshot in metadata.snapshots),
         *manifests,
         *(
