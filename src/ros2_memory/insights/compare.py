@@ -106,6 +106,8 @@ def compare(
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     view.notes.retract_outside(*windows)
+    if region is not None:
+        view.notes.add("way, errors and silent_s are not only of that place")
     return Comparison(
         oldest=min(each.start for each in windows),
         newest=max(each.stop for each in windows),

@@ -21,6 +21,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted, named, quote
 from ros2_memory.core.timebase import (
     MIN_NS,
@@ -459,11 +460,14 @@ def _spot(
     if thing is None or thing.place is None:
         return None
     seen = Pose(thing.place, None, thing.frame_id)
+    position, frame = thing.place, thing.frame_id
     for target in targets:
         there = pose_in(view, seen, target, found.time, found.bag.recording)
         if there is not None:
-            return LabelledPlace(thing.label, there.position, target)
-    return LabelledPlace(thing.label, thing.place, thing.frame_id)
+            position, frame = there.position, target
+            break
+    inside = places_at(view.limits.places, frame, *position[:2])
+    return LabelledPlace(thing.label, position, frame, inside)
 
 
 def _matching(detections: Sequence[Detection], condition: Condition) -> Detection | None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, Literal, TypeAlias
 
 from ros2_memory.core.reply import (
     AGO,
+    INSIDE,
     LASTED,
     LOCAL,
     MESSAGE,
@@ -253,13 +254,14 @@ class ValueWhen(AnswerWithNotes):
         return 0 if self.value is None else self.value.age or 0
 
 
-@result(XYZ.spread("position"), NAME("frame_id"))
+@result(XYZ.spread("position"), INSIDE("inside"), NAME("frame_id"))
 class LabelledPlace:
-    """A place (m) in a frame; `label` names what is there."""
+    """A place (m) in a frame, and the named places around it; `label` names what is there."""
 
     label: str
     position: Vector3
     frame_id: str
+    inside: tuple[str, ...] = ()
 
 
 def _other_topic(topic: str, scope: Scope) -> JsonValue | Absent:

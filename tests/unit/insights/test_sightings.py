@@ -22,6 +22,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
@@ -645,3 +646,23 @@ def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
     unrecorded = pause_s + 0.2 if pause_s > 1 else 0.0
     assert row["recorded_s"] == pytest.approx(100 + pause_s - 0.2 - unrecorded, abs=0.06)
     assert row["recorded_s"] - 1.0 <= row["topic_s"] <= row["recorded_s"]
+
+
+def test_the_named_place_of_a_thing_is_told_with_its_coordinates(tmp_path: Path) -> None:
+    messages = []
+    for second in range(5):
+        at = BEGIN + second * S
+        messages += [
+            odom(at, 2.0, 0.0),
+            tf(at, transform(at, "odom", "base_link", (2.0, 0.0, 0.0))),
+        ]
+        messages += [detections(at, ["cup"], at=(1.0, 0.0, 0.5))]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    places = tuple(
+        Place(name, "odom", Circle(x, 0.0, 0.6)) for name, x in (("shelf", 3.0), ("chair", 2.0))
+    )
+    memory = memory_of(tmp_path, limits=QuerySettings(places=places))
+    asked_for = {"topic": OBJECTS, "condition_type": "contains", "value": "cup"}
+    [sighting] = asked(memory, tmp_path, "find_matches", **asked_for)["sightings"]
+    assert sighting["place"] == {"x": 3.0, "y": 0.0, "z": 0.5, "in": "shelf", "frame_id": "odom"}
+    assert sighting["robot"]["in"] == "chair"

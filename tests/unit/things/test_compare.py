@@ -158,6 +158,9 @@ def test_a_thing_that_was_brought_back_appeared(tmp_path: Path) -> None:
 def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path: Path) -> None:
     reply = compared(tmp_path, moved_mug(), where="kitchen")
     assert labels(reply) == {"moved": ["mug"]}
+    not_only = "way, errors and silent_s are not only of that place"
+    assert not_only in reply["notes"]
+    assert not_only not in str(ask(tmp_path, **EARLIER, **LATER))
     there = ask(tmp_path, **EARLIER, **LATER, where={"x": -2.0, "y": 0.5, "radius_m": 0.5})
     assert labels(there) == {"moved": ["mug"]}
     assert there["things_unchanged"] == 0
