@@ -11,7 +11,7 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import accumulate
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -30,14 +30,13 @@ from ros2_memory.storage.base import (
     Definition,
     IntArray,
     Schema,
+    or_errors,
+    unless_error,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
-
-
-T = TypeVar("T")
 
 GROUP_BYTES: Final = 64 << 20
 """Payloads, or tables made of them, that one group has at most, about."""
@@ -135,7 +134,7 @@ def pieces(
             if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
                 bare.discard(channel.topic)
         wanted = {channel.topic for channel in channels}
-        for batch in _or_errors(reader.batches(path, wanted, window, bare=bare)):
+        for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
                 yield batch
             elif batch.sizes.size:
@@ -143,7 +142,7 @@ def pieces(
             del batch  # and its buffer, before the next is read
 
     # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-    return map(_unless_error, found())
+    return map(unless_error, found())
 
 
 def decoded(
@@ -168,7 +167,7 @@ def decoded(
 
     def found() -> Iterator[list[Table] | BagError]:
         group = _Group(reader, skip_undecodable)
-        for piece in _or_errors(read):
+        for piece in or_errors(read):
             if isinstance(piece, BagError):
                 yield piece
                 continue
@@ -181,7 +180,7 @@ def decoded(
         if tables:
             yield tables
 
-    return map(_unless_error, found())
+    return map(unless_error, found())
 
 
 def decoded_together(reader: BagReader, bags: Sequence[Sequence[Piece]]) -> list[BagRows]:
@@ -216,26 +215,6 @@ def decoded_together(reader: BagReader, bags: Sequence[Sequence[Piece]]) -> list
             key = (topic, channel.latched, kind.plan is None, kind.is_hashed)
             alike[key].append(_Own(nth, kind, moved))
     return [rows for own in alike.values() for rows in _together(reader, own)]
-
-
-def _or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
-    """Yields the items, and in place of those that are lost the errors that `next` raises."""
-    while True:
-        try:
-            item = next(items)
-        except StopIteration:
-            return
-        except BagError as error:
-            yield error
-            continue
-        yield item
-        del item
-
-
-def _unless_error(item: T | BagError) -> T:
-    if isinstance(item, BagError):
-        raise item
-    return item
 
 
 @dataclass(slots=True)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.scores import Scored, hypotheses, is_object, or_else, scored
+from ros2_memory.columns.scores import Scored, hypotheses, is_object, or_else, ranked, scored
 from ros2_memory.columns.shown import (
     ByType,
     Group,
@@ -406,15 +406,13 @@ def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     Raises:
         UnknownShapeError: they were rounded, so that another may be the best.
     """
-    rank = np.where(np.isnan(score), -np.inf, score)
-    order = np.lexsort((-rank, owners))
-    begins = np.diff(owners[order], prepend=-1) != 0
+    order, begins = ranked(score, owners)
     best: Ints = order[begins]
     if error:
         follows = np.flatnonzero(begins[:-1] & ~begins[1:])
         one, two = order[follows], order[follows + 1]
         with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = rank[one] - rank[two] <= 2 * error
+            is_close = score[one] - score[two] <= 2 * error
         if (is_close & (name.codes[one] != name.codes[two])).any():
             raise UnknownShapeError("another hypothesis may be the best")
     return best

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.columns.table import Table
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.storage.base import BagReader, Channel
+    from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
 
@@ -279,7 +279,8 @@ class Filling:
                 return True
             current = partial(self._is_settled, bag)
             to_store = ReadBag(self._key(bag), bag, hashed, current)
-            read = pieces(self._reader, bag.path, hashed=partial(_is_hashed, everything=hashed))
+            # A latched message may come again later, in another recording.
+            read = pieces(self._reader, bag.path, hashed=lambda each: hashed or each.latched)
             begin, size = _first_pieces(read)
             if size > LARGE_BYTES or bag.end - bag.start > LONG_NS:
                 groups = decoded(self._reader, chain(_popped(begin), read))
@@ -474,11 +475,6 @@ def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
         and settled(sidecar_ns, now)
         and not (bag_dir / ERASING_FILE).exists()
     )
-
-
-def _is_hashed(channel: Channel, *, everything: bool) -> bool:
-    """Returns whether payloads of a channel are hashed: a latched message may come again later."""
-    return everything or channel.latched
 
 
 def _mtime_ns(path: Path) -> Ns:

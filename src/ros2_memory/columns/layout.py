@@ -33,18 +33,6 @@ class Kind(NamedTuple):
 _OWNERS: Final = Kind("int64")
 
 
-class Slot(NamedTuple):
-    """Where a column lies among the packed ones of its table, in the order of `Layout`.
-
-    Attributes:
-        nth: its place.
-        kind: what it is.
-    """
-
-    nth: int
-    kind: Kind
-
-
 @dataclass(frozen=True, slots=True)
 class Layout:
     """The columns of the tables of one topic, type and definition.
@@ -53,22 +41,21 @@ class Layout:
         columns: by the path of the field.
         sequences: by the path of the sequence, as `Elements` has them.
         left_out: what is no column, and why.
-        slots: where a column lies among the packed ones of its table, by its path from there
-            (`detections.label`), and where owners lie, by the path of the sequence and `#`.
+        slots: all columns in the order in which they are packed, by their path from the table
+            (`detections.label`), and the owners of elements, by that of the sequence and `#`.
     """
 
     columns: Mapping[str, Kind]
     sequences: Mapping[str, Layout] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
-    slots: Mapping[str, Slot] = field(init=False, compare=False, repr=False)
+    slots: Mapping[str, Kind] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:
-        slots = {path: Slot(nth, kind) for nth, (path, kind) in enumerate(self.columns.items())}
+        slots = dict(self.columns)
         for path, inner in self.sequences.items():
-            slots[f"{path}#"] = Slot(len(slots), _OWNERS)
-            begin = len(slots)
-            for name, slot in inner.slots.items():
-                slots[f"{path}.{name}".rstrip(".")] = Slot(begin + slot.nth, slot.kind)
+            slots[f"{path}#"] = _OWNERS
+            for name, kind in inner.slots.items():
+                slots[f"{path}.{name}".rstrip(".")] = kind
         object.__setattr__(self, "slots", slots)
 
     @classmethod

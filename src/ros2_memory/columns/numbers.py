@@ -11,12 +11,12 @@ from ros2_memory.columns.shown import (
     Limits,
     Message,
     Node,
-    Shape,
     Spot,
     UnknownShapeError,
     leaves_below,
     opened,
     placed,
+    shape_of,
 )
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
 
@@ -65,12 +65,11 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     Returns:
         None where the columns do not hold them all: then the bag has to be read.
     """
-    if table.definition is None or "" in table.left_out:
+    shape, values = shape_of(table, extractor), Values(table)
+    if shape is None:
         return None
-    values = Values(table)
     try:
-        found = Shape(table.definition, table.channel.type, extractor).find(field)
-        parts = [_numbers_of(values, *of) for of in ([] if found is None else _leaves(found))]
+        parts = [_numbers_of(values, *of) for of in _leaves(shape.find(field))]
     except UnknownShapeError:
         return None
     known = [part for part in parts if part is not None]
@@ -83,11 +82,9 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
 
 def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:
     """Returns the path of the column that has all numbers of a field as they are; None: none."""
-    if table.definition is None:
-        return None
+    shape = shape_of(table, extractor)
     try:
-        found = Shape(table.definition, table.channel.type, extractor).find(field)
-        leaves = [] if found is None else [*_leaves(found)]
+        leaves = [] if shape is None else [*_leaves(shape.find(field))]
     except UnknownShapeError:
         return None
     if len(leaves) != 1 or leaves[0][0].level is not ROWS or leaves[0][1]:
@@ -128,9 +125,9 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     )
 
 
-def _leaves(found: Node) -> Iterator[tuple[Leaf, Limits]]:
+def _leaves(found: Node | None) -> Iterator[tuple[Leaf, Limits]]:
     """Yields the numbers of a field; not those of a summary."""
-    for spot in opened(Spot(found)):
+    for spot in () if found is None else opened(Spot(found)):
         node = spot.node
         if isinstance(node, Message | Group) and _SUMMARY.issuperset(node.names()):
             continue

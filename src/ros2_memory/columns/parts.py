@@ -113,7 +113,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
         if is_hashed.all() or "" not in table.left_out:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
-    steps = (slot.kind.step for slot in layout.slots.values())
+    steps = (kind.step for kind in layout.slots.values())
     columns = [*own.values(), *layout.columns_of(table)]
     packs = map(pack, columns, chain(repeat(EXACT, len(own)), steps))
     packed.update(zip((*own, *layout.slots), packs, strict=True))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses
-from ros2_memory.columns.shown import UnknownShapeError
+from ros2_memory.columns.shown import ByType, UnknownShapeError
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.core.arrays import row_maxima, row_sums
@@ -50,8 +50,9 @@ class PoseColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._extractor = extractor
-        self._known: dict[tuple[Definition, str], _Columns | None] = {}
+        self._columns = ByType(
+            extractor, lambda shape: _columns_of(extractor.plan(shape.type), shape.definition)
+        )
 
     def of(self, table: Table, times: IntArray, index: IntArray | None) -> Poses | None:
         """Returns the poses of some rows of a table; None where their messages have to be read.
@@ -64,16 +65,12 @@ class PoseColumns:
         Raises:
             NoPoseError: messages of this type have no pose.
         """
-        if table.definition is None or "" in table.left_out:
+        columns = self._columns.of(table)
+        if columns is None:
             return None
-        key = (table.definition, table.channel.type)
+        if not columns.axes:
+            raise NoPoseError
         try:
-            if key not in self._known:
-                plan = self._extractor.plan(table.channel.type)
-                self._known[key] = _columns_of(plan, table.definition)
-            columns = self._known[key]
-            if columns is None:
-                raise NoPoseError
             if index is not None:
                 return _read(_Rows(table, index), columns, times)
             return table.remember(
@@ -95,7 +92,7 @@ class _Columns(NamedTuple):
     """Which columns a pose is in, by their dot-paths.
 
     Attributes:
-        axes: of x, y and, unless it is 0, z.
+        axes: of x, y and, unless it is 0, z; or none.
         turn: of x, y, z, w; or of a heading (rad); or none.
         frame: of the frame in the header; empty without one.
         numbered_frame: of PX4's number of the frame; empty without one.
@@ -164,8 +161,8 @@ def _field(definition: Definition, path: Segments) -> _Field | None:
     return None
 
 
-def _columns_of(plan: Plan, definition: Definition) -> _Columns | None:
-    """Returns where poses are in messages of a type; None where they have none."""
+def _columns_of(plan: Plan, definition: Definition) -> _Columns:
+    """Returns where poses are in messages of a type; without axes where they have none."""
     found: tuple[tuple[str, ...], tuple[str, ...]] | None = None
     routes = [*plan.poses]
     if plan is UNMAPPED:
@@ -181,7 +178,7 @@ def _columns_of(plan: Plan, definition: Definition) -> _Columns | None:
         if found is not None:
             break
     if found is None:
-        return None
+        return _Columns((), (), "", "", ())
     frame = _field(definition, FRAME.segments)
     named = frame is not None and frame.length is None and frame.kind in _TEXTS
     numbered = plan.pose_frame and _field(definition, plan.pose_frame.segments)

@@ -332,16 +332,12 @@ class Scanner:
             stored = self.store.part_data(part, path)
             if stored is None:
                 raise GoneError
-            self._wait_for(stored)
+            if is_large(stored):
+                self._large.acquire()
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
         self._read.put((part, path), column, column_bytes(column))
         return column
-
-    def _wait_for(self, stored: bytes) -> None:
-        """Waits for the turn that what is stored needs where it is large."""
-        if is_large(stored):
-            self._large.acquire()
 
 
 def _outline_key(head: PartHead) -> FragmentKey:

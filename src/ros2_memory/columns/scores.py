@@ -8,6 +8,7 @@ and more would have to be looked at then, the limits say that they do not know.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, TypeAlias, TypeGuard
 
@@ -86,18 +87,14 @@ def or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Scores:
-    """Which detections score enough; `kept` and its kin are computed once for each table."""
+class _Detections(ABC):
+    """Which detections of a level stay; that is found once for each table."""
 
+    level: Level
     scored: Scored
     least: float
     texts: tuple[Leaf, ...]
     has_inner: bool
-
-    @property
-    def level(self) -> Level:
-        """The level of the detections."""
-        return self.scored.level
 
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the detection stays."""
@@ -105,6 +102,14 @@ class _Scores:
             values.kept[self] = self._kept(values)
         surely, perhaps = values.kept[self]
         return Kept(surely[among], perhaps[among])
+
+    @abstractmethod
+    def _kept(self, values: Values) -> Kept:
+        """Returns where the detections of a table stay."""
+
+
+class _Scores(_Detections):
+    """Which detections score enough."""
 
     def _kept(self, values: Values) -> Kept:
         found = self.scored.read(values)
@@ -119,35 +124,18 @@ class _Scores:
         return Kept(surely, perhaps)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BestScores:
+class _BestScores(_Detections):
     """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
-
-    level: Level
-    hypotheses: Scored
-    least: float
-    texts: tuple[Leaf, ...]
-    has_inner: bool
-
-    def kept(self, values: Values, among: Ints) -> Kept:
-        """Returns where the detection stays."""
-        if self not in values.kept:
-            values.kept[self] = self._kept(values)
-        surely, perhaps = values.kept[self]
-        return Kept(surely[among], perhaps[among])
 
     def _kept(self, values: Values) -> Kept:
         size = values.size(self.level) or 0
-        found, results = self.hypotheses.read(values), values.elements(self.hypotheses.level)
+        found, results = self.scored.read(values), values.elements(self.scored.level)
         if found is None or results is None or found[2]:
             return unknown(size)  # also with rounded scores, of which another may be the best
         name, score, _ = found
         labelled = _has_label(name)
-        rank = np.where(np.isnan(score), -np.inf, score)
-        # The first of those of the highest score, for each detection.
-        order = np.lexsort((-rank, results.owners))
-        first = np.flatnonzero(np.diff(results.owners[order], prepend=-1))
-        best = order[first]
+        order, begins = ranked(score, results.owners)
+        best = order[begins]
         of = results.owners[best]
         surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
         if self.has_inner or may_be_json(values, self.texts):
@@ -167,11 +155,11 @@ class _Hypotheses:
     @property
     def level(self) -> Level:
         """The level of the hypotheses."""
-        return self.best.hypotheses.level
+        return self.best.scored.level
 
     def kept(self, values: Values, among: Ints) -> Kept:
         """Returns where the hypothesis stays."""
-        found, results = self.best.hypotheses.read(values), values.elements(self.level)
+        found, results = self.best.scored.read(values), values.elements(self.level)
         if found is None or found[2] or results is None:
             return unknown(len(among))
         # Where it is not sure that the detection is one, neither is what stays of it.
@@ -211,7 +199,7 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
     found = scored(fields)
     if found is not None:
-        return Narrowed(_Scores(found, least, *_inside(fields, depth)), node)
+        return Narrowed(_Scores(found.level, found, least, *_inside(fields, depth)), node)
     results, named = fields.get("results"), hypotheses(fields)
     if isinstance(results, Listing) and named is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
@@ -255,7 +243,7 @@ def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], b
     for node in fields.values():
         found = without_low(node, 0.0, depth - 1)
         for _, leaf, limits in leaves_below(Spot(found)):
-            if any(isinstance(limit, _Scores | _BestScores) for limit in limits):
+            if any(isinstance(limit, _Detections) for limit in limits):
                 return (), True
             if leaf.json_depth:
                 texts.append(leaf)
@@ -268,6 +256,16 @@ def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
     return any(
         column is None or any(word[:1] in {"[", "{"} for word in column.words) for column in columns
     )
+
+
+def ranked(score: Floats, owners: Ints) -> tuple[Ints, Mask]:
+    """Returns the order of hypotheses by detection, the best first, and which begin one there.
+
+    Of those of one score the first comes first; without a score, last.
+    """
+    rank = np.where(np.isnan(score), -np.inf, score)
+    order = np.lexsort((-rank, owners))
+    return order, np.diff(owners[order], prepend=-1) != 0
 
 
 def _has_label(name: Texts) -> Mask:

@@ -258,11 +258,12 @@ class Shape:
 
     Attributes:
         type: as the channel names it.
+        definition: its fields.
     """
 
     def __init__(self, definition: Definition, type_name: str, extractor: SchemaExtractor) -> None:
         self.type = type_name
-        self._definition = definition
+        self.definition = definition
         self._fields = extractor.fields_of(type_name)
         self._limit = extractor.limit
 
@@ -379,13 +380,13 @@ class Shape:
         return Group({**fields, "encoding": encoding, "shape": sized})
 
     def _message(self) -> Node:
-        return self.shown(Place(ROWS, "", self._definition, None, 0))
+        return self.shown(Place(ROWS, "", self.definition, None, 0))
 
     def _at(self, path: Sequence[str]) -> Node | None:
         found = descend(self._message(), path)
         if found is not None:
             return found
-        plain = descend(self.plain(Place(ROWS, "", self._definition, None, 0)), path)
+        plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
         return None if plain is None else self._as_shown(plain)
 
     def _as_shown(self, node: Node) -> Node:
@@ -448,6 +449,13 @@ class Shape:
         return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
 
 
+def shape_of(known: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
+    """Returns the shape of a table's type, or of some parts'; None where the messages decide."""
+    if known.definition is None or "" in known.left_out:
+        return None
+    return Shape(known.definition, known.channel.type, extractor)
+
+
 class ByType(Generic[T]):
     """What is made of the shape of each type, once.
 
@@ -463,13 +471,13 @@ class ByType(Generic[T]):
 
     def of(self, known: Table | PartZones) -> T | None:
         """Returns that of a table's type, or of some parts'; None where the messages decide."""
-        definition = known.definition
-        if definition is None or "" in known.left_out:
+        shape = shape_of(known, self._extractor)
+        if shape is None:
             return None
-        key = (definition, known.channel.type)
+        key = (shape.definition, shape.type)
         if key not in self._known:
             try:
-                self._known[key] = self._make(Shape(*key, self._extractor))
+                self._known[key] = self._make(shape)
             except UnknownShapeError:
                 self._known[key] = None
         return self._known[key]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.columns.scores import is_object
-from ros2_memory.columns.shown import Shape, UnknownShapeError, children
+from ros2_memory.columns.shown import UnknownShapeError, children, shape_of
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
 
@@ -22,11 +22,11 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
     None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
     number: then the messages have to be read.
     """
-    if table.definition is None or "" in table.left_out:
+    shape = shape_of(table, extractor)
+    if shape is None:
         return None
     name: str | None = None
     try:
-        shape = Shape(table.definition, table.channel.type, extractor)
         node = shape.value if field is None else shape.find(field)
         if field is None and node is not None and is_object(node):
             [(name, node)] = children(node)

@@ -302,18 +302,9 @@ class BagReader(ABC):
         """
         del bare
 
-        def found() -> Iterator[Record | BagError]:
-            records = iter(self.records(path, topics, window))
-            while True:
-                try:
-                    yield next(records)
-                except StopIteration:
-                    return
-                except BagError as error:
-                    yield error
-
+        records = or_errors(self.records(path, topics, window))
         # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-        return map(_unless_error, batched(enumerate(found())))
+        return map(unless_error, batched(enumerate(records)))
 
     @abstractmethod
     def undecodable(self, channel: Channel) -> str | None:
@@ -417,7 +408,22 @@ def _joined(waiting: list[tuple[int, Record]]) -> Iterator[Batch]:
         yield whole.taken(np.array(rows, np.int64))
 
 
-def _unless_error(item: T | BagError) -> T:
+def or_errors(items: Iterator[T]) -> Iterator[T | BagError]:
+    """Yields the items, and in place of those that are lost the errors that `next` raises."""
+    while True:
+        try:
+            item = next(items)
+        except StopIteration:
+            return
+        except BagError as error:
+            yield error
+            continue
+        yield item
+        del item  # and its buffer, before the next is read
+
+
+def unless_error(item: T | BagError) -> T:
+    """Returns the item; raises it where it is an error that `or_errors` has yielded."""
     if isinstance(item, BagError):
         raise item
     return item

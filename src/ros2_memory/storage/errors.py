@@ -27,7 +27,6 @@ from ros2_memory.core.errors import (
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
-    from types import TracebackType
 
     from ros2_memory.core.timebase import Ns
 
@@ -83,35 +82,24 @@ def raise_if_lost(path: Path, item: T | LostError) -> T:
     raise error(str(path), str(item), (item.first, item.last))
 
 
-class reading:  # noqa: N801 - reads as the function that it would be
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
     """Raises every exception of its block as an `EpisodicError` about `path`.
-
-    A class, since a generator costs each question 2 us more.
 
     Raises:
         BagVanishedError: the file or a folder above it is gone.
         BagUnreachableError: the fault is not the file's, and may pass.
         BagError: anything else; its text ends with the reason.
     """
-
-    __slots__ = ("_path",)
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> None:
-        """Begins the block."""
-
-    def __exit__(
-        self, _kind: object, error: BaseException | None, _trace: TracebackType | None
-    ) -> None:
-        """Translates the exception of the block, if there is one."""
-        if not isinstance(error, Exception) or isinstance(error, EpisodicError):
-            return
+    try:
+        yield
+    except EpisodicError:
+        raise
+    except Exception as error:
         if isinstance(error, OSError) and error.errno in _GONE:
-            raise BagVanishedError(str(self._path), "the file is not there any more") from error
+            raise BagVanishedError(str(path), "the file is not there any more") from error
         error_type = BagUnreachableError if _may_pass(error) else BagError
-        raise error_type(str(self._path), reason_of(error)) from error
+        raise error_type(str(path), reason_of(error)) from error
 
 
 @contextmanager

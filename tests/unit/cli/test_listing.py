@@ -58,6 +58,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize("option", ["--limit", "--tail"])
+def test_cat_refuses_to_print_less_than_no_message(
+    folder: Path, exits: Program, option: str
+) -> None:
+    refused = exits(2, "cat", "/odom", folder, f"{option}=-1").err
+    assert "--limit and --tail must not be negative" in refused
+
+
 def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Program) -> None:
     assert "/od* is a pattern; matching: /odom" in exits(2, "cat", "/od*", folder).err
 

@@ -43,7 +43,7 @@ from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.storage.base import BagReader, Closing, Record
+from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
@@ -333,16 +333,11 @@ def _copies(
 
 def _readable(records: Iterator[Record]) -> Iterator[Record]:
     """Yields the messages that can be read."""
-    while True:
-        try:
-            yield next(records)
-        except StopIteration:
-            return
-        except BagUnreachableError:
-            raise
-        except BagError as error:
-            if error.lost is None:
-                return
+    for record in or_errors(records):
+        if isinstance(record, BagUnreachableError):
+            raise record
+        if not isinstance(record, BagError):
+            yield record
 
 
 def _write_lists(old: _Side, new: _Side, found: tuple[_Listed, _Listed]) -> None:
