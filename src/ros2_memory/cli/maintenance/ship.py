@@ -205,7 +205,7 @@ class _Shipping:
                 WallClock(),
                 messages=self.settings.lake.messages,
                 tombstones={*tombstones},
-                pause=self._pause,
+                before_commit=self._before_commit,
                 alive=self._alive,
             )
 
@@ -213,9 +213,13 @@ class _Shipping:
         notify(WATCHDOG)
         self.lease.renew()
 
-    def _pause(self) -> None:
-        """Waits before a commit until enough time has passed since the one before."""
-        _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
+    def _before_commit(self, is_full: bool) -> None:
+        """Waits until enough time has passed since the last commit, but with no full batch.
+
+        More than a batch may come in that time: to wait with each would never keep up.
+        """
+        if not is_full:
+            _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
         self.committed_s = time.monotonic()
         self.lease.confirm()
 
