@@ -96,7 +96,7 @@ class Shipper:
         clock: dates receipts.
         messages: topics whose messages are shipped whole.
         tombstones: what was forgotten; a bag with a message of it is not shipped.
-        pause: called before each commit; waits until another one is allowed.
+        before_commit: called with whether the batch is full, else waits until one is allowed again.
         alive: called for each bag.
         most_bags: of one commit.
     """
@@ -107,7 +107,7 @@ class Shipper:
     _: KW_ONLY
     messages: Sequence[str] = ()
     tombstones: set[Tombstone] = field(default_factory=set)
-    pause: Callable[[], object] = lambda: None
+    before_commit: Callable[[bool], object] = lambda _: None
     alive: Callable[[], object] = lambda: None
     most_bags: int = MOST_BAGS
 
@@ -130,10 +130,10 @@ class Shipper:
                 rows += sum(map(len, ready.rows.values()))
                 size += sum(len(cast("bytes", row["packed"])) for row in ready.rows["channels"])
                 if len(batch) >= self.most_bags or rows >= MOST_ROWS or size >= MOST_BYTES:
-                    self._commit(batch, done)
+                    self._commit(batch, done, is_full=True)
                     batch, rows, size = [], 0, 0
         if batch:
-            self._commit(batch, done)
+            self._commit(batch, done, is_full=False)
         return done
 
     def keep_up(self, grace: Ns) -> None:
@@ -181,13 +181,13 @@ class Shipper:
         for robot in self.robots:
             robot.look_again()
 
-    def _commit(self, batch: Sequence[_Ready], done: Shipped) -> None:
+    def _commit(self, batch: Sequence[_Ready], done: Shipped, *, is_full: bool) -> None:
         """Commits a batch.
 
         Raises:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
-        self.pause()
+        self.before_commit(is_full)
         bags = [bag for ready in batch for bag in (ready.bag, *ready.replaced)]
         # Few files have to be looked at for it.
         condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)

@@ -81,9 +81,10 @@ def test_a_batch_has_as_many_bytes_of_messages_as_memory_may_hold(
 ) -> None:
     with shipping(tmp_path, [robot_bags("hall", fleet / "hall")], most_bags=100) as shipper:
         monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
-        commits: list[None] = []
-        shipper.pause = lambda: commits.append(None)
+        commits: list[bool] = []
+        shipper.before_commit = commits.append
         assert shipper.run().bags == len(commits) == BAGS
+        assert all(commits)
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
