@@ -87,7 +87,7 @@ def lake_tables() -> str:
         own = _listed(
             (name, *told)
             for name, told in lake_table.columns.items()
-            if name not in {*KEYS, "topic_key", "time"}
+            if name not in {*KEYS, "topic", "topic_key", "time"}
         )
         parts.append(
             f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{own}"
@@ -100,19 +100,29 @@ def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
     alike: dict[tuple[str, str], list[str]] = {}
     for name, kind, meaning in columns:
         alike.setdefault((kind, meaning), []).append(f"`{name}`")
-    lines = (f"- {', '.join(names)} ({kind}): {told}" for (kind, told), names in alike.items())
-    return "\n".join(lines)
+    return "\n".join(
+        f"- {', '.join(names)} ({kind}): {told.removesuffix(' (ns)')}"
+        for (kind, told), names in alike.items()
+    )
 
 
 def exit_table() -> str:
     """Each command, what it is for, and what its exit codes say, but for success."""
     rows = []
     for name, (_, purpose, codes) in COMMANDS.items():
-        failures = (f"{code}: {why}" for code, why in codes.items() if code)
+        failures = (f"{code}: {_short(why)}" for code, why in codes.items() if code)
         rows.append((f"`{name}`", purpose, "; ".join(failures)))
-    common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
+    common = "; ".join(f"{code}: {_short(why)}" for code, why in COMMON_EXIT_CODES.items())
     columns = table(("command", "what it is for", "exit code"), rows)
-    return f"{columns}\n\nExit code 0 is success. Where nothing else is said, {common}."
+    return (
+        f"{columns}\n\nExit code 0 is success; for others stderr has the reason. Where nothing "
+        f"else is said, {common}."
+    )
+
+
+def _short(why: str) -> str:
+    """What an exit code says, without that stderr says more."""
+    return re.sub(r" \((see )?stderr.*\)", "", why)
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
