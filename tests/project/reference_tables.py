@@ -260,9 +260,10 @@ def documented_settings() -> str:
     ):
         schema = _schema_of(key)
         kind = "" if "enum" in schema else _kind(schema)  # its comment names the choices
+        kind = kind.replace("number ", "")  # the page's head
         if default == "null":
             kind = f"or {kind.replace('/`null`', '')}"
-        elif not any(word in kind for word in ("integer", "number", "null")):
+        elif not any(word in kind for word in ("integer", ">", "≥", "null")):
             kind = ""  # the default shows it
         held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
         rows.append(f"- `{key}` ({held}): {meaning.replace(' | ', ', ')}")
