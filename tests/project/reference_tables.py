@@ -362,7 +362,8 @@ def _is_log(node: ast.AST) -> bool:
 def event_list(page: str) -> str:
     """The log events by level, with their own fields, and what the page says that they mean.
 
-    Those of which it says nothing, since their names do, stand together at the end of a level.
+    Those of which it says nothing, since their names do, stand together at the end of a level,
+    without their fields.
     """
     written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
     plain = {
@@ -381,7 +382,7 @@ def event_list(page: str) -> str:
         inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
         shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
         if name in plain and name not in written:
-            named[worst].append(shown_name)
+            named[worst].append(f"`{name}`" + "".join(f" (or {level})" for level in others))
         else:
             told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
     parts = []
