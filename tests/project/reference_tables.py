@@ -128,8 +128,8 @@ def _short(why: str) -> str:
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
     """Each tool: what it answers, its arguments, a call and the reply.
 
-    An argument that several tools describe alike stands once, before them. A tool that is another
-    one up to now, or some seconds ago, shows neither call nor reply.
+    An argument that several tools describe alike stands once, before them; required ones are bold.
+    A tool that is another one up to now, or some seconds ago, shows neither call nor reply.
     """
     whole = {tool.name: tool for tool in tools}
     counted = Counter(
@@ -196,11 +196,11 @@ def _tool(tool: Tool, reply: str | None, known: Iterable[str]) -> str:
     names = {line.partition(":")[0].strip("`") for line in known}
     lines, also = [], []
     for name, line in _arguments(tool).items():
-        need = " (required)" if name in required else ""
+        shown_name = f"**`{name}`**" if name in required else f"`{name}`"
         if line in known or (reply is None and name in names):
-            also.append(f"`{name}`{need}")
+            also.append(shown_name)
         else:
-            lines.append(f"- {line.replace(':', need + ':', 1)}")
+            lines.append(f"- {shown_name}:{line.partition(':')[2]}")
     if also:
         where = "as there" if reply is None else "as above"
         lines.append(f"- {where}: {', '.join(also)}")
