@@ -87,7 +87,7 @@ def lake_tables() -> str:
         own = _listed(
             (name, *told)
             for name, told in lake_table.columns.items()
-            if name not in {*KEYS, "topic_key", "time"}
+            if name not in {*KEYS, "topic", "topic_key", "time"}
         )
         parts.append(
             f"## {lake_table.name}\n\nA row for each {lake_table.row}, by {order}.\n\n{own}"
@@ -100,26 +100,36 @@ def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
     alike: dict[tuple[str, str], list[str]] = {}
     for name, kind, meaning in columns:
         alike.setdefault((kind, meaning), []).append(f"`{name}`")
-    lines = (f"- {', '.join(names)} ({kind}): {told}" for (kind, told), names in alike.items())
-    return "\n".join(lines)
+    return "\n".join(
+        f"- {', '.join(names)} ({kind}): {told.removesuffix(' (ns)')}"
+        for (kind, told), names in alike.items()
+    )
 
 
 def exit_table() -> str:
     """Each command, what it is for, and what its exit codes say, but for success."""
     rows = []
     for name, (_, purpose, codes) in COMMANDS.items():
-        failures = (f"{code}: {why}" for code, why in codes.items() if code)
+        failures = (f"{code}: {_short(why)}" for code, why in codes.items() if code)
         rows.append((f"`{name}`", purpose, "; ".join(failures)))
-    common = "; ".join(f"{code}: {why}" for code, why in COMMON_EXIT_CODES.items())
+    common = "; ".join(f"{code}: {_short(why)}" for code, why in COMMON_EXIT_CODES.items())
     columns = table(("command", "what it is for", "exit code"), rows)
-    return f"{columns}\n\nExit code 0 is success. Where nothing else is said, {common}."
+    return (
+        f"{columns}\n\nExit code 0 is success; for others stderr has the reason. Where nothing "
+        f"else is said, {common}."
+    )
+
+
+def _short(why: str) -> str:
+    """What an exit code says, without that stderr says more."""
+    return re.sub(r" \((see )?stderr.*\)", "", why)
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:
     """Each tool: what it answers, its arguments, a call and the reply.
 
-    An argument that several tools describe alike stands once, before them. A tool that is another
-    one up to now, or some seconds ago, shows neither call nor reply.
+    An argument that several tools describe alike stands once, before them; required ones are bold.
+    A tool that is another one up to now, or some seconds ago, shows neither call nor reply.
     """
     whole = {tool.name: tool for tool in tools}
     counted = Counter(
@@ -186,11 +196,11 @@ def _tool(tool: Tool, reply: str | None, known: Iterable[str]) -> str:
     names = {line.partition(":")[0].strip("`") for line in known}
     lines, also = [], []
     for name, line in _arguments(tool).items():
-        need = " (required)" if name in required else ""
+        shown_name = f"**`{name}`**" if name in required else f"`{name}`"
         if line in known or (reply is None and name in names):
-            also.append(f"`{name}`{need}")
+            also.append(shown_name)
         else:
-            lines.append(f"- {line.replace(':', need + ':', 1)}")
+            lines.append(f"- {shown_name}:{line.partition(':')[2]}")
     if also:
         where = "as there" if reply is None else "as above"
         lines.append(f"- {where}: {', '.join(also)}")
@@ -250,9 +260,10 @@ def documented_settings() -> str:
     ):
         schema = _schema_of(key)
         kind = "" if "enum" in schema else _kind(schema)  # its comment names the choices
+        kind = kind.replace("number ", "")  # the page's head
         if default == "null":
             kind = f"or {kind.replace('/`null`', '')}"
-        elif not any(word in kind for word in ("integer", "number", "null")):
+        elif not any(word in kind for word in ("integer", ">", "≥", "null")):
             kind = ""  # the default shows it
         held = f"`{default}`" + (f" {kind}" if kind[:2] == "or" else f", {kind}" if kind else "")
         rows.append(f"- `{key}` ({held}): {meaning.replace(' | ', ', ')}")
@@ -351,7 +362,8 @@ def _is_log(node: ast.AST) -> bool:
 def event_list(page: str) -> str:
     """The log events by level, with their own fields, and what the page says that they mean.
 
-    Those of which it says nothing, since their names do, stand together at the end of a level.
+    Those of which it says nothing, since their names do, stand together at the end of a level,
+    without their fields.
     """
     written = dict(re.findall(r"^- `(\w+)`(?: \([^)]*\))?: (.+)$", page, re.MULTILINE))
     plain = {
@@ -370,7 +382,7 @@ def event_list(page: str) -> str:
         inside += [f"`{field}`" for field in fields if field not in {"reason", "exception"}]
         shown_name = f"`{name}`" + (f" ({', '.join(inside)})" if inside else "")
         if name in plain and name not in written:
-            named[worst].append(shown_name)
+            named[worst].append(f"`{name}`" + "".join(f" (or {level})" for level in others))
         else:
             told[worst].append(f"- {shown_name}: {written.get(name, '?')}")
     parts = []
