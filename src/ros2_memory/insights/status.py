@@ -129,12 +129,11 @@ def _heard(snapshot: Snapshot) -> Ns | None:
 
     The recorder logs at each split, so its own topics go on when the robot is dead.
     """
-    timeline = snapshot.timeline
     times = [
         stated.last
-        for topic in timeline.topics()
+        for topic in snapshot.timeline.topics()
         if topic not in OWN_TOPICS
-        for stated in timeline.totals(topic).values()
+        for stated in snapshot.totals(topic)
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)

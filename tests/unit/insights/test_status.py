@@ -90,6 +90,9 @@ def test_the_recorders_own_topics_do_not_make_old_data_new(tmp_path: Path) -> No
     told = shown(memory, tmp_path)
     assert (told["recorder_alive"], told["newest_age_s"]) == (True, 50.0)
     assert f"no message since {BEGIN // S + 10}.000000 but on topics that the" in told["doubts"]
+    ahead = BEGIN + 365 * 86_400 * S
+    write_mcap(tmp_path / "rec" / "ahead.mcap", [odom(ahead, 0.0, 0.0, 0.0)])
+    assert shown(memory, tmp_path)["newest_age_s"] == 50.0
 
 
 def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> None:
