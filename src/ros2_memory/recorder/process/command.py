@@ -7,6 +7,7 @@ regular expression; an option that only some have is used only if the help lists
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import yaml
@@ -74,7 +75,7 @@ def record_argv(
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
     if STATISTICS in known_options:
-        topics = TopicSelection((*topics.entries, MESSAGES_LOST))
+        topics = replace(topics, entries=(*topics.entries, MESSAGES_LOST))
     argv += ["-e", topics.regex]
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]

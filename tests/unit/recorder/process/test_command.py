@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import yaml
 
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.command import (
+    STATISTICS,
     options_in_help,
     record_argv,
     storage_config,
@@ -131,6 +133,14 @@ def test_what_a_distribution_knows_is_added_to_the_letter() -> None:
         "/tf_static=32",
         "/map",
     ]
+
+
+@pytest.mark.parametrize("known", [(), (STATISTICS,)], ids=["plain", "with statistics"])
+def test_what_is_excluded_is_recorded_by_no_distribution(known: tuple[str, ...]) -> None:
+    argv = argv_for(frozenset(known), topics=TopicSelection(("/a/*",), ("/a/secret",)))
+    recorded = re.compile(argv[argv.index("-e") + 1])
+    assert recorded.search("/a/speed")
+    assert not recorded.search("/a/secret")
 
 
 @pytest.mark.parametrize("distribution", DISTRIBUTIONS)
