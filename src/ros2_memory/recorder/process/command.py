@@ -16,9 +16,10 @@ from ros2_memory.bag_dir.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
-    from ros2_memory.recorder.process.topics import TopicSelection
     from collections.abc import Collection, Sequence
     from pathlib import Path
+
+    from ros2_memory.recorder.process.topics import TopicSelection
 
 
 HELP_ARGV: Final = ("bag", "record", "--help")
