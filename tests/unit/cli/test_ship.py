@@ -19,8 +19,8 @@ from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.lease import WarehouseLease, writing_alone
 from ros2_memory.lake.upkeep import TOMBSTONES_FILE
-from tests.support.fleets import seeded, write_robot
-from tests.support.lakes import START_S, lake_column, write_bag
+from tests.support.fleets import START_S, seeded, write_robot
+from tests.support.lakes import lake_column, write_bag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
