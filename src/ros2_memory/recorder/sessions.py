@@ -222,7 +222,11 @@ class RecordingSessions:
                 self._report_death(session, now)
                 if session is self.current:
                     self._finalize(session, now)
-                self._lose(session)
+                    self._lose(session)
+                else:
+                    self._lose(session)  # its sidecar says so before it is finalized
+                    self._finalize(session, now)
+                    self.settle_handovers()
         return deaths
 
     def end_unready(self, now: ClockReading) -> bool:

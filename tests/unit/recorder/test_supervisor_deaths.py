@@ -114,7 +114,10 @@ class TestDeath:
         world = World(tmp_path, session_duration_s=20).started(22.5)
         old, new = world.recorders
         new.die()
-        world.run(1)
+        with capture_logs() as logs:
+            world.run(1)
+        assert (len(events(logs, "recorder_died")), events(logs, "recorder_hung")) == (1, [])
+        assert world.heartbeat()["restarts"] == 1
         assert old.status is None
         assert read_handover(new.directory).handover.hides_all
         assert read_handover(old.directory).handover.next is None
