@@ -33,6 +33,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.core.directories import mode_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
@@ -142,7 +143,7 @@ def recording_name(now: Ns, bag_dir: Path) -> str:
     stem = f"rec_{utc_stamp(now)}"
     name, number = stem, 1
     try:
-        while (bag_dir / name).exists():
+        while mode_of(bag_dir / name):
             number += 1
             name = f"{stem}_{number}"
     except OSError as error:

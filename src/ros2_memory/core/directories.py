@@ -90,6 +90,29 @@ def identity_at(descriptor: int) -> Identity:
     return Identity(inode, int(generation))
 
 
+def mode_of(path: Path) -> int:
+    """Returns the type and mode of what has this name, also of a link; 0 where nothing has.
+
+    Not by `Path.exists`, which takes what the disk does not tell for missing since Python 3.14.
+
+    Raises:
+        OSError: the disk does not tell.
+    """
+    try:
+        return path.lstat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return 0
+
+
+def is_folder(path: Path) -> bool:
+    """Returns whether it is a directory, and not a link to one.
+
+    Raises:
+        OSError: the disk does not tell.
+    """
+    return stat.S_ISDIR(mode_of(path))
+
+
 def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
     """Yields a directory and each below it, with their entries; skips what cannot be listed.
 

@@ -28,6 +28,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
+from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.handover.union import cut_clock, intended
@@ -302,6 +303,6 @@ def _is_there(recording: Path) -> bool:
         RecorderError: it cannot be looked at.
     """
     try:
-        return recording.is_dir()
+        return is_folder(recording)
     except OSError as error:
         raise RecorderError(f"{recording}: {error.strerror or error}") from error

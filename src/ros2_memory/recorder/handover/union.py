@@ -40,6 +40,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handovers,
 )
 from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
+from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
@@ -78,7 +79,7 @@ def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str]
     Raises:
         OSError: the bag directory cannot be listed.
     """
-    for directory in sorted(filter(_is_folder, bag_dir.iterdir())):
+    for directory in sorted(filter(is_folder, bag_dir.iterdir())):
         handover = read_handover(directory).handover
         pairs: list[tuple[Path, Path]] = []
         if handover.next is not None and handover.counts_until is None:
@@ -86,7 +87,7 @@ def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str]
         # Retention may have deleted the one before, and then there is nothing to compare.
         if handover.previous is not None and handover.compared is False:
             previous = bag_dir / handover.previous
-            pairs += [(previous, directory)] * _is_folder(previous)
+            pairs += [(previous, directory)] * is_folder(previous)
         for old, new in pairs:
             try:
                 settle_handover(old, new, reader, running)
@@ -106,27 +107,22 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
         RecorderError: the recordings cannot be read, or the sidecars cannot be written.
     """
     try:
-        if not _is_folder(old):
-            if _is_folder(new) and handover_to_change(new).hides_all:
+        if not is_folder(old):
+            if is_folder(new) and handover_to_change(new).hides_all:
                 write_handover(new, Handover())
             return True
         begun = read_handover(old).handover
         if begun.next == new.name and begun.counts_until is None:
-            if old.name in running and _is_folder(new):
+            if old.name in running and is_folder(new):
                 return False
             _write_cut(old, new, reader)
             _log.info("handover_settled", recording=old.name, next=new.name)
-        return not _is_folder(new) or _compare(old, new, reader, running)
+        return not is_folder(new) or _compare(old, new, reader, running)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
         # What the disk cannot show at present must not be taken for missing.
         raise RecorderError(str(error)) from error
-
-
-def _is_folder(path: Path) -> bool:
-    """Whether it is a directory, and not a link to one elsewhere."""
-    return path.is_dir() and not path.is_symlink()
 
 
 def intended(old: Handover, new_name: str | None) -> Handover:
@@ -144,7 +140,7 @@ def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
     sidecar records about its own end is kept.
     """
     before = handover_to_change(old)
-    after = handover_to_change(new) if _is_folder(new) else Handover(Counting.VOID)
+    after = handover_to_change(new) if is_folder(new) else Handover(Counting.VOID)
     last = None if after.state is Counting.VOID else _end_of(old, reader)
     if after.state is Counting.COUNTS and after.counts_from is not None:
         # The crash came between the two sidecars of a complete handover.
