@@ -447,13 +447,15 @@ class ColumnStore(Database):
         return self.write(write)
 
     def put_listings(self, listings: dict[str, str]) -> bool:
-        """Replaces all that `listings` returns."""
+        """Replaces all that `listings` returns; returns whether the file has them then."""
 
         def write(connection: sqlite3.Connection) -> None:
             connection.execute("DELETE FROM listing")
             connection.executemany("INSERT INTO listing VALUES (?, ?)", listings.items())
 
-        return self.listings() == listings or self.write(write)
+        if self.listings() == listings:
+            return True
+        return self.write(write)
 
     def put(self, decoded: DecodedBags, *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.

@@ -87,7 +87,7 @@ class Zone(NamedTuple):
         """Returns whether some value lies above a limit, or below it."""
         return self.high > limit if above else self.low < limit
 
-    def is_near(self, place: float, distance: float) -> bool:
+    def may_be_near(self, place: float, distance: float) -> bool:
         """Returns whether some value may be within a distance of a place."""
         return as_float(self.low) - place <= distance and place - as_float(self.high) <= distance
 

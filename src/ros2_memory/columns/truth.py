@@ -421,7 +421,7 @@ class _PlaceTest:
         found: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
             zone = zone_of(leaf)
-            found = found if zone is None else found & zone.is_near(center, reach)
+            found = found if zone is None else found & zone.may_be_near(center, reach)
         return found
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:

@@ -104,7 +104,7 @@ class Zones:
         at = min(max(as_float(limit), -sys.float_info.max), sys.float_info.max)
         return self.high > at if above else self.low < at
 
-    def is_near(self, place: float, distance: float) -> Mask:
+    def may_be_near(self, place: float, distance: float) -> Mask:
         """Returns in which parts some value may be within a distance of a place."""
         return (self.low - place <= distance) & (place - self.high <= distance)
 

@@ -122,12 +122,13 @@ class RobotTracks:
     def __init__(self, view: View, frame_id: str) -> None:
         self._view = view
         self._frame_id = frame_id
-        self._body = body_by_transforms(view)
-        tf_topics = view.limits.tf_topics
-        self._topics = (view.pose_topic,) if self._body is None else tf_topics
-        own = pose_frame(view, view.pose_topic) if self._body is None else self._body.child
-        self._own_frame = own
-        self._is_own = self._body is None and own == frame_id
+        self._body = body = body_by_transforms(view)
+        self._topics = view.limits.tf_topics
+        if body is None:
+            self._topics, self._own_frame = (view.pose_topic,), pose_frame(view, view.pose_topic)
+        else:
+            self._own_frame = body.child
+        self._is_own = body is None and self._own_frame == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
 
