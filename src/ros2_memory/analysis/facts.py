@@ -53,8 +53,12 @@ MOST: Final = {LABEL: 256, FLAG: 512, STATUS: 512, GOAL: 512}
 """Facts of a kind in one message that are tracked; the rest is counted."""
 LOW_CHARGES: Final = (0.2, 0.1, 0.05)
 """Fractions of a full battery; the value of its charge is how many of them it is below."""
+_UNSURE_CHARGE: Final = 0.02
+"""So little above such a fraction says nothing: the charge that a battery reports trembles."""
 
 _PERCENT: Final = 100
+_FULL: Final = 1.05
+"""Up to here a charge is a fraction, of a full battery that reports a little more."""
 _WARN: Final = 30
 _ERROR: Final = 40
 _LOG_WORDS: Final = ((50, "fatal"), (_ERROR, "error"), (_WARN, "warning"))
@@ -128,15 +132,17 @@ def charge_of(value: JsonValue) -> float | None:
     charge = value.get("percentage") if isinstance(value, dict) else None
     if not isinstance(charge, float) or not 0 <= charge <= _PERCENT:
         return None
-    return charge / _PERCENT if charge > 1 else charge
+    return charge / _PERCENT if charge > _FULL else min(charge, 1.0)
 
 
 def charge_levels(charges: Floats) -> Ints:
-    """Returns below how many of `LOW_CHARGES` each charge is; -1 where it is not known."""
+    """Returns below how many of `LOW_CHARGES` each charge is; -1 where that is not known."""
     with np.errstate(invalid="ignore"):
-        part = np.where(charges > 1, charges / _PERCENT, charges)
+        part = np.where(charges > _FULL, charges / _PERCENT, charges)
         levels = np.sum([part < least for least in LOW_CHARGES], axis=0, dtype=np.int64)
-        return np.where((charges >= 0) & (charges <= _PERCENT), levels, -1)
+        surely = np.sum([part < least + _UNSURE_CHARGE for least in LOW_CHARGES], axis=0)
+        is_known = (charges >= 0) & (charges <= _PERCENT) & (levels == surely)
+        return np.where(is_known, levels, -1)
 
 
 def is_still(numbers: Floats, error: float = 0.0) -> Flags:
@@ -217,8 +223,9 @@ def _listed(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
 
 def _charge(value: JsonValue) -> Iterator[Fact]:
     charge = charge_of(value)
-    if charge is not None:
-        yield Word(CHARGE), sum(charge < least for least in LOW_CHARGES)
+    level = -1 if charge is None else int(charge_levels(np.array([charge]))[0])
+    if level >= 0:
+        yield Word(CHARGE), level
 
 
 def _command(value: JsonValue) -> Iterator[Fact]:

@@ -65,5 +65,6 @@ def _joined(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
     return [] if whole is None else [whole]
 
 
-EVENTS: Final = Kind("events", _fragment, _events, _joined)
+# Named anew where the same messages report something else: what was stored before does not count.
+EVENTS: Final = Kind("events2", _fragment, _events, _joined)
 """What came into view, changed or failed on a topic in a part."""

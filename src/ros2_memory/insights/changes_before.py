@@ -238,7 +238,8 @@ def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
         if text:
             yield _Change(change.time, change.time, text)
     for known in events.known:
-        # A goal is new, and a status that is not ok, where earlier messages are without it.
+        # Where earlier messages are without it, a goal is new, and a status that is not ok; and a
+        # charge had been just above a limit.
         if known.at == events.first:
             continue
         if known.kind == GOAL:
@@ -246,6 +247,8 @@ def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
             yield _Change(known.at, known.at, f"{action_of(topic)} goal {word}")
         elif known.kind == STATUS and known.first:
             yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
+        elif known.kind == CHARGE and known.first:
+            yield _Change(known.at, known.at, _fell(topic, known.first))
 
 
 def _changed(topic: str, change: Change, charge: int) -> str:
@@ -257,8 +260,12 @@ def _changed(topic: str, change: Change, charge: int) -> str:
     if change.kind == GOAL and change.value in GOAL_WORDS:
         return f"{action_of(topic)} goal {GOAL_WORDS[change.value]}"
     if change.kind == CHARGE and change.value > charge:
-        return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
+        return _fell(topic, change.value)
     return ""
+
+
+def _fell(topic: str, level: int) -> str:
+    return f"{topic} fell below {LOW_CHARGES[level - 1]:.0%}"
 
 
 def _status(name: str, level: int, text: str) -> str:

@@ -99,7 +99,22 @@ def test_a_charge_that_is_not_known_is_no_fact(charge: JsonValue) -> None:
     assert Word(CHARGE) not in stated({"percentage": charge}, BATTERY)
 
 
-numbers = st.sampled_from([0.0, -0.0, 1e-5, 0.04, 0.15, 0.3, 1.0, 80.0, -2.0, math.nan, math.inf])
+@pytest.mark.parametrize(("charge", "below"), [(0.199, 1), (0.2, None), (0.219, None), (0.221, 0)])
+def test_a_charge_just_above_a_limit_says_nothing_of_it(charge: float, below: int | None) -> None:
+    assert stated({"percentage": charge}, BATTERY).get(Word(CHARGE)) == below
+
+
+@pytest.mark.parametrize(
+    ("reported", "charge"), [(1.0, 1.0), (1.02, 1.0), (1.5, 0.015), (80.0, 0.8)]
+)
+def test_a_full_battery_may_report_a_little_more(reported: float, charge: float) -> None:
+    assert charge_of({"percentage": reported}) == charge
+    assert (charge_levels(np.array([reported]))[0] > 0) == (charge < 0.2)
+
+
+numbers = st.sampled_from(
+    [0.0, -0.0, 1e-5, 0.04, 0.051, 0.21, 0.15, 0.3, 1.0, 1.02, 80.0, -2.0, math.nan, math.inf]
+)
 
 
 @given(st.lists(numbers, max_size=8))

@@ -157,6 +157,14 @@ def test_a_command_that_ends_without_a_goal_is_no_change(tmp_path: Path) -> None
     assert told(before(tmp_path, 20.0)) == [("/drive goal succeeded", 2.0)]
 
 
+def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:
+    trembling = [battery(at(t), 0.209 - t * 0.0002 + 0.008 * (-1) ** t) for t in range(60)]
+    write(tmp_path, [*trembling, boolean(at(59), True)])
+    reply = before(tmp_path, 60.0, seconds_before=60)
+    below = [each for each in reply["before"] if "fell below" in each["text"]]
+    assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
+
+
 def test_goals_are_accepted_and_end(tmp_path: Path) -> None:
     statuses = [(5, {1: RUNNING}), (10, {1: ABORTED, 2: 1}), (11, {1: ABORTED, 2: RUNNING})]
     write(tmp_path, [*driving(20, 20), *(goals(at(t), each) for t, each in statuses)])
