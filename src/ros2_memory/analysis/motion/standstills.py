@@ -1,15 +1,16 @@
 """Where the robot stood still.
 
-A standstill is a time of at least `SHORTEST_NS` in which the robot stays in a box that does not
-grow with time. It begins with the first pose at that place and ends with the last.
+A standstill is a time of at least `SHORTEST_NS` in which the robot moves no faster than odometry
+drifts. It begins with the first pose at that place and ends with the last.
 
 Poses are averaged in slots of `SLOT_NS`, counted from the epoch, so that noise averages out.
 Consecutive slots are linked where their means are no farther apart than a drift of `DRIFT_MPS` or
 the noise of their own poses explains, and linked slots form a chain, whose first and last slot may
 be half motion and are left out. Slow motion that noise hides from two slots shows in blocks of
 `BLOCK_NS`: a block whose means spread farther than drift and noise explain is motion, and splits
-the chain. So are still blocks that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. A
-standstill that drifts out of `LARGEST_M` in a longer time ends there, and the next one begins.
+the chain. So are still blocks that lead `LARGEST_M` away within `CREEP_NS`: the robot creeps. What
+takes longer is drift: the odometry of a camera wanders while the robot is at its dock. A standstill
+that drifts out of `DRIFTED_M` ends there, and the next one begins.
 
 The ends of still blocks in a row are found pose by pose: some slots just inside give the place and
 its noise, and poses are followed outwards until one is elsewhere. The last one before that is
@@ -65,6 +66,8 @@ CONTEXT_NS: Final[Ns] = CREEP_NS + SHORTEST_NS + BLOCK_NS + 2 * SILENCE_NS
 DRIFT_MPS: Final = 0.008
 """The mean position of a still robot may move so fast: odometry drifts."""
 LARGEST_M: Final = 0.1
+DRIFTED_M: Final = 1.0
+"""So far odometry may drift while the robot stands."""
 CREEP_MPS: Final = LARGEST_M / unix_from_ns(CREEP_NS)
 """A slower robot cannot be distinguished from one that stands still."""
 
@@ -415,7 +418,7 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
         start = max(since, until)
         if end - start < SHORTEST_NS:
             continue
-        if box.diagonal <= LARGEST_M:
+        if box.diagonal <= DRIFTED_M:
             found.append(Standstill(start, end, box))
         else:
             found += _in_run(corners, firsts[begin:stop], begin, start, end)
@@ -461,7 +464,7 @@ def _in_run(
         while True:
             low = np.minimum.accumulate(lows[begin : begin + some])
             high = np.maximum.accumulate(highs[begin : begin + some])
-            fits = int((_lengths(high - low) <= LARGEST_M).sum())
+            fits = int((_lengths(high - low) <= DRIFTED_M).sum())
             if fits < some or begin + fits == firsts.size:
                 break
             some *= 4
