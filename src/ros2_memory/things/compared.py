@@ -21,6 +21,7 @@ from ros2_memory.core.regions import Place, places_at
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
 from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
+from ros2_memory.things.moves import LEAST_MM
 from ros2_memory.things.presence import missed_in
 
 if TYPE_CHECKING:
@@ -39,6 +40,11 @@ class _Seen(NamedTuple):
 
     stay: PlacedStay
     part: ThingStay
+
+    def is_elsewhere(self, other: _Seen) -> bool:
+        """Whether a thing was moved between this and another: to and fro is no move."""
+        away_m = math.dist(self.part.place[:2], other.part.place[:2])
+        return self.stay.place != other.stay.place and away_m >= LEAST_MM / 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +72,11 @@ class ThingsBetween:
             before = self._seen(instance, self.earlier, self.later.start)
             after = self._seen(instance, self.later)
             shared = self._seen(instance, self.earlier)
-            if before is None and after and shared and shared.stay.place != after.stay.place:
+            if before is None and after and shared and shared.is_elsewhere(after):
                 before = shared  # in slices of both windows, but elsewhere
             if not self._counts(instance, before, after):
                 continue
-            if before and after and before.stay.place == after.stay.place:
+            if before and after and not before.is_elsewhere(after):
                 same += 1
                 continue
             kind, thing = self._differs(instance, before, after)

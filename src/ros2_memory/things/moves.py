@@ -26,7 +26,7 @@ _PAUSE_NS: Final = 60 * NS_PER_S
 """A visit ends where nothing is seen for longer."""
 _FEWEST: Final = 3
 """Fewer looks move nothing."""
-_LEAST_MM: Final = 150.0
+LEAST_MM: Final = 150.0
 """A step that is shorter is none, however sure it is."""
 _SIGMAS: Final = 5.0
 """So many standard errors are no chance, although a thing may be moved at any of many times."""
@@ -205,7 +205,7 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
     right = np.concatenate(((old + new)[:, :3, 3:], new[:, :1, 3:]), axis=1)
     inverse = np.linalg.inv(normal + np.diag(_PRIOR))
     moved = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
-    likely = np.where(moved >= _LEAST_MM**2, moved / inverse[:, 3, 3], 0.0)
+    likely = np.where(moved >= LEAST_MM**2, moved / inverse[:, 3, 3], 0.0)
     # Of each thing the likeliest, of equal ones the first.
     order = np.lexsort((at, -likely, series.thing[at]))
     things, first = np.unique(series.thing[at[order]], return_index=True)

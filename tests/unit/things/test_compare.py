@@ -155,6 +155,20 @@ def test_a_thing_that_was_brought_back_appeared(tmp_path: Path) -> None:
     assert labels(unknown) == {"not_looked_at": ["book", "mug"]}
 
 
+def test_a_thing_that_was_moved_to_and_fro_is_unchanged(tmp_path: Path) -> None:
+    visits = [*(0.5,) * 4, *(0.1,) * 4, *(0.48,) * 4]
+    messages = [
+        each
+        for nth, y in enumerate(visits)
+        for each in looked(nth * 120, nth * 120 + 30, HERE, ("mug", 3.0, y), BOOK)
+    ]
+    first = {"with_start": BEGIN, "with_end": BEGIN + 470}
+    last = {"start": BEGIN + 960, "end": BEGIN + 1430}
+    assert labels(compared(tmp_path, messages, **first, **last)) == {}
+    moved = ask(tmp_path, **first, start=BEGIN + 480, end=BEGIN + 950)
+    assert labels(moved) == {"moved": ["mug"]}
+
+
 def test_where_keeps_the_things_that_were_in_a_region_in_either_window(tmp_path: Path) -> None:
     reply = compared(tmp_path, moved_mug(), where="kitchen")
     assert labels(reply) == {"moved": ["mug"]}
