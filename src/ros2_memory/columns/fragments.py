@@ -7,6 +7,7 @@ not change, so a fragment does not either, and goes with the first of its parts.
 from __future__ import annotations
 
 import json
+import math
 import threading
 from collections import deque
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
@@ -90,8 +91,7 @@ class Fragment(NamedTuple):
         arrays: dict[str, Array] = {}
         at = 0
         for name, kind, *shape in json.loads(kinds):
-            count = int(np.prod(shape, dtype=np.int64))
-            array = np.frombuffer(values, np.dtype(kind), count, at)
+            array = np.frombuffer(values, kind, math.prod(shape), at)
             arrays[name] = array.reshape(shape)
             at += array.nbytes
         return cls(head.decode(), arrays)

@@ -45,6 +45,8 @@ _COLUMN_BYTES: Final = 300
 CACHE_MB: Final = 64
 """How much unpacked columns and fragments may take in memory, in MiB."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
+_FETCHED_BYTES: Final = 2 << 20
+"""How much compressed columns may take in memory that a scan wants next."""
 DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
@@ -126,6 +128,7 @@ class Scanner:
         self._covering = None if store is None else Covering(store, bag_dir)
         self._read: ByteLru[object] = ByteLru(cache_mb << 20)
         self._known: ByteLru[Packed] = ByteLru((cache_mb << 20) // 5)
+        self._fetched: ByteLru[bytes] = ByteLru(_FETCHED_BYTES)
         self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
         self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
         self.decoded: ByteLru[list[list[Table]]] = ByteLru(DECODED_BYTES)
@@ -266,7 +269,7 @@ class Scanner:
             known = packed(path)
             if known is None:
                 raise KeyError(path)
-            return self._column(head.number, path, known)
+            return self._column(head, path, known, together)
 
         table = part_table(
             topic,
@@ -320,24 +323,47 @@ class Scanner:
                 raise GoneError
         return None if known is _ABSENT else known
 
-    def _column(self, part: int, path: str, packed: Packed) -> Column:
-        known = self._read.get((part, path))
+    def _column(
+        self, head: PartHead, path: str, packed: Packed, together: Sequence[PartHead]
+    ) -> Column:
+        key = (head.number, path)
+        known = self._read.get(key)
         if known is not None:
             return cast("Column", known)
-        assert self.store is not None  # noqa: S101 - as above
         data = b""
         # The one value of a constant is its least, unless it is a text.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
         if packed.count and not is_constant:
-            stored = self.store.part_data(part, path)
-            if stored is None:
-                raise GoneError
+            stored = self._stored(head, path, together)
             if is_large(stored):
                 self._large.acquire()
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        self._read.put((part, path), column, column_bytes(column))
+        self._read.put(key, column, column_bytes(column))
         return column
+
+    def _stored(self, head: PartHead, path: str, together: Sequence[PartHead]) -> bytes:
+        """Returns the compressed bytes of a column; those of parts `together` with it are fetched.
+
+        Raises:
+            GoneError: the part was deleted meanwhile, or the store cannot be read.
+        """
+        assert self.store is not None  # noqa: S101 - as above
+        stored = self._fetched.get((head.number, path))
+        if stored is None:
+            others = [
+                part.number
+                for part in together
+                if part.topic == head.topic and self._read.get((part.number, path)) is None
+            ]
+            numbers = dict.fromkeys([head.number, *others])
+            found = self.store.part_data([*numbers], path, _FETCHED_BYTES // 2)
+            for number, data in found.items():
+                self._fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
+            stored = found.get(head.number)
+            if stored is None:
+                raise GoneError
+        return stored
 
 
 def _outline_key(head: PartHead) -> FragmentKey:

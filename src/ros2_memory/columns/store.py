@@ -358,19 +358,30 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def part_data(self, part: int, path: str) -> bytes | None:
-        """Returns the compressed bytes of a column; None if it is gone."""
+    def part_data(self, parts: Sequence[int], path: str, most_bytes: int) -> dict[int, bytes]:
+        """Returns the compressed bytes of a column of parts, in their order; none of what is gone.
 
-        def ask(connection: sqlite3.Connection) -> bytes | None:
-            row = connection.execute(
-                "SELECT coalesce(own.data, other.data) FROM part_column AS own"
+        Of more than `most_bytes` those are left out that follow.
+        """
+
+        def ask(connection: sqlite3.Connection) -> dict[int, bytes]:
+            rows = connection.execute(
+                "SELECT own.part, coalesce(own.data, other.data) FROM json_each(?) AS wanted"
+                " CROSS JOIN part_column AS own ON own.part = wanted.value AND own.path = ?"
                 " LEFT JOIN part_column AS other ON other.part = own.part AND other.path = own.same"
-                " WHERE own.part = ? AND own.path = ?",
-                (part - self.offset, path),
-            ).fetchone()
-            return None if row is None else row[0]
+                " WHERE coalesce(own.data, other.data) IS NOT NULL",
+                (self._ids(parts), path),
+            )
+            found: dict[int, bytes] = {}
+            size = 0
+            for part, data in rows:
+                found[part + self.offset] = data
+                size += len(data)
+                if size > most_bytes:
+                    break
+            return found
 
-        return self.read(ask, None)
+        return self.read(ask, {})
 
     def fragment(self, kind: str, key: FragmentKey) -> bytes | None:
         """Returns a fragment of a kind; None where it is not stored."""
