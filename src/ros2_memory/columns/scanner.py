@@ -343,7 +343,9 @@ class Scanner:
         return column
 
     def _stored(self, head: PartHead, path: str, together: Sequence[PartHead]) -> bytes:
-        """Returns the compressed bytes of a column; those of parts `together` with it are fetched.
+        """Returns the compressed bytes of a column.
+
+        Where that of the part before was read, too, those of the next parts are fetched with it.
 
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
@@ -351,13 +353,11 @@ class Scanner:
         assert self.store is not None  # noqa: S101 - as above
         stored = self._fetched.get((head.number, path))
         if stored is None:
-            others = [
-                part.number
-                for part in together
-                if part.topic == head.topic and self._read.get((part.number, path)) is None
-            ]
-            numbers = dict.fromkeys([head.number, *others])
-            found = self.store.part_data([*numbers], path, _FETCHED_BYTES // 2)
+            numbers = [part.number for part in together if part.topic == head.topic]
+            nth = numbers.index(head.number) if head.number in numbers else 0
+            goes_on = nth > 0 and self._read.get((numbers[nth - 1], path)) is not None
+            numbers = numbers[nth:] if goes_on else [head.number]
+            found = self.store.part_data(numbers, path, _FETCHED_BYTES // 2)
             for number, data in found.items():
                 self._fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
             stored = found.get(head.number)
