@@ -456,7 +456,7 @@ def build_memory(
         ConfigError: the reader cannot be built, or the schema map or the labels are refused.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.columns.scanner import CACHE_MB, Scanner
+    from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
     from ros2_memory.index.scan import BAG_DIR_SETTING
     from ros2_memory.recorder.index_manager import IndexManager
@@ -483,8 +483,8 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
         large=shared.large,
     )
-    reading, cache_mb = reading_of(settings, schemas), shared.cache_mb or CACHE_MB
-    scanner = Scanner(columns, bag_dir, reading, shared.large, cache_mb)
+    cache_mb = shared.cache_mb or settings.store.cache_mb
+    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas), shared.large, cache_mb)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 

@@ -311,6 +311,7 @@ class StoreSettings:
     enabled: Flag
     max_share: Annotated[float, Field(strict=True, ge=0, le=1)]
     max_gb: Positive
+    cache_mb: Count
 
 
 @section

@@ -65,7 +65,7 @@ class TestDefaults:
                 "max_chunk_mb": 64,
                 "schemas_file": ROOT / "config/message_schemas.yaml",
             },
-            "store": {"enabled": True, "max_share": 0.15, "max_gb": 2.0},
+            "store": {"enabled": True, "max_share": 0.15, "max_gb": 2.0, "cache_mb": 64},
             "retention": {
                 "max_total_gb": 5.0,
                 "max_age_h": 168.0,

@@ -42,8 +42,6 @@ _HEAD_BYTES: Final = 400
 """About how much memory what is known of a part takes."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
-CACHE_MB: Final = 64
-"""How much unpacked columns and fragments may take in memory, in MiB."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 _FETCHED_BYTES: Final = 2 << 20
 """How much compressed columns may take in memory that a scan wants next."""
@@ -121,7 +119,7 @@ class Scanner:
         bag_dir: Path,
         settings: str = "",
         large: LargeReads | None = None,
-        cache_mb: int = CACHE_MB,
+        cache_mb: int = 64,
     ) -> None:
         self.store = store
         self._large = large or LargeReads()
