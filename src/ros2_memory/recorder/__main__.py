@@ -37,13 +37,7 @@ from ros2_memory.config import (
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.malloc import return_large_at_once, share_one_arena
-from ros2_memory.core.sd_notify import (
-    READY,
-    STOPPING,
-    WATCHDOG,
-    notify,
-    watchdog_interval_s,
-)
+from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.recorder.supervisor import make_bag_dir
@@ -126,31 +120,29 @@ def _record(settings: Settings) -> None:
     if clear:
         refuse_homes(bag_dir)
     make_bag_dir(bag_dir)
+    # Until this process ends: what is still under way in its threads must meet no other recorder.
     lock = BagDirLock.acquire(bag_dir)
-    try:
-        recorder = build_recorder(
-            settings,
-            reader=reader,
-            housekeeper=housekeeper,
-            own=own,
-            keep_open=(lock.descriptor,),
-            excluding={
-                each.topic: f"the rule {each.name!r} of recording.exclude_when"
-                for each in exclusions_of(settings)
-            },
-        )
-        recorder.check()
-        claim(own)
-        if clear:
-            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
-        _put_in_order(bag_dir, reader, housekeeper)
-        _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
-        if unused := unused_config():
-            _log.warning("config_unused", reason=unused)
-        _record_until_signal(recorder, bag_dir, reader, lock)
-        _log.info("stopped")
-    finally:
-        lock.release()
+    recorder = build_recorder(
+        settings,
+        reader=reader,
+        housekeeper=housekeeper,
+        own=own,
+        keep_open=(lock.descriptor,),
+        excluding={
+            each.topic: f"the rule {each.name!r} of recording.exclude_when"
+            for each in exclusions_of(settings)
+        },
+    )
+    recorder.check()
+    claim(own)
+    if clear:
+        _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
+    _put_in_order(bag_dir, reader, housekeeper)
+    _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
+    if unused := unused_config():
+        _log.warning("config_unused", reason=unused)
+    _record_until_signal(recorder, bag_dir, reader, lock)
+    _log.info("stopped")
 
 
 def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
@@ -191,8 +183,6 @@ def _record_until_signal(
     Raises:
         EpisodicError: recording cannot begin, or another recorder took the bag directory.
     """
-    interval_s = watchdog_interval_s()
-    next_sign_s = 0.0
     recover_at_s = time.monotonic() + RECOVER_EVERY_S
     with _ending_signals() as received:
         try:
@@ -210,9 +200,6 @@ def _record_until_signal(
                     # The recorder reports a directory that cannot be listed.
                     with suppress(OSError):
                         recover_handovers(bag_dir, reader, read_heartbeat(bag_dir).recordings)
-                if interval_s is not None and now_s >= next_sign_s:
-                    notify(WATCHDOG)
-                    next_sign_s = now_s + interval_s / 2
             _log.info("signal_received", signal=signal.Signals(received[0]).name)
         finally:
             notify(STOPPING)

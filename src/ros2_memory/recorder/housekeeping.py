@@ -8,7 +8,6 @@ later, when the index finds them and nothing writes them.
 from __future__ import annotations
 
 import os
-import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -29,6 +28,7 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
@@ -150,8 +150,7 @@ class Housekeeping(Housekeeper):
         self._collected = Collected()
         self._status = HouseStatus()
         self._unshipped = 0
-        self._threads: dict[str, threading.Thread] = {}
-        self._faults: dict[str, str] = {}
+        self._background = Background()
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -197,8 +196,7 @@ class Housekeeping(Housekeeper):
         Raises:
             OSError: the free space cannot be measured.
         """
-        self._apply(free_bytes_wanted)
-        most_free = self._collected.most_free
+        most_free = self._apply(free_bytes_wanted).most_free
         if most_free is not None and not self._out_of_reach:
             _log.error(
                 "room_out_of_reach",
@@ -283,7 +281,7 @@ class Housekeeping(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
-    def _apply(self, free_bytes_wanted: int | None = None) -> None:
+    def _apply(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
         self._update_moments()
         self._clear_memory()
@@ -319,6 +317,7 @@ class Housekeeping(Housekeeper):
         self._report(before, collected)
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
+        return collected
 
     def _report(self, before: Collected, collected: Collected) -> None:
         """Reports what began or ended with a pass, and what it deleted unshipped."""
@@ -497,7 +496,7 @@ class BackgroundHousekeeper(Housekeeping):
 
     def is_making_room(self) -> bool:
         """Whether room is being made."""
-        return self._is_under_way("make_room")
+        return self._background.is_under_way("make_room")
 
     def apply(self) -> None:
         """Begins to apply the limits."""
@@ -509,51 +508,32 @@ class BackgroundHousekeeper(Housekeeping):
 
     def screen(self, live: Collection[str]) -> None:
         """Begins to screen closed splits."""
-        if self._screening is None or self._is_under_way("screen"):
+        if self._screening is None or self._background.is_under_way("screen"):
             return
         # What is live is known now, and not when the thread begins.
         try:
             step = self._screening.plan(live)
         except (EpisodicError, OSError) as error:
-            self._faults["screen"] = str(error)
+            self._background.failed("screen", str(error))
             return
         self._begin("screen", step)
 
     def finish(self) -> None:
-        """Screens what is left, after what is under way."""
-        if "screen" in self._threads:
-            self._threads["screen"].join()
-        self._run("screen", super().finish)
+        """Screens what is left, after what is under way; waits for that, but not for ever."""
+        self._background.add("screen", super().finish)
+        self._background.wait()
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""
-        return dict(self._faults)
+        return self._background.faults()
 
     def wait(self) -> None:
         """Waits until nothing is under way."""
-        for thread in self._threads.values():
-            thread.join()
+        self._background.wait(None)
 
     def _begin(self, task: str, do: Callable[[], None]) -> None:
-        if not self._is_under_way(task):
-            self._threads[task] = threading.Thread(
-                target=self._run, args=(task, do), name=f"housekeeping {task}", daemon=True
-            )
-            self._threads[task].start()
-
-    def _run(self, task: str, do: Callable[[], None]) -> None:
-        try:
-            do()
-        except (EpisodicError, OSError) as error:
-            self._faults[task] = str(error)
-        except Exception as error:  # noqa: BLE001 - or its thread ends silently, and the disk fills
-            _log.exception("housekeeping_faulty", task=task)
-            self._faults[task] = f"a fault in this program ({type(error).__name__}); see its log"
-        else:
-            self._faults.pop(task, None)
-
-    def _is_under_way(self, task: str) -> bool:
-        return task in self._threads and self._threads[task].is_alive()
+        if not self._background.is_under_way(task):
+            self._background.add(task, do)
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

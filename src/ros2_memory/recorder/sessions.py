@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
@@ -64,6 +65,7 @@ class Orders:
         topics: the list of topics to record.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed, and measures how they arrive.
+        background: does what takes a while.
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
@@ -80,6 +82,7 @@ class Orders:
     topics: TopicsFile
     own: OwnRecordings
     reception: Reception
+    background: Background
     required: Sequence[Required] = ()
     simulated: bool = False
     advice: Callable[[], str] = str
@@ -343,8 +346,11 @@ class RecordingSessions:
                 self._orders.reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
-        for fault in flush_bags(directory, names):
-            self._events.warn("not_flushed", fault, recording=session.name)
+        def flush() -> None:
+            for fault in flush_bags(directory, names):
+                self._events.warn("not_flushed", fault, recording=session.name)
+
+        self._orders.background.add("flush", flush)
 
     def _take_over(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
