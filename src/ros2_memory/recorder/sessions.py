@@ -21,7 +21,7 @@ from ros2_memory.recorder.handover.transfer import (
     HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.union import settle_handover
+from ros2_memory.recorder.handover.union import settle_handover, unsettled_handovers
 from ros2_memory.recorder.policies import ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.output import LineKind
@@ -389,10 +389,20 @@ class RecordingSessions:
                 self._unsettled.append(handover.directories)
                 self.settle_handovers()
 
+    def recover(self) -> None:
+        """Settles what an earlier run left.
+
+        Raises:
+            OSError: the bag directory cannot be listed.
+        """
+        self._unsettled = unsettled_handovers(self._bag_dir)
+        self.settle_handovers()
+
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
-        What fails is tried again when the next split is closed.
+        What fails, as on a full disk, is reported and tried again with the next call: until then
+        the messages of the new recording do not count.
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
@@ -400,7 +410,10 @@ class RecordingSessions:
                 if settle_handover(old, new, self._orders.reader, running):
                     self._unsettled.remove((old, new))
             except RecorderError as error:
-                self._events.fail("rotation_failed", str(error), recording=old.name)
+                name = old.name
+                self._events.fail_once("handover_not_settled", name, str(error), recording=name)
+            else:
+                self._events.resolve("handover_not_settled", old.name)
 
     def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)

@@ -51,6 +51,8 @@ RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
+UNSETTLED_S: Final = 60.0
+"""How often handovers are tried again that could not be settled, beside at each closed split."""
 LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
@@ -107,7 +109,7 @@ class Supervisor:
         self.stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
-        self._applied_s = self._last.monotonic_s
+        self._applied_s = -QUIET_RETENTION_S
 
     @property
     def is_recording(self) -> bool:
@@ -128,6 +130,7 @@ class Supervisor:
         make_bag_dir(self._bag_dir)
         try:
             self._disk.remember()
+            self._sessions.recover()
         except OSError as error:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
         self._check_space(now)
@@ -184,6 +187,7 @@ class Supervisor:
             ("interruptions", 0.0, True, self._note_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
             ("house", 0.0, False, self._apply_retention),
+            ("settle", UNSETTLED_S, True, lambda _: self._sessions.settle_handovers()),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
             ("screen", SCREENING_S, True, self._screen),
         )

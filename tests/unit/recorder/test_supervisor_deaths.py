@@ -13,7 +13,6 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.storage.base import Closing
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
@@ -146,7 +145,7 @@ class TestDeath:
         world = World(tmp_path, session_duration_s=20).started(after_s)
         for recorder in world.running:
             recorder.die()
-        recover_handovers(tmp_path, world.reader)
+        World(tmp_path).started(0.25)
         assert_what_stands_counts_once(world)
 
 

@@ -176,7 +176,7 @@ class TestUnmounted:
         assert len(events(logs, "disk_gone")) == 1
         assert world.running == []
         assert len(world.recorders) == 1
-        assert housekeeping.asked == []
+        assert housekeeping.asked == ["apply"]
         world.supervisor.stop()
         assert list(world.bag_dir.iterdir()) == []
 
@@ -260,18 +260,18 @@ class TestHouse:
         world.run(15)
         assert [loss.lost for loss in read_losses(tmp_path, MIN_NS, MAX_NS)] == [3]
 
-    def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
+    def test_it_is_kept_at_the_start_and_after_splits_were_closed(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         World(tmp_path, housekeeper=housekeeping).started(31)
-        assert housekeeping.asked.count("apply") == 3
+        assert housekeeping.asked.count("apply") == 4
 
-    def test_it_is_kept_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
+    def test_it_is_kept_at_the_start_and_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.silent = True
         world.supervisor.start()
         world.run(130)
-        assert housekeeping.asked.count("apply") == 2
+        assert housekeeping.asked.count("apply") == 3
 
 
 class TestSlowDisk:
