@@ -13,7 +13,7 @@ from ros2_memory.core.errors import EpisodicError
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-PATIENCE_S: Final = 10.0
+PATIENCE_S: Final = 8.0
 """How long a recorder that stops waits for what is under way; the service manager allows 40 s."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)

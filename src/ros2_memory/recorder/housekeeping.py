@@ -28,9 +28,9 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.index.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
-from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
 from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
@@ -58,6 +58,8 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 _MB: Final = 10**6
 _MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
+_WRITTEN_AT_ONCE: Final = 2
+"""Recordings, during a rotation."""
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
@@ -112,7 +114,7 @@ class Housekeeping(Housekeeper):
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
-        collector = GarbageCollector(
+        self._collector = GarbageCollector(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics, self._own, monotonic=monotonic),
@@ -134,7 +136,7 @@ class Housekeeping(Housekeeper):
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            collector=collector,
+            packs=True,
         )
         self._moments = MomentKeeper(bag_dir, moments_bytes, clock, self._own, rule_bytes)
         self._triggers = None if watch is None else watch(self._moments)
@@ -285,7 +287,7 @@ class Housekeeping(Housekeeper):
         begun = time.perf_counter_ns()
         self._update_moments()
         self._clear_memory()
-        before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
+        before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
         limit = f"{self._max_age_h:g} h"
         age_held = (
@@ -317,6 +319,16 @@ class Housekeeping(Housekeeper):
         self._report(before, collected)
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
+        return collected
+
+    def _collect(self, free_bytes_wanted: int | None) -> Collected:
+        with self._index.undisturbed(patrolling=True) as snapshot:
+            heartbeat = self._index.heartbeat()
+            begun = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
+            known = self._index.known_bags(begun, snapshot)
+            collected = self._collector.apply(known, snapshot, free_bytes_wanted)
+        if collected.bags or collected.cut:
+            self._index.refresh()
         return collected
 
     def _report(self, before: Collected, collected: Collected) -> None:

@@ -149,10 +149,7 @@ class Supervisor:
             self._events.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now
         self._run_tasks(now)
-        if self._is_due("beat", HEARTBEAT_S, now):
-            self._write_heartbeat()
-        else:
-            self._write_heartbeat(only_changes=True)
+        self._write_heartbeat(only_changes=not self._is_due("beat", HEARTBEAT_S, now))
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -186,7 +183,8 @@ class Supervisor:
             ("reap", 0.0, False, self._sessions.collect_ended),
             ("interruptions", 0.0, True, self._note_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
-            ("house", 0.0, False, self._apply_retention),
+            ("faults", 0.0, False, self._report_faults),
+            ("house", 0.0, True, self._apply_retention),
             ("settle", UNSETTLED_S, True, lambda _: self._sessions.settle_handovers()),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
             ("screen", SCREENING_S, True, self._screen),
@@ -363,15 +361,16 @@ class Supervisor:
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
 
-    def _apply_retention(self, now: ClockReading) -> None:
+    def _report_faults(self, _: ClockReading) -> None:
         faults = {**self._housekeeper.faults(), **self._orders.background.faults()}
         self._events.report_faults(faults)
+
+    def _apply_retention(self, now: ClockReading) -> None:
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
-        if self._disk.away or now.monotonic_s - self._applied_s < every_s:
-            return
-        self._applied_s = now.monotonic_s
-        self._splits_closed = False
-        self._housekeeper.apply()
+        if now.monotonic_s - self._applied_s >= every_s:
+            self._applied_s = now.monotonic_s
+            self._splits_closed = False
+            self._housekeeper.apply()
 
     def _screen(self, _: ClockReading) -> None:
         self._housekeeper.screen([session.name for session in self._sessions.running])

@@ -16,8 +16,9 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
+from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.recorder.housekeeping import Housekeeping
-from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
@@ -418,7 +419,7 @@ class TestInTheBackground:
     ) -> None:
         keeper = background_keeper_of(tmp_path)
         with monkeypatch.context() as patch:
-            patch.setattr(IndexManager, "apply_retention", Mock(side_effect=error))
+            patch.setattr(GarbageCollector, "apply", Mock(side_effect=error))
             keeper.apply()
             keeper.wait()
         assert keeper.faults() == {"apply": reported}

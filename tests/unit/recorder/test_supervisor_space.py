@@ -265,7 +265,9 @@ class TestHouse:
         World(tmp_path, housekeeper=housekeeping).started(31)
         assert housekeeping.asked.count("apply") == 4
 
-    def test_it_is_kept_at_the_start_and_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
+    def test_it_is_kept_at_the_start_and_now_and_then_when_nothing_comes(
+        self, tmp_path: Path
+    ) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.silent = True
