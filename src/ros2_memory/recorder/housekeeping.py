@@ -66,6 +66,10 @@ _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 class Housekeeping(Housekeeper):
     """Repairs and deletes in one bag directory, which its caller has locked.
 
+    What takes a while is done in the background: the first scan of a week of bags takes from
+    seconds to minutes, in which the recorder must continue. Only `repair` waits, since nothing is
+    recorded yet. What is still under way is not begun again.
+
     Args:
         bag_dir: the bag directory.
         reader: reads bags.
@@ -86,6 +90,7 @@ class Housekeeping(Housekeeper):
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
+        background: runs what takes a while.
     """
 
     def __init__(
@@ -109,8 +114,10 @@ class Housekeeping(Housekeeper):
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
         cutter: TopicCutter | None = None,
+        background: Background | None = None,
     ) -> None:
         self._bag_dir = bag_dir
+        self._background = background or Background()
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
@@ -152,7 +159,6 @@ class Housekeeping(Housekeeper):
         self._collected = Collected()
         self._status = HouseStatus()
         self._unshipped = 0
-        self._background = Background()
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -193,11 +199,34 @@ class Housekeeping(Housekeeper):
             _log.error("memory_not_limited", reason=error.strerror or str(error))
 
     def make_room(self, free_bytes_wanted: int) -> None:
-        """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
+        """Begins to delete, oldest first, until so much is free, or nothing may be deleted."""
+        self._begin("make_room", partial(self._make_room, free_bytes_wanted))
 
-        Raises:
-            OSError: the free space cannot be measured.
-        """
+    def is_making_room(self) -> bool:
+        """Whether room is being made."""
+        return self._background.is_under_way("make_room")
+
+    def apply(self) -> None:
+        """Begins to delete what exceeds the limits, and to repair what nothing writes any more."""
+        self._begin("apply", self._keep_limits)
+
+    def keep_moments(self) -> None:
+        """Begins to save the moments that were asked for, or wait for bags."""
+        self._begin("keep_moments", self._keep_moments)
+
+    def faults(self) -> Mapping[str, str]:
+        """Maps each task whose last run failed to the reason."""
+        return self._background.faults()
+
+    def wait(self) -> None:
+        """Waits until nothing is under way."""
+        self._background.wait(None)
+
+    def _begin(self, task: str, do: Callable[[], None]) -> None:
+        if not self._background.is_under_way(task):
+            self._background.add(task, do)
+
+    def _make_room(self, free_bytes_wanted: int) -> None:
         most_free = self._apply(free_bytes_wanted).most_free
         if most_free is not None and not self._out_of_reach:
             _log.error(
@@ -210,19 +239,12 @@ class Housekeeping(Housekeeper):
             )
         self._out_of_reach = most_free is not None
 
-    def apply(self) -> None:
-        """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""
+    def _keep_limits(self) -> None:
         self._apply()
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def keep_moments(self) -> None:
-        """Saves the moments that were asked for, and continues those that wait for bags.
-
-        Raises:
-            EpisodicError: the disk fails while bags are read.
-            OSError: the folders of requests or moments cannot be listed or written to.
-        """
+    def _keep_moments(self) -> None:
         self._moments.open()
         restarted = self._triggers is not None and bool(self._triggers.restarts)
         if restarted or self._moments.has_work():
@@ -254,14 +276,24 @@ class Housekeeping(Housekeeper):
             self._screening.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:
-        """Screens closed splits."""
-        if self._screening is not None:
-            self._screening.plan(live)()
+        """Begins to screen closed splits."""
+        if self._screening is None or self._background.is_under_way("screen"):
+            return
+        # What is live is known now, and not when the thread begins.
+        try:
+            self._background.add("screen", self._screening.plan(live))
+        except (EpisodicError, OSError) as error:
+            self._background.failed("screen", str(error))
 
     def finish(self) -> None:
-        """Screens what is left, some splits of each recording."""
+        """Screens what is left, some splits of each recording, and waits for what is under way."""
         for _ in range(_LAST_STEPS):
-            Housekeeping.screen(self, ())
+            self._background.add("screen", self._screen_rest)
+        self._background.wait()
+
+    def _screen_rest(self) -> None:
+        if self._screening is not None:
+            self._screening.plan(())()
 
     def status(self) -> HouseStatus:
         """Returns what the last pass found, and what is held back at this moment."""
@@ -492,60 +524,6 @@ class Housekeeping(Housekeeper):
                 str(path), f"{size} bytes are too many to repair while recording: {remedy}"
             )
         return self._repairer.repair(path)
-
-
-class BackgroundHousekeeper(Housekeeping):
-    """Does what takes a while in threads, so that its methods return at once.
-
-    The first scan of a week of bags takes from seconds to minutes, in which the recorder must
-    continue and answer the service manager's watchdog. Only `repair` waits: nothing is recorded
-    yet. What is still under way is not begun again.
-    """
-
-    def make_room(self, free_bytes_wanted: int) -> None:
-        """Begins to delete until so much of the disk is free."""
-        self._begin("make_room", partial(super().make_room, free_bytes_wanted))
-
-    def is_making_room(self) -> bool:
-        """Whether room is being made."""
-        return self._background.is_under_way("make_room")
-
-    def apply(self) -> None:
-        """Begins to apply the limits."""
-        self._begin("apply", super().apply)
-
-    def keep_moments(self) -> None:
-        """Begins to save the moments that were asked for."""
-        self._begin("keep_moments", super().keep_moments)
-
-    def screen(self, live: Collection[str]) -> None:
-        """Begins to screen closed splits."""
-        if self._screening is None or self._background.is_under_way("screen"):
-            return
-        # What is live is known now, and not when the thread begins.
-        try:
-            step = self._screening.plan(live)
-        except (EpisodicError, OSError) as error:
-            self._background.failed("screen", str(error))
-            return
-        self._begin("screen", step)
-
-    def finish(self) -> None:
-        """Screens what is left, after what is under way; waits for that, but not for ever."""
-        self._background.add("screen", super().finish)
-        self._background.wait()
-
-    def faults(self) -> Mapping[str, str]:
-        """Maps each task whose last run failed to the reason."""
-        return self._background.faults()
-
-    def wait(self) -> None:
-        """Waits until nothing is under way."""
-        self._background.wait(None)
-
-    def _begin(self, task: str, do: Callable[[], None]) -> None:
-        if not self._background.is_under_way(task):
-            self._background.add(task, do)
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

@@ -134,6 +134,7 @@ class RecordingSessions:
         self._completed: dict[str, HandoverTransfer] = {}
         # Old and new recordings whose sidecars may have to change.
         self._unsettled: list[tuple[Path, Path]] = []
+        self._is_recovered = False
         self._ended_bytes = 0
         self.restarts = 0
         self.heard = set[str]()
@@ -390,12 +391,14 @@ class RecordingSessions:
                 self.settle_handovers()
 
     def recover(self) -> None:
-        """Settles what an earlier run left.
+        """Settles what an earlier run left, which is looked for once, and what could not be yet.
 
         Raises:
             OSError: the bag directory cannot be listed.
         """
-        self._unsettled = unsettled_handovers(self._bag_dir)
+        if not self._is_recovered:
+            self._unsettled = unsettled_handovers(self._bag_dir)
+            self._is_recovered = True
         self.settle_handovers()
 
     def settle_handovers(self) -> None:

@@ -130,7 +130,6 @@ class Supervisor:
         make_bag_dir(self._bag_dir)
         try:
             self._disk.remember()
-            self._sessions.recover()
         except OSError as error:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
         self._check_space(now)
@@ -183,9 +182,9 @@ class Supervisor:
             ("reap", 0.0, False, self._sessions.collect_ended),
             ("interruptions", 0.0, True, self._note_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
+            ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
             ("faults", 0.0, False, self._report_faults),
             ("house", 0.0, True, self._apply_retention),
-            ("settle", UNSETTLED_S, True, lambda _: self._sessions.settle_handovers()),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
             ("screen", SCREENING_S, True, self._screen),
         )

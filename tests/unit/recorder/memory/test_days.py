@@ -58,7 +58,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import HOUR, own_all
+from tests.support.housekeepers import HOUR, Direct, own_all
 from tests.support.memories import reply_over, shipped_extractor
 from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
@@ -133,6 +133,7 @@ def house(
         moments_bytes=10**15,
         monotonic=monotonic,
         memory=memory,
+        background=Direct(),
     )
 
 
