@@ -156,7 +156,7 @@ def build_housekeeper(
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
-    from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
+    from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
 
@@ -166,7 +166,7 @@ def build_housekeeper(
     rules = rules_of(settings, moments_bytes)
     bags = BagDirReader(reader)
     own = own or OwnRecordings(bag_dir)
-    return BackgroundHousekeeper(
+    return Housekeeping(
         bag_dir,
         bags,
         McapWriter(settings.reader.max_chunk_mb),
@@ -458,8 +458,8 @@ def build_memory(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
+    from ros2_memory.index.index_manager import IndexManager
     from ros2_memory.index.scan import BAG_DIR_SETTING
-    from ros2_memory.recorder.index_manager import IndexManager
 
     clock = WallClock()
     shared = shared or shared_parts(settings)

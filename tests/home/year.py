@@ -21,7 +21,7 @@ from tests.home import world
 from tests.home.days import Scale
 from tests.home.recording import write
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import HOUR, PLENTY, own_all
+from tests.support.housekeepers import HOUR, PLENTY, Direct, own_all
 from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ class Year:
             RetentionLimits(PLENTY, HOUR, keeps_foreign=True),
             is_synchronised=lambda: True,
             split_duration_s=split_s,
+            background=Direct(),
             own=own,
             static_topics=("/tf_static",),
             memory=MemoryDays(

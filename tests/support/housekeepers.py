@@ -24,7 +24,8 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags
 from ros2_memory.core.directories import identity_of
 from ros2_memory.core.timebase import NS_PER_S, Clock
-from ros2_memory.recorder.housekeeping import BackgroundHousekeeper, Housekeeping
+from ros2_memory.recorder.background import Background
+from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -43,6 +44,14 @@ PLENTY = 10**15
 HOUR = 3600 * NS_PER_S
 
 
+class Direct(Background):
+    """Runs each job at once, and raises what it raises."""
+
+    def add(self, task: str, job: Callable[[], object]) -> None:
+        del task
+        job()
+
+
 def keeper_of(
     bag_dir: Path,
     *,
@@ -59,13 +68,13 @@ def keeper_of(
     keeps_foreign: bool = False,
     require_shipped: bool = False,
     screening: Screening | None = None,
-    kind: type[Housekeeping] = Housekeeping,
+    background: Background | None = None,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
 
     Its clock is right, and an hour later unless one is given.
     """
-    return kind(
+    return Housekeeping(
         bag_dir,
         BagDirReader(reader or McapReader()),
         writer or McapWriter(),
@@ -84,14 +93,13 @@ def keeper_of(
         grace_s=grace_s,
         monotonic=monotonic,
         measure_free=measure_free,
+        background=background or Direct(),
     )
 
 
-def background_keeper_of(bag_dir: Path, **limits: Any) -> BackgroundHousekeeper:
+def background_keeper_of(bag_dir: Path, **limits: Any) -> Housekeeping:
     """The same housekeeper, whose tasks run in threads."""
-    keeper = keeper_of(bag_dir, kind=BackgroundHousekeeper, **limits)
-    assert isinstance(keeper, BackgroundHousekeeper)
-    return keeper
+    return keeper_of(bag_dir, background=Background(), **limits)
 
 
 def reader_of_both() -> BagReader:

@@ -20,6 +20,7 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
@@ -135,6 +136,13 @@ class PlayedRecorder(Child):
         write_mcap(self.directory / self._file, self._held, layout)
 
 
+class Inline(Background):
+    """Runs each job at once."""
+
+    def add(self, task: str, job: Callable[[], object]) -> None:
+        self.run(task, job)
+
+
 class WorldClock(Clock):
     def __init__(self, world: World) -> None:
         self._world = world
@@ -153,6 +161,8 @@ class World:
         housekeeper: Housekeeper | None = None,
         expected: Sequence[str] = (),
         required: Sequence[Required] = (),
+        sign: Callable[[], None] | None = None,
+        background: Background | None = None,
         **orders: object,
     ) -> None:
         self.bag_dir = bag_dir
@@ -161,6 +171,8 @@ class World:
         self.silent = False
         self.disk_full = False
         self.free = 10**12
+        self.unmeasurable_after = 10**9
+        """How often what is free can still be measured."""
         self.device = 1
         self.refuse = ""
         self.before_start: Callable[[Path], object] = bool
@@ -174,6 +186,7 @@ class World:
             "min_free_bytes": 1000,
         }
         self.reader = McapReader()
+        self.background = background or Inline()
         self.topics_path = bag_dir.with_name(f"{bag_dir.name}.topics.yaml")
         self.list_topics(*expected)
         topics = TopicsFile(self.topics_path)
@@ -184,7 +197,8 @@ class World:
             clock=WorldClock(self),
             topics=topics,
             own=OwnRecordings(bag_dir),
-            reception=Reception(self.reader, run=lambda task: task()),
+            reception=Reception(self.reader, bag_dir=bag_dir, background=self.background),
+            background=self.background,
             required=required,
             **(plan | orders),  # type: ignore[arg-type]
         )
@@ -192,9 +206,16 @@ class World:
             self.orders,
             housekeeper or Housekeeper(),
             monotonic=lambda: self.mono,
-            free_bytes_of=lambda _directory: self.free,
+            free_bytes_of=self._free_bytes,
             device=lambda _directory: self.device,
+            sign=sign,
         )
+
+    def _free_bytes(self, directory: Path) -> int:
+        if not self.unmeasurable_after:
+            raise OSError(5, "the disk does not tell", str(directory))
+        self.unmeasurable_after -= 1
+        return self.free
 
     def list_topics(self, *names: str) -> None:
         """Writes the list of topics: these, and whatever else the recorders know."""

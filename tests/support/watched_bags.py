@@ -25,6 +25,7 @@ from ros2_memory.triggers.search import SplitSearch
 from ros2_memory.triggers.watch import Triggers
 from tests.support.bags import Msg, boolean, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.housekeepers import Direct
 from tests.support.memories import shipped_extractor
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ class WatchedBags:
             is_synchronised=lambda: True,
             split_duration_s=10.0,
             own=self.own,
+            background=Direct(),
             moments_bytes=self.limits.get("moments_bytes", PLENTY),
             rule_bytes={each.name: each.max_bytes for each in self.rules},
             watch=lambda moments: Triggers(

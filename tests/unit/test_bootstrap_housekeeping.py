@@ -8,7 +8,7 @@ import pytest
 from ros2_memory.bootstrap import build_housekeeper, build_reader, build_repairer
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
-from ros2_memory.recorder.housekeeping import BackgroundHousekeeper
+from ros2_memory.recorder.housekeeping import Housekeeping
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.housekeepers import files_in
 
@@ -24,7 +24,7 @@ def kept(bag_dir: Path, *overrides: str) -> list[str]:
         write_mcap(bag_dir / "rec" / f"h{ago}.mcap", [odom(at - n, 1.0, 2.0) for n in range(9)])
     settings = load_settings(overrides, {"MEMORY_BAG_DIR": str(bag_dir)})
     keeper = build_housekeeper(settings, bag_dir, build_reader(settings))
-    assert isinstance(keeper, BackgroundHousekeeper)
+    assert isinstance(keeper, Housekeeping)
     keeper.apply()
     keeper.wait()
     return files_in(bag_dir)

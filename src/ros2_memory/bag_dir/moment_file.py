@@ -339,7 +339,9 @@ class RequestQueue:
         return any(self._is_request(name) for name in names)
 
     def take(self, now: Ns) -> Iterator[SaveRequest]:
-        """Yields requests, those begun earlier first; invalid ones are logged and deleted.
+        """Yields requests, those begun earlier first.
+
+        Those that are invalid, or that the disk does not give, are logged and answered by that.
 
         Raises:
             OSError: the folder cannot be listed, or written to.
@@ -360,9 +362,7 @@ class RequestQueue:
         Raises:
             OSError: it cannot be written.
         """
-        text = json.dumps({"format": FORMAT, **asdict(outcome)})
-        write_durably(self._folder / f"{request.number}.answer", text, mode=READABLE)
-        self._delete(request.number)
+        self._answer(request.number, outcome)
 
     def _take(self, name: str, now: Ns) -> SaveRequest | None:
         number = name.partition(".")[0]
@@ -376,10 +376,14 @@ class RequestQueue:
         except (OSError, ValueError) as error:
             self._ignored.add(path.name)
             _log.warning("request_ignored", path=str(path), reason=str(error))
-            self._delete(number)
+            refused = f"the recorder cannot read the request: {error}"
+            with suppress(OSError):
+                self._answer(number, Outcome(refused=refused))
             return None
 
-    def _delete(self, number: str) -> None:
+    def _answer(self, number: str, outcome: Outcome) -> None:
+        text = json.dumps({"format": FORMAT, **asdict(outcome)})
+        write_durably(self._folder / f"{number}.answer", text, mode=READABLE)
         with suppress(OSError):
             (self._folder / f"{number}.taken").unlink()
 

@@ -20,6 +20,7 @@ that it completes, `memory/thinned.json`.
 from __future__ import annotations
 
 from bisect import bisect_right
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import chain
@@ -124,11 +125,12 @@ def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
     """Appends losses, and drops the oldest where the file is too long.
 
     Raises:
-        OSError: the file cannot be written.
+        OSError: they cannot be written, and none is appended.
     """
     if LOST.append(bag_dir, losses) > MOST_LOST_BYTES:
-        rows = LOST.rows(bag_dir)
-        LOST.replace(bag_dir, rows[len(rows) // 2 :])
+        with suppress(OSError):  # or with the next ones
+            rows = LOST.rows(bag_dir)
+            LOST.replace(bag_dir, rows[len(rows) // 2 :])
 
 
 @until_changed(LOST_FILE)

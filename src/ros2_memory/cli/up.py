@@ -21,6 +21,17 @@ from ros2_memory.bag_dir.layout import MEMORY_FOLDER, ROS_LOG_DIR
 from ros2_memory.bootstrap import build_reader
 from ros2_memory.cli.options import MB, BagDir, Overrides, load_for
 from ros2_memory.cli.output import escape, format_duration, print_line, spinner, stdout_console
+from ros2_memory.cli.proposal import (
+    Choice,
+    Disk,
+    Offered,
+    Proposal,
+    chosen,
+    judge,
+    propose,
+    topics_yaml,
+)
+from ros2_memory.cli.survey import LOOK_S, Survey, survey
 from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
@@ -37,18 +48,7 @@ from ros2_memory.recorder.process.installation import (
     setup_files_here,
 )
 from ros2_memory.recorder.process.topics import load_topics
-from ros2_memory.recorder.proposal import (
-    Choice,
-    Disk,
-    Offered,
-    Proposal,
-    chosen,
-    judge,
-    propose,
-    topics_yaml,
-)
 from ros2_memory.recorder.supervisor import make_bag_dir
-from ros2_memory.recorder.survey import LOOK_S, Survey, survey
 from ros2_memory.retention.policy import GB
 
 SECONDS: Final = 5.0

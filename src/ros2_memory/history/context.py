@@ -23,6 +23,7 @@ from ros2_memory.index.listed_splits import (
     listing_from_json,
     listing_to_json,
 )
+from ros2_memory.retention.inventory import Foreign, ForeignBags
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
@@ -37,12 +38,12 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.inventory import Foreign
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader
 
 NowOfMemory = Literal["wall", "latest"]
 _LISTINGS: Final[Key[Listings]] = Key()
+_FOREIGN: Final[Key[ForeignBags]] = Key()
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +108,6 @@ class SnapshotSource(Protocol):
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the directory's recorder, if it can be read."""
 
-    def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """Returns the bags that the directory's recorder did not make; None if not known."""
-
     def joined_with(self, recording: Path) -> tuple[str, ...]:
         """Returns the names of the recordings beside one that handovers join with it."""
 
@@ -137,8 +135,11 @@ class Memory:
 
         None where nothing is deleted, or bags of any origin are, or no recorder has listed its own.
         """
-        kept = self.limits.kept
-        return self.index.foreign(snapshot) if kept is not None and kept.keeps_foreign else None
+        if self.limits.kept is None or not self.limits.kept.keeps_foreign:
+            return None
+        bags = self.memo.of(_FOREIGN, lambda: ForeignBags(self.index.bag_dir))
+        heartbeat = self.index.heartbeat()
+        return bags.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
         """Returns what recordings' metadata.yaml lists and is not there."""

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.retention.inventory import Foreign
 
 P = ParamSpec("P")
 A = TypeVar("A", bound=MomentAnswer)
@@ -94,10 +93,6 @@ class OneSnapshot:
     def heartbeat(self) -> Heartbeat | None:
         """Returns that of the index; so does the next."""
         return self._index.heartbeat()
-
-    def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """As above."""
-        return self._index.foreign(snapshot)
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
         """As above."""

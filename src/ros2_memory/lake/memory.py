@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.timebase import Clock, Ns
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.lake.files import Days, Lake
-    from ros2_memory.retention.inventory import Foreign
 
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""
@@ -202,11 +201,6 @@ class LakeIndex:
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns None: what a robot's recorder does now is not in a lake."""
-        return None
-
-    def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """Returns None: a lake does not know of retention."""
-        del snapshot
         return None
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:

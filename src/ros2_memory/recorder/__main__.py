@@ -10,13 +10,12 @@ import argparse
 import signal
 import sys
 import time
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final
 
 import structlog
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import (
@@ -37,31 +36,22 @@ from ros2_memory.config import (
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.malloc import return_large_at_once, share_one_arena
-from ros2_memory.core.sd_notify import (
-    READY,
-    STOPPING,
-    WATCHDOG,
-    notify,
-    watchdog_interval_s,
-)
-from ros2_memory.recorder.handover.union import recover_handovers
+from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
 from ros2_memory.retention.policy import SMALL_BUDGET_GB, small_budget
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.recorder.base import Housekeeper, Recorder
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.recorder.base import Recorder
 
 PROGRAM: Final = "ros2-memory-recorder"
 FAILED: Final = 1
 INTERRUPTED: Final = 130
 TICK_S: Final = 0.2
-RECOVER_EVERY_S: Final = 60.0
 CACHE_MB: Final = 1
 """Every bag is read once: a cache of chunks would only take memory."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -126,31 +116,32 @@ def _record(settings: Settings) -> None:
     if clear:
         refuse_homes(bag_dir)
     make_bag_dir(bag_dir)
+    # Until this process ends: what is still under way in its threads must meet no other recorder.
     lock = BagDirLock.acquire(bag_dir)
+    recorder = build_recorder(
+        settings,
+        reader=reader,
+        housekeeper=housekeeper,
+        own=own,
+        keep_open=(lock.descriptor,),
+        excluding={
+            each.topic: f"the rule {each.name!r} of recording.exclude_when"
+            for each in exclusions_of(settings)
+        },
+    )
+    recorder.check()
+    claim(own)
+    if clear:
+        _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
     try:
-        recorder = build_recorder(
-            settings,
-            reader=reader,
-            housekeeper=housekeeper,
-            own=own,
-            keep_open=(lock.descriptor,),
-            excluding={
-                each.topic: f"the rule {each.name!r} of recording.exclude_when"
-                for each in exclusions_of(settings)
-            },
-        )
-        recorder.check()
-        claim(own)
-        if clear:
-            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
-        _put_in_order(bag_dir, reader, housekeeper)
-        _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
-        if unused := unused_config():
-            _log.warning("config_unused", reason=unused)
-        _record_until_signal(recorder, bag_dir, reader, lock)
-        _log.info("stopped")
-    finally:
-        lock.release()
+        housekeeper.repair()
+    except (EpisodicError, OSError) as error:
+        _log.error("not_prepared", task="repair", reason=str(error))
+    _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
+    if unused := unused_config():
+        _log.warning("config_unused", reason=unused)
+    _record_until_signal(recorder, lock)
+    _log.info("stopped")
 
 
 def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
@@ -162,38 +153,15 @@ def _clear(bag_dir: Path, own: OwnRecordings | None) -> None:
         _log.error("not_cleared", reason=f"{cleared.more} more cannot be deleted")
 
 
-def _put_in_order(bag_dir: Path, reader: BagReader, housekeeper: Housekeeper) -> None:
-    """Repairs what a crash left, completes handovers, and begins to apply the limits.
-
-    A failure is reported, and recording starts anyway.
-    """
-    tasks: dict[str, Callable[[], None]] = {
-        "repair": housekeeper.repair,
-        "settle": lambda: recover_handovers(bag_dir, reader),
-        "apply": housekeeper.apply,
-    }
-    for name, task in tasks.items():
-        try:
-            task()
-        except (EpisodicError, OSError) as error:
-            _log.error("not_prepared", task=name, reason=str(error))
-
-
-def _record_until_signal(
-    recorder: Recorder, bag_dir: Path, reader: BagReader, lock: BagDirLock
-) -> None:
+def _record_until_signal(recorder: Recorder, lock: BagDirLock) -> None:
     """Records until SIGTERM, SIGINT or SIGHUP comes, and ends what it started.
 
-    Meanwhile it takes the lock again if its file has gone, and completes handovers that could not
-    be completed, as on a full disk: until then the messages of the new recording do not count.
-    Must be called from the main thread, which the recorder's processes die with.
+    Meanwhile it takes the lock again if its file has gone. Must be called from the main thread,
+    which the recorder's processes die with.
 
     Raises:
         EpisodicError: recording cannot begin, or another recorder took the bag directory.
     """
-    interval_s = watchdog_interval_s()
-    next_sign_s = 0.0
-    recover_at_s = time.monotonic() + RECOVER_EVERY_S
     with _ending_signals() as received:
         try:
             recorder.start()
@@ -204,15 +172,6 @@ def _record_until_signal(
                 recorder.tick()
                 if lock.renew():
                     _log.warning("lock_renewed", reason="its file had gone from the bag directory")
-                now_s = time.monotonic()
-                if now_s >= recover_at_s:
-                    recover_at_s = now_s + RECOVER_EVERY_S
-                    # The recorder reports a directory that cannot be listed.
-                    with suppress(OSError):
-                        recover_handovers(bag_dir, reader, read_heartbeat(bag_dir).recordings)
-                if interval_s is not None and now_s >= next_sign_s:
-                    notify(WATCHDOG)
-                    next_sign_s = now_s + interval_s / 2
             _log.info("signal_received", signal=signal.Signals(received[0]).name)
         finally:
             notify(STOPPING)

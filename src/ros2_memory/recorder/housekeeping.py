@@ -8,7 +8,6 @@ later, when the index finds them and nothing writes them.
 from __future__ import annotations
 
 import os
-import threading
 import time
 from contextlib import suppress
 from dataclasses import replace
@@ -29,8 +28,9 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
+from ros2_memory.index.index_manager import SPLITS_OF_PATIENCE, IndexManager
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
-from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
 from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
@@ -58,11 +58,17 @@ MOST_REPAIRED_BYTES: Final = 1 << 30
 _MB: Final = 10**6
 _MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
+_WRITTEN_AT_ONCE: Final = 2
+"""Recordings, during a rotation."""
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
 class Housekeeping(Housekeeper):
     """Repairs and deletes in one bag directory, which its caller has locked.
+
+    What takes a while is done in the background: the first scan of a week of bags takes from
+    seconds to minutes, in which the recorder must continue. Only `repair` waits, since nothing is
+    recorded yet. What is still under way is not begun again.
 
     Args:
         bag_dir: the bag directory.
@@ -84,6 +90,7 @@ class Housekeeping(Housekeeper):
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
+        background: runs what takes a while.
     """
 
     def __init__(
@@ -107,12 +114,14 @@ class Housekeeping(Housekeeper):
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
         cutter: TopicCutter | None = None,
+        background: Background | None = None,
     ) -> None:
         self._bag_dir = bag_dir
+        self._background = background or Background()
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
         self._keeps_foreign = limits.keeps_foreign
-        collector = GarbageCollector(
+        self._collector = GarbageCollector(
             bag_dir,
             limits,
             Carrier(bag_dir, reader, writer, static_topics, self._own, monotonic=monotonic),
@@ -134,7 +143,7 @@ class Housekeeping(Housekeeper):
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            collector=collector,
+            packs=True,
         )
         self._moments = MomentKeeper(bag_dir, moments_bytes, clock, self._own, rule_bytes)
         self._triggers = None if watch is None else watch(self._moments)
@@ -150,8 +159,6 @@ class Housekeeping(Housekeeper):
         self._collected = Collected()
         self._status = HouseStatus()
         self._unshipped = 0
-        self._threads: dict[str, threading.Thread] = {}
-        self._faults: dict[str, str] = {}
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -192,13 +199,35 @@ class Housekeeping(Housekeeper):
             _log.error("memory_not_limited", reason=error.strerror or str(error))
 
     def make_room(self, free_bytes_wanted: int) -> None:
-        """Deletes, oldest first, until so much of the disk is free, or nothing may be deleted.
+        """Begins to delete, oldest first, until so much is free, or nothing may be deleted."""
+        self._begin("make_room", partial(self._make_room, free_bytes_wanted))
 
-        Raises:
-            OSError: the free space cannot be measured.
-        """
-        self._apply(free_bytes_wanted)
-        most_free = self._collected.most_free
+    def is_making_room(self) -> bool:
+        """Whether room is being made."""
+        return self._background.is_under_way("make_room")
+
+    def apply(self) -> None:
+        """Begins to delete what exceeds the limits, and to repair what nothing writes any more."""
+        self._begin("apply", self._keep_limits)
+
+    def keep_moments(self) -> None:
+        """Begins to save the moments that were asked for, or wait for bags."""
+        self._begin("keep_moments", self._keep_moments)
+
+    def faults(self) -> Mapping[str, str]:
+        """Maps each task whose last run failed to the reason."""
+        return self._background.faults()
+
+    def wait(self) -> None:
+        """Waits until nothing is under way."""
+        self._background.wait(None)
+
+    def _begin(self, task: str, do: Callable[[], None]) -> None:
+        if not self._background.is_under_way(task):
+            self._background.add(task, do)
+
+    def _make_room(self, free_bytes_wanted: int) -> None:
+        most_free = self._apply(free_bytes_wanted).most_free
         if most_free is not None and not self._out_of_reach:
             _log.error(
                 "room_out_of_reach",
@@ -210,19 +239,12 @@ class Housekeeping(Housekeeper):
             )
         self._out_of_reach = most_free is not None
 
-    def apply(self) -> None:
-        """Deletes what exceeds the budget or is too old; repairs what nothing writes any more."""
+    def _keep_limits(self) -> None:
         self._apply()
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def keep_moments(self) -> None:
-        """Saves the moments that were asked for, and continues those that wait for bags.
-
-        Raises:
-            EpisodicError: the disk fails while bags are read.
-            OSError: the folders of requests or moments cannot be listed or written to.
-        """
+    def _keep_moments(self) -> None:
         self._moments.open()
         restarted = self._triggers is not None and bool(self._triggers.restarts)
         if restarted or self._moments.has_work():
@@ -254,14 +276,24 @@ class Housekeeping(Housekeeper):
             self._screening.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:
-        """Screens closed splits."""
-        if self._screening is not None:
-            self._screening.plan(live)()
+        """Begins to screen closed splits."""
+        if self._screening is None or self._background.is_under_way("screen"):
+            return
+        # What is live is known now, and not when the thread begins.
+        try:
+            self._background.add("screen", self._screening.plan(live))
+        except (EpisodicError, OSError) as error:
+            self._background.failed("screen", str(error))
 
     def finish(self) -> None:
-        """Screens what is left, some splits of each recording."""
+        """Screens what is left, some splits of each recording, and waits for what is under way."""
         for _ in range(_LAST_STEPS):
-            Housekeeping.screen(self, ())
+            self._background.add("screen", self._screen_rest)
+        self._background.wait()
+
+    def _screen_rest(self) -> None:
+        if self._screening is not None:
+            self._screening.plan(())()
 
     def status(self) -> HouseStatus:
         """Returns what the last pass found, and what is held back at this moment."""
@@ -283,11 +315,11 @@ class Housekeeping(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
-    def _apply(self, free_bytes_wanted: int | None = None) -> None:
+    def _apply(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
         self._update_moments()
         self._clear_memory()
-        before, collected = self._collected, self._index.apply_retention(free_bytes_wanted)
+        before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
         limit = f"{self._max_age_h:g} h"
         age_held = (
@@ -319,6 +351,17 @@ class Housekeeping(Housekeeper):
         self._report(before, collected)
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
+        return collected
+
+    def _collect(self, free_bytes_wanted: int | None) -> Collected:
+        with self._index.undisturbed(patrolling=True) as snapshot:
+            heartbeat = self._index.heartbeat()
+            begun = heartbeat.recordings if heartbeat else self._own.in_order()[-_WRITTEN_AT_ONCE:]
+            known = self._index.known_bags(begun, snapshot)
+            collected = self._collector.apply(known, snapshot, free_bytes_wanted)
+        if collected.bags or collected.cut:
+            self._index.refresh()
+        return collected
 
     def _report(self, before: Collected, collected: Collected) -> None:
         """Reports what began or ended with a pass, and what it deleted unshipped."""
@@ -481,79 +524,6 @@ class Housekeeping(Housekeeper):
                 str(path), f"{size} bytes are too many to repair while recording: {remedy}"
             )
         return self._repairer.repair(path)
-
-
-class BackgroundHousekeeper(Housekeeping):
-    """Does what takes a while in threads, so that its methods return at once.
-
-    The first scan of a week of bags takes from seconds to minutes, in which the recorder must
-    continue and answer the service manager's watchdog. Only `repair` waits: nothing is recorded
-    yet. What is still under way is not begun again.
-    """
-
-    def make_room(self, free_bytes_wanted: int) -> None:
-        """Begins to delete until so much of the disk is free."""
-        self._begin("make_room", partial(super().make_room, free_bytes_wanted))
-
-    def is_making_room(self) -> bool:
-        """Whether room is being made."""
-        return self._is_under_way("make_room")
-
-    def apply(self) -> None:
-        """Begins to apply the limits."""
-        self._begin("apply", super().apply)
-
-    def keep_moments(self) -> None:
-        """Begins to save the moments that were asked for."""
-        self._begin("keep_moments", super().keep_moments)
-
-    def screen(self, live: Collection[str]) -> None:
-        """Begins to screen closed splits."""
-        if self._screening is None or self._is_under_way("screen"):
-            return
-        # What is live is known now, and not when the thread begins.
-        try:
-            step = self._screening.plan(live)
-        except (EpisodicError, OSError) as error:
-            self._faults["screen"] = str(error)
-            return
-        self._begin("screen", step)
-
-    def finish(self) -> None:
-        """Screens what is left, after what is under way."""
-        if "screen" in self._threads:
-            self._threads["screen"].join()
-        self._run("screen", super().finish)
-
-    def faults(self) -> Mapping[str, str]:
-        """Maps each task whose last run failed to the reason."""
-        return dict(self._faults)
-
-    def wait(self) -> None:
-        """Waits until nothing is under way."""
-        for thread in self._threads.values():
-            thread.join()
-
-    def _begin(self, task: str, do: Callable[[], None]) -> None:
-        if not self._is_under_way(task):
-            self._threads[task] = threading.Thread(
-                target=self._run, args=(task, do), name=f"housekeeping {task}", daemon=True
-            )
-            self._threads[task].start()
-
-    def _run(self, task: str, do: Callable[[], None]) -> None:
-        try:
-            do()
-        except (EpisodicError, OSError) as error:
-            self._faults[task] = str(error)
-        except Exception as error:  # noqa: BLE001 - or its thread ends silently, and the disk fills
-            _log.exception("housekeeping_faulty", task=task)
-            self._faults[task] = f"a fault in this program ({type(error).__name__}); see its log"
-        else:
-            self._faults.pop(task, None)
-
-    def _is_under_way(self, task: str) -> bool:
-        return task in self._threads and self._threads[task].is_alive()
 
 
 def _named(bag_dir: Path) -> frozenset[Path]:

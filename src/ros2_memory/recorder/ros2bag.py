@@ -17,6 +17,7 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import WallClock
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, Recorder
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
@@ -107,6 +108,7 @@ class Ros2BagRecorder(Recorder):
         self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
         self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
+        background = Background()
         self._reception = Reception(
             reader,
             self._queue_bytes,
@@ -114,6 +116,7 @@ class Ros2BagRecorder(Recorder):
             latched=latched_topics,
             # Each recording would receive the log of an excluded time again.
             volatile={ROSOUT} - excluding.keys() if excluding else (),
+            background=background,
         )
         self._orders = Orders(
             bag_dir=self._bag_dir,
@@ -126,6 +129,7 @@ class Ros2BagRecorder(Recorder):
             topics=self._topics,
             own=own or OwnRecordings(self._bag_dir),
             reception=self._reception,
+            background=background,
             required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),

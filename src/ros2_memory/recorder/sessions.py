@@ -21,7 +21,7 @@ from ros2_memory.recorder.handover.transfer import (
     HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.union import settle_handover
+from ros2_memory.recorder.handover.union import settle_handover, unsettled_handovers
 from ros2_memory.recorder.policies import ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.output import LineKind
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Clock, Ns
+    from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.reception.reception import Reception
@@ -64,6 +65,7 @@ class Orders:
         topics: the list of topics to record.
         own: the list of recordings that were made here.
         reception: plans how topics are subscribed, and measures how they arrive.
+        background: does what takes a while.
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
@@ -80,6 +82,7 @@ class Orders:
     topics: TopicsFile
     own: OwnRecordings
     reception: Reception
+    background: Background
     required: Sequence[Required] = ()
     simulated: bool = False
     advice: Callable[[], str] = str
@@ -131,6 +134,7 @@ class RecordingSessions:
         self._completed: dict[str, HandoverTransfer] = {}
         # Old and new recordings whose sidecars may have to change.
         self._unsettled: list[tuple[Path, Path]] = []
+        self._is_recovered = False
         self._ended_bytes = 0
         self.restarts = 0
         self.heard = set[str]()
@@ -343,8 +347,11 @@ class RecordingSessions:
                 self._orders.reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
-        for fault in flush_bags(directory, names):
-            self._events.warn("not_flushed", fault, recording=session.name)
+        def flush() -> None:
+            for fault in flush_bags(directory, names):
+                self._events.warn("not_flushed", fault, recording=session.name)
+
+        self._orders.background.add("flush", flush)
 
     def _take_over(self, handover: HandoverTransfer, now: ClockReading) -> None:
         if handover.missing:
@@ -383,10 +390,22 @@ class RecordingSessions:
                 self._unsettled.append(handover.directories)
                 self.settle_handovers()
 
+    def recover(self) -> None:
+        """Settles what an earlier run left, which is looked for once, and what could not be yet.
+
+        Raises:
+            OSError: the bag directory cannot be listed.
+        """
+        if not self._is_recovered:
+            self._unsettled = unsettled_handovers(self._bag_dir)
+            self._is_recovered = True
+        self.settle_handovers()
+
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
-        What fails is tried again when the next split is closed.
+        What fails, as on a full disk, is reported and tried again with the next call: until then
+        the messages of the new recording do not count.
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
@@ -394,7 +413,10 @@ class RecordingSessions:
                 if settle_handover(old, new, self._orders.reader, running):
                     self._unsettled.remove((old, new))
             except RecorderError as error:
-                self._events.fail("rotation_failed", str(error), recording=old.name)
+                name = old.name
+                self._events.fail_once("handover_not_settled", name, str(error), recording=name)
+            else:
+                self._events.resolve("handover_not_settled", old.name)
 
     def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
         self._report_output(session)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.sd_notify import SignOfLife
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.transfer import Step
 from ros2_memory.recorder.policies import (
@@ -50,6 +51,8 @@ RETENTION_S: Final = 10.0
 """How often the limits are applied when splits were closed."""
 QUIET_RETENTION_S: Final = 60.0
 """How often the limits are applied when no split was closed: bags still get older."""
+UNSETTLED_S: Final = 60.0
+"""How often handovers are tried again that could not be settled, beside at each closed split."""
 LIST_S: Final = 2.0
 """How often the file of topics is looked at."""
 TOPICS_S: Final = 1.0
@@ -65,6 +68,8 @@ class Supervisor:
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
+        sign: gives the service manager a sign of life; called before each task, since a slow disk
+            takes seconds for what one writes.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -78,12 +83,14 @@ class Supervisor:
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
+        sign: Callable[[], None] | None = None,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
         self._reception = orders.reception
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
+        self._sign = sign or SignOfLife().give
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
         self._events = EventLog(orders.clock)
@@ -98,10 +105,11 @@ class Supervisor:
         self._paused = False
         self._room_requested = False
         self._splits_closed = False
+        self._interruptions: list[tuple[Ns, Interruption]] = []
         self.stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
-        self._applied_s = self._last.monotonic_s
+        self._applied_s = -QUIET_RETENTION_S
 
     @property
     def is_recording(self) -> bool:
@@ -140,10 +148,7 @@ class Supervisor:
             self._events.warn("clock_set_back", "the clock was set back: a new recording begins")
         self._last = now
         self._run_tasks(now)
-        if self._is_due("beat", HEARTBEAT_S, now):
-            self._write_heartbeat()
-        else:
-            self._write_heartbeat(only_changes=True)
+        self._write_heartbeat(only_changes=not self._is_due("beat", HEARTBEAT_S, now))
 
     def stop(self) -> None:
         """Ends everything that runs, within the patience of its children."""
@@ -158,6 +163,7 @@ class Supervisor:
             self._housekeeper.finish()
             # What was held back could not be compared before.
             self._sessions.settle_handovers()
+        self._orders.background.wait()
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
@@ -174,14 +180,18 @@ class Supervisor:
             ("restart", 0.0, True, self._check_restart),
             ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
             ("reap", 0.0, False, self._sessions.collect_ended),
+            ("interruptions", 0.0, True, self._note_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
-            ("house", 0.0, False, self._apply_retention),
+            ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
+            ("faults", 0.0, False, self._report_faults),
+            ("house", 0.0, True, self._apply_retention),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
             ("screen", SCREENING_S, True, self._screen),
         )
         for name, every_s, needs_disk, task in tasks:
             if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
                 continue
+            self._sign()
             try:
                 task(now)
             except OSError as error:
@@ -202,6 +212,7 @@ class Supervisor:
         """Ends recording while another disk lies under the bag directory than at the start."""
         recordings = [each.name for each in self._sessions.running if each.splits.exists]
         was_away, is_away = self._disk.away, self._disk.is_away(recordings)
+        self._reception.may_write = not is_away
         if is_away and not was_away:
             self._sessions.end_all(now)
             self._events.fail(
@@ -244,7 +255,9 @@ class Supervisor:
         else:
             if free < least and not self._room_requested:
                 self._housekeeper.make_room(enough)
-                free = self._free_bytes() or 0
+                free = self._free_bytes()
+                if free is None:
+                    return
             self._room_requested = free < least
             # Room that is being made is waited for while half of it is free.
             waits = self._housekeeper.is_making_room() and free >= least // 2
@@ -313,7 +326,7 @@ class Supervisor:
         before = self._orders.topics.selection.listed
         if self._orders.topics.look():
             listed_now = self._orders.topics.selection.listed
-            self._rotate_now |= self._sessions.current is not None
+            self._rotate_now = True
             self._events.info(
                 "topics_changed",
                 added=sorted({*listed_now} - {*before}),
@@ -335,6 +348,7 @@ class Supervisor:
 
     def _begin(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
+        self._rotate_now = False
         self._reception.skip_latched(())
         self._sessions.begin(now)
         self._topic_watch.began(now)
@@ -346,14 +360,16 @@ class Supervisor:
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
 
+    def _report_faults(self, _: ClockReading) -> None:
+        faults = {**self._housekeeper.faults(), **self._orders.background.faults()}
+        self._events.report_faults(faults)
+
     def _apply_retention(self, now: ClockReading) -> None:
-        self._events.report_faults(self._housekeeper.faults())
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S
-        if self._disk.away or now.monotonic_s - self._applied_s < every_s:
-            return
-        self._applied_s = now.monotonic_s
-        self._splits_closed = False
-        self._housekeeper.apply()
+        if now.monotonic_s - self._applied_s >= every_s:
+            self._applied_s = now.monotonic_s
+            self._splits_closed = False
+            self._housekeeper.apply()
 
     def _screen(self, _: ClockReading) -> None:
         self._housekeeper.screen([session.name for session in self._sessions.running])
@@ -370,7 +386,11 @@ class Supervisor:
     def _note_restart(self, first: Ns, how: Interruption) -> None:
         # What hangs when everything is ended is followed by no other recording.
         if not self.stopped:
-            self._housekeeper.note_restart(first, how)
+            self._interruptions.append((first, how))
+
+    def _note_interruptions(self, _: ClockReading) -> None:
+        while self._interruptions:
+            self._housekeeper.note_restart(*self._interruptions.pop(0))
 
     def _write_heartbeat(
         self,

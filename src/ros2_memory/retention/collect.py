@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
-_WRITTEN_AT_ONCE: Final = 2
-"""Recordings, during a rotation."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -202,15 +200,6 @@ class GarbageCollector:
         self._reported: set[str] = set()
         self._emptied: set[Path] = set()
         self._unwritten: list[Deleted] = []
-
-    @property
-    def begun_last(self) -> Sequence[str]:
-        """The recordings that are being written, or were last, by the list of all.
-
-        Raises:
-            OSError: the list cannot be read.
-        """
-        return self._own.in_order()[-_WRITTEN_AT_ONCE:]
 
     def apply(
         self, known: KnownBags, snapshot: Snapshot, free_bytes_wanted: int | None = None

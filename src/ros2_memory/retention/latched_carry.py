@@ -45,6 +45,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
+from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -295,23 +296,18 @@ class Carrier:
                 it must not be replaced by a bag without them.
             BagUnreachableError: the disk fails to read a bag, and may recover.
         """
-        records = self._reader.records(path, topics, TimeWindow.everything())
-        while True:
-            try:
-                yield from records
-            except BagVanishedError:
+        for record in or_errors(self._reader.records(path, topics, TimeWindow.everything())):
+            if not isinstance(record, BagError):
+                yield record
+            elif isinstance(record, BagVanishedError):
                 return
-            except BagError as error:
-                if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
-                    raise
-                if path == self.path:
-                    reason = f"{error.reason}; move it away to give up its messages"
-                    raise BagError(str(path), reason) from error
-                _log.warning("latched_not_read", path=str(path), reason=error.reason)
-                if error.lost is None:
-                    return
+            elif isinstance(record, BagUnreachableError) and self._failing.may_recover(path):
+                raise record
+            elif path == self.path:
+                reason = f"{record.reason}; move it away to give up its messages"
+                raise BagError(str(path), reason) from record
             else:
-                return
+                _log.warning("latched_not_read", path=str(path), reason=record.reason)
 
     def _fetched(
         self,

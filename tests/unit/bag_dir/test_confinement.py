@@ -37,7 +37,6 @@ from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
 from ros2_memory.recorder import ros2bag
-from ros2_memory.recorder.handover.union import recover_handovers
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -45,6 +44,7 @@ from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import boolean, text, write_db3, write_mcap
+from tests.support.handovers import recover_handovers
 from tests.support.housekeepers import keeper_of
 from tests.support.robot_run import ANSWERED, T0, T0_S, write_run
 

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+import errno
 import json
 import os
 import stat
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
 import structlog
 
+from ros2_memory.bag_dir import moment_file
 from ros2_memory.bag_dir.layout import REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
     MAX_AT_ONCE,
@@ -67,9 +70,9 @@ def test_a_request_that_was_taken_and_not_answered_is_taken_again(tmp_path: Path
 
 
 def test_a_request_whose_server_died_is_forgotten(tmp_path: Path) -> None:
-    asked(tmp_path)
+    posted = asked(tmp_path)
     assert list(RequestQueue(tmp_path).take(T0 + STALE_NS + 1)) == []
-    assert names(tmp_path) == []
+    assert names(tmp_path) == [f"{posted.request.number}.answer"]
 
 
 def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
@@ -120,6 +123,21 @@ def test_what_is_no_request_is_told_and_dropped(tmp_path: Path, text: str) -> No
     with structlog.testing.capture_logs() as captured:
         assert list(queue.take(T0)) == []
     assert [event["event"] for event in captured] == ["request_ignored"]
+    assert names(tmp_path) == [f"{NUMBER}.answer"]
+
+
+def test_who_asked_is_told_that_the_disk_did_not_give_the_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    unreadable = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    with monkeypatch.context() as patch:
+        patch.setattr(moment_file, "_read_request", unreadable)
+        assert list(queue.take(T0)) == []
+    outcome = posted.outcome()
+    assert outcome is not None
+    assert "Input/output error" in (outcome.refused or "")
+    posted.close()
     assert names(tmp_path) == []
 
 

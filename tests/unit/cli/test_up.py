@@ -28,7 +28,7 @@ def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STUB_OPTIONS", "--start-paused --include-hidden-topics --node-name")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ros2_memory.cli.up.SECONDS", 0.3)
-    monkeypatch.setattr("ros2_memory.recorder.survey.QUIET_S", 0.1)
+    monkeypatch.setattr("ros2_memory.cli.survey.QUIET_S", 0.1)
 
 
 def test_a_deployment_that_does_not_record_is_refused(exits: Program, tmp_path: Path) -> None:

@@ -16,7 +16,9 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.recorder.index_manager import IndexManager
+from ros2_memory.index.index_manager import IndexManager
+from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
@@ -357,8 +359,34 @@ class TestMakingRoom:
         (said,) = (each for each in logs if each["event"] == "room_out_of_reach")
         assert 0 < said["most_free_bytes"] < said["free_bytes_wanted"] == PLENTY
 
+    def test_what_another_pass_finds_meanwhile_is_not_taken_for_its_own(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        recording(tmp_path, "a", 0)
+        keeper = keeper_of(tmp_path, measure_free=lambda _: 0)
+
+        def meanwhile(*_: object) -> None:
+            monkeypatch.undo()
+            keeper.apply()
+
+        monkeypatch.setattr(Housekeeping, "_report", meanwhile)
+        with structlog.testing.capture_logs() as logs:
+            keeper.make_room(PLENTY)
+        assert len(events(logs, "room_out_of_reach")) == 1
+
 
 class TestInTheBackground:
+    def test_what_is_under_way_ends_before_the_recorder_does(self, tmp_path: Path) -> None:
+        paths, finishing = recording(tmp_path, "a", 0), threading.Event()
+        keeper = background_keeper_of(
+            tmp_path, measure_free=lambda _: 0 if finishing.wait(30) else PLENTY
+        )
+        keeper.make_room(1)
+        finishing.set()
+        keeper.finish()
+        assert not keeper.is_making_room()
+        assert not paths[0].exists()
+
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
         held, asked = threading.Event(), []
@@ -391,7 +419,7 @@ class TestInTheBackground:
     ) -> None:
         keeper = background_keeper_of(tmp_path)
         with monkeypatch.context() as patch:
-            patch.setattr(IndexManager, "apply_retention", Mock(side_effect=error))
+            patch.setattr(GarbageCollector, "apply", Mock(side_effect=error))
             keeper.apply()
             keeper.wait()
         assert keeper.faults() == {"apply": reported}

@@ -247,6 +247,17 @@ class TestClock:
         world.run(20)
         assert len(world.recorders) == 1
 
+    def test_set_back_while_nothing_records_no_recording_is_cut_short(self, tmp_path: Path) -> None:
+        world = World(tmp_path).started(10)
+        world.free = 5
+        world.run(3)
+        world.set_clock(-3600)
+        world.run(3)
+        world.free = 10**12
+        world.run(30)
+        assert len(world.recorders) == 2
+        assert len(world.running) == 1
+
     def test_set_forward_by_a_year_nothing_happens(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(10)
         world.set_clock(365 * 86400)

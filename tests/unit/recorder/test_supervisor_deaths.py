@@ -7,13 +7,14 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.union import recover_handovers
+from ros2_memory.recorder import sessions
 from ros2_memory.storage.base import Closing
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
@@ -146,7 +147,25 @@ class TestDeath:
         world = World(tmp_path, session_duration_s=20).started(after_s)
         for recorder in world.running:
             recorder.die()
-        recover_handovers(tmp_path, world.reader)
+        World(tmp_path).started(0.25)
+        assert_what_stands_counts_once(world)
+
+    def test_where_the_disk_does_not_list_what_is_there_it_is_settled_later(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20).started(24)
+        for recorder in world.running:
+            recorder.die()
+        again = World(tmp_path)
+        again.wall = world.wall + NS_PER_S
+        with monkeypatch.context() as patch, capture_logs() as logs:
+            failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+            patch.setattr(sessions, "unsettled_handovers", failing)
+            again.started(3)
+        assert again.supervisor.is_recording
+        assert [each["task"] for each in events(logs, "supervision_failed")] == ["settle"]
+        again.run(60)
+        again.supervisor.stop()
         assert_what_stands_counts_once(world)
 
 

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import threading
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 from structlog.testing import capture_logs
 
+from ros2_memory.bag_dir.layout import LOST_FILE
+from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.supervisor import make_bag_dir
+from tests.support.housekeepers import keeper_of
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
     World,
@@ -99,6 +107,16 @@ class TestSpace:
         assert len(world.running) == 1
         assert world.heartbeat()["state"] == "recording"
 
+    def test_what_is_free_and_cannot_be_measured_is_no_full_disk(self, tmp_path: Path) -> None:
+        world = World(tmp_path).started(3)
+        world.free = 900
+        world.unmeasurable_after = 1
+        with capture_logs() as logs:
+            world.run(3)
+        assert len(events(logs, "free_space_unknown")) == 1
+        assert world.supervisor.is_recording
+        assert events(logs, "recording_paused") == []
+
     def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
         world.supervisor.start()
@@ -158,7 +176,7 @@ class TestUnmounted:
         assert len(events(logs, "disk_gone")) == 1
         assert world.running == []
         assert len(world.recorders) == 1
-        assert housekeeping.asked == []
+        assert housekeeping.asked == ["apply"]
         world.supervisor.stop()
         assert list(world.bag_dir.iterdir()) == []
 
@@ -178,6 +196,24 @@ class TestUnmounted:
         beat = world.heartbeat()
         assert beat["state"] == "recording"
         assert "has been unmounted" in beat["last_error"]
+
+    def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(
+        self, tmp_path: Path
+    ) -> None:
+        bag_dir = tmp_path / "bags"
+        world = World(bag_dir, housekeeper=keeper_of(bag_dir)).started(3)
+        world.recorders[0].ends_with = -9
+        aside = self.unmounted(world)
+        world.run(0.25)
+        world.orders.reception.lost(world.recorders[0].directory.name, "/door", 3)
+        world.run(20)
+        assert list(bag_dir.iterdir()) == []
+        shutil.rmtree(bag_dir)
+        aside.rename(bag_dir)
+        world.device = 1
+        world.run(20)
+        lost = [(loss.topic, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
+        assert lost == [("*", 0, "hung"), ("/door", 3, "rosbag2")]
 
     def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags").started(3)
@@ -209,18 +245,59 @@ class TestHouse:
         assert world.heartbeat()["last_error"] == "the oldest bags cannot be deleted"
         assert world.supervisor.is_recording
 
-    def test_it_is_kept_after_splits_were_closed(self, tmp_path: Path) -> None:
+    def test_so_is_what_failed_in_the_background(self, tmp_path: Path) -> None:
+        world = World(tmp_path).started(3)
+        lost = tmp_path / LOST_FILE
+        lost.mkdir()
+        name = world.recorders[0].directory.name
+        world.orders.reception.lost(name, "/door", 3)
+        with capture_logs() as logs:
+            world.run(5)
+        (reported,) = events(logs, "housekeeping_failed")
+        assert (reported["task"], "losses" in reported["reason"]) == ("reception", True)
+        assert world.heartbeat()["last_error"] == reported["reason"]
+        lost.rmdir()
+        world.run(15)
+        assert [loss.lost for loss in read_losses(tmp_path, MIN_NS, MAX_NS)] == [3]
+
+    def test_it_is_kept_at_the_start_and_after_splits_were_closed(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         World(tmp_path, housekeeper=housekeeping).started(31)
-        assert housekeeping.asked.count("apply") == 3
+        assert housekeeping.asked.count("apply") == 4
 
-    def test_it_is_kept_now_and_then_when_nothing_comes(self, tmp_path: Path) -> None:
+    def test_it_is_kept_at_the_start_and_now_and_then_when_nothing_comes(
+        self, tmp_path: Path
+    ) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping)
         world.silent = True
         world.supervisor.start()
         world.run(130)
-        assert housekeeping.asked.count("apply") == 2
+        assert housekeeping.asked.count("apply") == 3
+
+
+class TestSlowDisk:
+    def test_a_recorder_that_waits_for_it_is_no_dead_one_to_the_service_manager(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Each flush takes 5 s; after 90 s without a sign of life it would be killed."""
+        signs = [1_000.0]
+        world = World(
+            tmp_path,
+            session_duration_s=20,
+            sign=lambda: signs.append(world.mono),
+            background=Background(),
+        )
+
+        def flush(_: int) -> None:
+            if threading.current_thread() is threading.main_thread():
+                world.mono += 5.0
+                world.wall += 5 * NS_PER_S
+
+        monkeypatch.setattr(os, "fsync", flush)
+        world.started(120)
+        assert len(world.recorders) > 2
+        assert max(after - before for before, after in pairwise(signs)) < 45.0
 
 
 def test_a_bag_directory_that_is_a_file_is_called_one(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import HOUR, own_all
+from tests.support.housekeepers import HOUR, Direct, own_all
 from tests.support.memories import reply_over
 
 S = NS_PER_S
@@ -97,6 +97,7 @@ def house(
         split_duration_s=10.0,
         static_topics=("/tf_static",),
         cutter=cutter,
+        background=Direct(),
     )
 
 

@@ -71,28 +71,22 @@ _Copies: TypeAlias = "Counter[tuple[str, bool]]"
 """How often a recording holds one message, by file, and by whether the cut counts it there."""
 
 
-def recover_handovers(bag_dir: Path, reader: BagReader, running: Collection[str] = ()) -> None:
-    """Settles every handover below the bag directory; reports those that it cannot settle.
-
-    `running` are recordings that are being written, which may still complete theirs.
+def unsettled_handovers(bag_dir: Path) -> list[tuple[Path, Path]]:
+    """Returns the old and the new recording of each handover that an earlier run left unsettled.
 
     Raises:
         OSError: the bag directory cannot be listed.
     """
+    pairs: list[tuple[Path, Path]] = []
     for directory in sorted(filter(is_folder, bag_dir.iterdir())):
         handover = read_handover(directory).handover
-        pairs: list[tuple[Path, Path]] = []
         if handover.next is not None and handover.counts_until is None:
             pairs.append((directory, bag_dir / handover.next))
         # Retention may have deleted the one before, and then there is nothing to compare.
         if handover.previous is not None and handover.compared is False:
             previous = bag_dir / handover.previous
             pairs += [(previous, directory)] * is_folder(previous)
-        for old, new in pairs:
-            try:
-                settle_handover(old, new, reader, running)
-            except RecorderError as error:
-                _log.error("handover_not_settled", recording=directory.name, reason=str(error))
+    return pairs
 
 
 def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection[str] = ()) -> bool:

@@ -52,6 +52,7 @@ from ros2_memory.recorder.memory.thinning import (
     rounded,
 )
 from ros2_memory.retention.disk import FailingFiles
+from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -379,30 +380,20 @@ class MemoryDays:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
         groups = decoded(self._reader, pieces(self._reader, path), skip_undecodable=True)
-        while True:
-            try:
-                tables = next(groups, None)
-                if tables is None:
-                    return
+        for tables in or_errors(groups):
+            if isinstance(tables, BagError):
+                self._raise_if_transient(path, tables)
+                _log.warning("memory_not_read", path=str(path), reason=tables.reason)
+            else:
                 yield from tables
-            except BagError as error:
-                self._raise_if_transient(path, error)
-                _log.warning("memory_not_read", path=str(path), reason=error.reason)
-                if error.lost is None:
-                    return
 
     def _readable(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
         """Yields the messages of a bag that can be read; raises as `_tables` does."""
-        records = self._reader.records(path, topics, _EVERYTHING)
-        while True:
-            try:
-                yield from records
-            except BagError as error:
-                self._raise_if_transient(path, error)
-                if error.lost is None:
-                    return
+        for record in or_errors(self._reader.records(path, topics, _EVERYTHING)):
+            if isinstance(record, BagError):
+                self._raise_if_transient(path, record)
             else:
-                return
+                yield record
 
     def _raise_if_transient(self, path: Path, error: BagError) -> None:
         """Raises an error of the disk again while the disk may recover."""

@@ -7,7 +7,7 @@ that came later, takes a rotation. What the splits show is measured beside the r
 from __future__ import annotations
 
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -17,14 +17,17 @@ import yaml
 
 from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import Loss, append_losses
-from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.directories import is_folder
+from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.text import counted, listed
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.reception.measure import (
     Arrivals,
     LossCounter,
     TopicFlow,
     measure_split,
 )
+from ros2_memory.retention.delete import size_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -145,6 +148,8 @@ ASK_AGAIN_S: Final = 300.0
 QUEUE_BYTES: Final = 64 * 2**20
 _PLANS_KEPT: Final = 8
 _LOOKED_AT: Final = 3
+_MOST_UNWRITTEN: Final = 1000
+_TASK: Final = "reception"
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
@@ -176,7 +181,10 @@ class Reception:
         bag_dir: where losses are written; nowhere where None.
         latched: topics that count as latched, see `qos_overrides`.
         volatile: topics that are not asked for their earlier messages once a split has shown them.
-        run: runs a task that takes a while; in a thread of its own where None.
+        background: measures splits and writes losses beside the recorder's loop.
+
+    Attributes:
+        may_write: whether losses are written; those that are not wait.
     """
 
     def __init__(
@@ -187,17 +195,19 @@ class Reception:
         bag_dir: Path | None = None,
         latched: Collection[str] = (),
         volatile: Collection[str] = (),
-        run: Callable[[Callable[[], None]], None] | None = None,
+        background: Background | None = None,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
         self._latched = tuple(latched)
         self._volatile = tuple(volatile)
-        self._run = run or _in_thread()
+        self._background = background or Background()
         self._bag_dir = bag_dir
         self._losses = LossCounter()
+        self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
         self._arrivals = Arrivals()
         self._lock = threading.Lock()
+        self.may_write = True
         self._flows: dict[str, TopicFlow] = {}
         self._asked_anew: set[str] = set()
         self._skipped = frozenset[str]()
@@ -246,11 +256,11 @@ class Reception:
 
     def learn(self, recording: str, path: Path) -> None:
         """Measures a closed split of a recording, later."""
-        self._run(lambda: self._measure(recording, path))
+        self._background.add(_TASK, lambda: self._measure(recording, path))
 
     def flush(self) -> None:
         """Counts what no further split can fill; called when nothing is recorded any more."""
-        self._run(lambda: self._count(self._losses.flush))
+        self._background.add(_TASK, lambda: self._count(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
@@ -259,7 +269,7 @@ class Reception:
             known = self._recordings.get(recording)
             return self._losses.reported(topic, *((0, 0) if known is None else known.span), count)
 
-        self._run(lambda: self._count(reported))
+        self._background.add(_TASK, lambda: self._count(reported))
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are known to be missing of the last hour."""
@@ -274,8 +284,6 @@ class Reception:
     def _count(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
             losses = take()
-        if not losses:
-            return
         by_topic: dict[str, int] = {}
         for loss in losses:
             by_topic[loss.topic] = by_topic.get(loss.topic, 0) + loss.lost
@@ -287,11 +295,14 @@ class Reception:
                 reason=f"{topic}: {counted(lost, 'message')} missing, by its counter, its stamps "
                 "or rosbag2's count: lost on the way to the disk, or never published",
             )
-        if self._bag_dir is not None:
+        self._unwritten += losses
+        if self._bag_dir is not None and self.may_write and self._unwritten:
             try:
-                append_losses(self._bag_dir, losses)
+                append_losses(self._bag_dir, self._unwritten)
             except OSError as error:
-                _log.warning("losses_not_written", reason=str(error))
+                reason = error.strerror or error
+                raise RecorderError(f"losses cannot be written: {reason}") from error
+            self._unwritten.clear()
 
     def refused(self, recording: str, topic: str) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
@@ -393,17 +404,7 @@ def newest_splits(bag_dir: Path) -> list[Path]:
     found: list[Path] = []
     with suppress(OSError):
         folders = sorted(each for each in bag_dir.iterdir() if has_own_name(each.name))
-        for folder in folders[-_LOOKED_AT:]:
-            splits = sorted(folder.glob("*.mcap"), key=lambda split: split.stat().st_mtime_ns)
-            found += (split for split in splits if split.stat().st_size)
+        for folder in [*filter(is_folder, folders)][-_LOOKED_AT:]:
+            splits = sorted(folder.glob("*.mcap"), key=lambda split: split.lstat().st_mtime_ns)
+            found += filter(size_of, splits)
     return found[-_LOOKED_AT:]
-
-
-def _in_thread() -> Callable[[Callable[[], None]], None]:
-    """Returns what runs tasks one after the other in a thread, which begins with the first."""
-    pool = ThreadPoolExecutor(1, thread_name_prefix="reception")
-
-    def run(task: Callable[[], None]) -> None:
-        pool.submit(task)
-
-    return run

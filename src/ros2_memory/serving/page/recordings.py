@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.index.timeline import Timeline
-    from ros2_memory.retention.inventory import Foreign
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""
@@ -68,10 +67,6 @@ class OneRecording:
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the directory's recorder."""
         return self._index.heartbeat()
-
-    def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """Returns the bags of a snapshot that the directory's recorder did not make."""
-        return self._index.foreign(snapshot)
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
         """Returns the recordings that handovers join with one."""

@@ -21,9 +21,11 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.handover.transfer import pending, void
-from ros2_memory.recorder.handover.union import intended, recover_handovers
+from ros2_memory.recorder.handover.union import intended
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
+from tests.support.handovers import recover_handovers
+from tests.support.simulated_recorders import World
 
 S = 10**9
 T0 = 1_795_150_800 * S
@@ -166,7 +168,7 @@ def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path
         write_handover(old, intended(Handover(), name + "2"))
     (tmp_path / "a" / ".handover.json.tmp").mkdir()
     with capture_logs() as logs:
-        recover_handovers(tmp_path, READER)
+        World(tmp_path).started(100)
     assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
     assert read_handover(tmp_path / "c").handover.next is None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 import yaml
@@ -18,6 +19,7 @@ from ros2_memory.recorder.reception.reception import (
 )
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.simulated_recorders import Inline
 
 NS = 10**9
 T0 = 1_795_000_000 * NS
@@ -29,7 +31,7 @@ def split(path: Path, hz: int, seconds: int, topic: str = "/odom") -> Path:
 
 
 def reception(queue_bytes: int = 2**26) -> Reception:
-    return Reception(McapReader(), queue_bytes, latched=["/tf_static"], run=lambda task: task())
+    return Reception(McapReader(), queue_bytes, latched=["/tf_static"], background=Inline())
 
 
 def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
@@ -130,6 +132,15 @@ def test_an_unreadable_split_teaches_nothing(tmp_path: Path) -> None:
     assert made.rotation_due("a", 10.0) is None
 
 
+def test_a_bug_in_measuring_is_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    background = Inline()
+    made = Reception(McapReader(), background=background)
+    monkeypatch.setattr(measure.TopicFlow, "joined", Mock(side_effect=KeyError("x")))
+    for number in range(2):
+        made.learn("a", split(tmp_path / f"a_{number}.mcap", 50, 4))
+    assert "KeyError" in background.faults()["reception"]
+
+
 def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
     assert newest_splits(tmp_path) == []
     assert newest_splits(tmp_path / "none") == []
@@ -137,6 +148,9 @@ def test_the_newest_splits_of_an_earlier_run_are_found(tmp_path: Path) -> None:
     split(tmp_path / "other" / "x_0.mcap", 5, 1)
     newest = split(tmp_path / "rec_20261120T090000Z" / "x_0.mcap", 5, 1)
     (tmp_path / "rec_20261120T090000Z" / "x_1.mcap").touch()
+    elsewhere = split(tmp_path / "other" / "x_1.mcap", 5, 1)
+    (tmp_path / "rec_20261120T090000Z" / "x_2.mcap").symlink_to(elsewhere)
+    (tmp_path / "rec_20261120T100000Z").symlink_to(elsewhere.parent)
     assert newest_splits(tmp_path) == [*older[1:], newest]
 
 
@@ -172,7 +186,7 @@ def test_what_a_split_shows_of_a_refused_publisher_is_asked_for_again(tmp_path: 
 
 
 def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
-    made = Reception(McapReader(), volatile=["/rosout"], run=lambda task: task())
+    made = Reception(McapReader(), volatile=["/rosout"], background=Inline())
     topics = ("/rosout", "/map")
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
     layout = McapLayout(latched=frozenset(topics))

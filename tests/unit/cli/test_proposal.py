@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 import yaml
 
-from ros2_memory.recorder.process.topics import load_topics
-from ros2_memory.recorder.proposal import (
+from ros2_memory.cli.proposal import (
     Choice,
     Disk,
     Offered,
@@ -18,6 +17,7 @@ from ros2_memory.recorder.proposal import (
     propose,
     topics_yaml,
 )
+from ros2_memory.recorder.process.topics import load_topics
 
 if TYPE_CHECKING:
     from pathlib import Path

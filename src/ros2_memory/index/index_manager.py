@@ -2,8 +2,7 @@
 
 A scan reads what changed (see `index.bag_table`) and swaps in a new `Snapshot`: a query that has
 one works on a consistent index for as long as it needs. No thread is started: a query, or a caller
-of `refresh`, runs the scan itself. Nothing is written or deleted without a `GarbageCollector`,
-which only the recorder daemon has.
+of `refresh`, runs the scan itself.
 """
 
 from __future__ import annotations
@@ -22,15 +21,13 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import Clock, Ns, ms_from_ns, ns_from_unix
-from ros2_memory.index.bag_table import BagTable, TableChange
+from ros2_memory.index.bag_table import BagTable, KnownBags, TableChange
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.retention.collect import Collected, GarbageCollector
-from ros2_memory.retention.inventory import Foreign, ForeignBags
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
     from pathlib import Path
 
     from structlog.typing import FilteringBoundLogger
@@ -52,7 +49,6 @@ class IndexManager:
         clock: the wall clock.
         refresh_s: how old a snapshot may become before a query has it renewed.
         split_duration_s: how long the recorder writes one file.
-        collector: deletes bags that exceed its limits; nothing is deleted without it.
         known: gives, by path, closed files that were read earlier. A first scan does not read them
             again if they are unchanged.
         include_active: whether the readable part of a file that is being written answers, too. Not
@@ -62,6 +58,8 @@ class IndexManager:
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
         setting: the one that names the bag directory, for sentences.
         large: the turn to hold much of a bag, for which no scan waits.
+        packs: whether summaries are packed: who deletes bags looks at few of them, and who answers
+            looks at all.
 
     Attributes:
         bag_dir: the bag directory.
@@ -76,13 +74,13 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
-        collector: GarbageCollector | None = None,
         known: Callable[[], Mapping[str, BagFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
         only: str | None = None,
         setting: str = BAG_DIR_SETTING,
         large: LargeReads | None = None,
+        packs: bool = False,
     ) -> None:
         self._large = large or LargeReads()
         self._setting = setting
@@ -91,14 +89,13 @@ class IndexManager:
         self.bag_dir = bag_dir
         self._known = known
         self._include_active = include_active
-        self._collector = collector
+        self._packs = packs
         self._reader = reader
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._log: FilteringBoundLogger = structlog.get_logger()
         self._lock = threading.Lock()
-        self._foreign = ForeignBags(bag_dir)
         self.published: Snapshot | None = None
         self._table = self._new_table()
 
@@ -125,32 +122,20 @@ class IndexManager:
             return self._scan()
 
     @contextmanager
-    def undisturbed(self) -> Iterator[Snapshot]:
-        """Yields the result of a scan; nothing is deleted within the block."""
-        with self._lock:
-            yield self._scan(patrolling=False)
+    def undisturbed(self, *, patrolling: bool = False) -> Iterator[Snapshot]:
+        """Yields the result of a scan; within the block no other one enters, or scans.
 
-    def apply_retention(self, free_bytes_wanted: int | None = None) -> Collected:
-        """Scans, and deletes what exceeds the limits; nothing without a `collector`.
-
-        `free_bytes_wanted` is how much of the disk must be free, if that is to count.
+        `patrolling`: whether directories that did not change are looked at again.
         """
-        if self._collector is None:
-            return Collected()
         with self._lock:
-            snapshot = self._scan()
-            heartbeat = read_heartbeat(self.bag_dir).heartbeat
-            named = self._collector.begun_last if heartbeat is None else heartbeat.recordings
-            collected = self._collector.apply(
-                self._table.known(named, snapshot.scanned_at), snapshot, free_bytes_wanted
-            )
-            if collected.bags or collected.cut:
-                self._scan()
-            return collected
+            yield self._scan(patrolling=patrolling)
 
-    def foreign(self, snapshot: Snapshot) -> Foreign | None:
-        """Measures the bags that the recorder did not make; returns None if that is unknown."""
-        return self._foreign.measured(snapshot, read_heartbeat(self.bag_dir).recordings)
+    def known_bags(self, named: Collection[str], snapshot: Snapshot) -> KnownBags:
+        """Returns what retention considers, within `undisturbed`, which gave the snapshot.
+
+        `named` are recordings that are being written.
+        """
+        return self._table.known(named, snapshot.scanned_at)
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
         """Returns the recordings that a handover names as those before and after one."""
@@ -169,14 +154,12 @@ class IndexManager:
     # The methods below run under the lock.
 
     def _new_table(self) -> BagTable:
-        # Who deletes bags looks at few of them; who answers looks at all of them.
-        packs = self._collector is not None
         return BagTable(
             self.bag_dir,
             self._reader,
             known=self._known,
             only=self._only,
-            packs=packs,
+            packs=self._packs,
             setting=self._setting,
         )
 

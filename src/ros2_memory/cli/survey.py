@@ -13,14 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import Ns, unix_from_ns
-from ros2_memory.recorder.process.child import Child, end_all
-from ros2_memory.recorder.process.command import record_argv, storage_config
-from ros2_memory.recorder.process.output import LineKind, parse_line
-from ros2_memory.recorder.process.topics import TopicSelection
-from ros2_memory.recorder.proposal import (
+from ros2_memory.cli.proposal import (
     INDEX_BYTES,
     MESSAGE_BYTES,
     Choice,
@@ -28,6 +21,13 @@ from ros2_memory.recorder.proposal import (
     chosen,
     judge,
 )
+from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import Ns, unix_from_ns
+from ros2_memory.recorder.process.child import Child, end_all
+from ros2_memory.recorder.process.command import record_argv, storage_config
+from ros2_memory.recorder.process.output import LineKind, parse_line
+from ros2_memory.recorder.process.topics import TopicSelection
 from ros2_memory.recorder.reception.reception import QueuePlan, qos_overrides
 
 if TYPE_CHECKING:

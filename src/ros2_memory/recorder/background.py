@@ -1,0 +1,76 @@
+"""Does beside the recorder's loop what takes a while: the disk may take seconds for a call."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+import structlog
+
+from ros2_memory.core.errors import EpisodicError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+PATIENCE_S: Final = 8.0
+"""How long a recorder that stops waits for what is under way; the service manager allows 40 s."""
+
+_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+class Background:
+    """Runs jobs in threads: those of one task one after the other, in their order."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._jobs: dict[str, deque[Callable[[], object]]] = {}
+        self._faults: dict[str, str] = {}
+
+    def add(self, task: str, job: Callable[[], object]) -> None:
+        """Adds a job to those of a task."""
+        with self._changed:
+            if task in self._jobs:
+                self._jobs[task].append(job)
+                return
+            self._jobs[task] = deque([job])
+        threading.Thread(target=self._work, args=(task,), name=task, daemon=True).start()
+
+    def is_under_way(self, task: str) -> bool:
+        """Whether a task has a job that has not ended."""
+        return task in self._jobs
+
+    def run(self, task: str, job: Callable[[], object]) -> None:
+        """Runs a job at once, and keeps why it failed. Raises nothing."""
+        try:
+            job()
+        except (EpisodicError, OSError) as error:
+            self.failed(task, str(error))
+        except Exception as error:  # noqa: BLE001 - or its thread ends silently, and the disk fills
+            _log.exception("housekeeping_faulty", task=task)
+            self.failed(task, f"a fault in this program ({type(error).__name__}); see its log")
+        else:
+            self._faults.pop(task, None)
+
+    def failed(self, task: str, reason: str) -> None:
+        """Notes that the last job of a task failed."""
+        self._faults[task] = reason
+
+    def faults(self) -> Mapping[str, str]:
+        """Maps each task whose last job failed to the reason."""
+        return dict(self._faults)
+
+    def wait(self, patience_s: float | None = PATIENCE_S) -> None:
+        """Waits until nothing is under way, or so long; None: however long that takes."""
+        with self._changed:
+            self._changed.wait_for(lambda: not self._jobs, patience_s)
+
+    def _work(self, task: str) -> None:
+        jobs = self._jobs[task]
+        while jobs:
+            self.run(task, jobs[0])
+            with self._changed:
+                jobs.popleft()
+                if not jobs:
+                    del self._jobs[task]
+                    self._changed.notify_all()
