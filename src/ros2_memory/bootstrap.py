@@ -458,8 +458,8 @@ def build_memory(
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
     from ros2_memory.columns.scanner import Scanner
     from ros2_memory.history.context import Memory
-    from ros2_memory.index.index_manager import IndexManager
     from ros2_memory.index.scan import BAG_DIR_SETTING
+    from ros2_memory.recorder.index_manager import IndexManager
 
     clock = WallClock()
     shared = shared or shared_parts(settings)

@@ -34,9 +34,9 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.bootstrap import claim
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.history.context import Call
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.insights.status import memory_status
 from ros2_memory.observability.prometheus import MemoryGauges, _Collector
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import write_mcap

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from ros2_memory.bag_dir.state_files import read_gate
 from ros2_memory.core.timebase import WallClock
-from ros2_memory.index.index_manager import IndexManager
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.live_recorder import LiveRecorder, Machine, machine
 from tests.support.processes import PATIENCE_S

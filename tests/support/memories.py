@@ -23,8 +23,8 @@ from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.index.scan import BAG_DIR_SETTING
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader

@@ -15,7 +15,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import AtTime, TimeRange
-from ros2_memory.index.index_manager import IndexManager
+from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
     Msg,
     boolean,

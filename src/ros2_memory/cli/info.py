@@ -26,11 +26,11 @@ from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.history.view import View
-from ros2_memory.index.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
 from ros2_memory.queries import list_recorded_topics
+from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import TopicRow
 from ros2_memory.tools.replies import Replies
 

@@ -28,9 +28,9 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.index.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
+from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
 from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of

@@ -14,8 +14,8 @@ from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.history.coverage import describe_excluded, unread_spans
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.insights.status import nothing_here
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.things.find import find_things

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.heartbeat import (
     write_heartbeat,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.index.index_manager import IndexManager, Snapshot
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, close, grow, plain

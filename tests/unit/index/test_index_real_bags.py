@@ -11,7 +11,7 @@ import pytest
 
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.timebase import Ns
-from ros2_memory.index.index_manager import IndexManager, Snapshot
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import McapLayout, text, write_db3, write_mcap

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock

@@ -9,9 +9,9 @@ import pytest
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock

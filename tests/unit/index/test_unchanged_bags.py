@@ -11,7 +11,7 @@ import pytest
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.index.bag_table import BagTable
 from ros2_memory.index.file_state import ScanContext
-from ros2_memory.index.index_manager import IndexManager, Snapshot
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
 

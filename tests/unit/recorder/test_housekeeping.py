@@ -16,8 +16,8 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.collect import GarbageCollector
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.storage.mcap_reader import McapReader

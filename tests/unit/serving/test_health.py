@@ -16,7 +16,7 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index import listed_splits
-from ros2_memory.index.index_manager import IndexManager
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import NAMED, Health, keep_fresh, read_listings
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock

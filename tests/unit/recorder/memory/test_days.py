@@ -32,8 +32,8 @@ from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
-from ros2_memory.index.index_manager import IndexManager
 from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.recorder.memory.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.retention import collect
 from ros2_memory.retention.delete import remove_bag

@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import Clock
-from ros2_memory.index.index_manager import IndexManager, Snapshot
+from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
