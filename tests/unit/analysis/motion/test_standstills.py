@@ -177,7 +177,7 @@ def test_the_box_of_a_standstill_is_as_large_as_a_drift(speed: float, noise: flo
 
 def test_a_standstill_whose_place_drifts_is_one() -> None:
     [found] = standstills_of(world([(300.0, 0.002)]).poses)
-    assert stood([found]) == pytest.approx(300, abs=0.5)
+    assert stood((found,)) == pytest.approx(300, abs=0.5)
 
 
 def test_a_standstill_that_drifts_away_ends_where_the_next_one_begins() -> None:
