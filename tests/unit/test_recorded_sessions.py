@@ -16,7 +16,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
 from tests.support.closed_form import (
@@ -164,6 +164,16 @@ def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Sess
     assert session.since(unix_from_ns(answer.found.sample.time)) == pytest.approx(
         seen[-1], abs=0.05
     )
+
+
+def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
+    begin, end = spanned(memory, session)
+    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
+    for sample in queries.topic_range(memory, Call(), "/odom", span, max_samples=60).samples:
+        again = queries.topic_value(
+            memory, Call(), "/odom", AtTime(at_s=unix_rounded_up(sample.time)), tolerance_s=0.0
+        )
+        assert again.sample.time == sample.time
 
 
 def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> None:
