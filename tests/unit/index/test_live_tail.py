@@ -222,6 +222,13 @@ def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
             )
 
 
+def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:
+    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:5], at=5 * S)
+    assert tail.states() == []
+    [aside] = tail.memory.index.snapshot().active
+    assert not aside.answers
+
+
 def test_a_db3_that_is_being_written_does_not_answer(tmp_path: Path) -> None:
     tail = Tail(tmp_path, storage="rosbag2")
     path = write_db3(tmp_path / "rec" / "rec_0.db3", driven(0, 5))

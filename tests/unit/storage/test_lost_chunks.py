@@ -5,6 +5,8 @@ A damaged index costs none, and is reported too.
 
 from __future__ import annotations
 
+import json
+import struct
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +24,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.fuzz.indexes import agreed
-from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked as asked_tool
 from tests.support.memories import memory_of, with_store
@@ -118,6 +120,14 @@ def asked(memory: Memory, pattern: str, wanted: str) -> Match:
     return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
 
 
+def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_reported(tmp_path: Path) -> None:
+    damaged_bag(tmp_path / "rec" / "rec_0.mcap")
+    found = asked(memory_of(tmp_path), "/chatter", f"{3:0100d}")
+    assert found.found is not None
+    assert found.found.sample.time == 3
+    assert any("rec_0.mcap could not be read whole" in note for note in found.notes)
+
+
 def test_a_chunk_damaged_before_the_match_is_reported_neither_with_a_catalogue_nor_without(
     tmp_path: Path,
 ) -> None:
@@ -190,6 +200,69 @@ def test_damaged_bags_are_reported_in_one_order_whichever_was_found_first(tmp_pa
     assert notes[0] == notes[1]
     [once] = notes[0]
     assert once.startswith("2 bags could not be read whole: a/a_0.mcap (")
+
+
+class TestAnIndexThatContradictsItsMessages:
+    """One bit of a message index is another: nothing that is asked for is missed or moved."""
+
+    def driven(self, bag_dir: Path) -> Path:
+        """Ten seconds at 1 m/s; one message is indexed as if it lay 0.2 s later."""
+        moving = [
+            each
+            for n in range(100)
+            for at in [T0 + n * S // 10]
+            for each in (
+                odom(at, n / 10, 0.0),
+                tf(at, transform(at, "odom", "base", (n / 10, 0.0, 0.0))),
+            )
+        ]
+        path = write_mcap(bag_dir / "rec" / "rec_0.mcap", moving, McapLayout(chunk_size=8000))
+        self.right = path.read_bytes()
+        chunk = chunks_of(path)[2]
+        for offset in chunk.message_index_offsets.values():
+            data = bytearray(path.read_bytes())
+            at = offset + 15 + 16 * 5
+            (time,) = struct.unpack_from("<Q", data, at)
+            self.at = time
+            struct.pack_into("<Q", data, at, time + S // 5)
+            path.write_bytes(data)
+        return path
+
+    def test_where_the_robot_was_is_what_its_messages_say(self, tmp_path: Path) -> None:
+        self.driven(tmp_path)
+        true = (self.at - T0) / S
+        for storage in ("mcap", "rosbag2"):
+            memory = memory_of(tmp_path, storage=storage)
+            at_s = self.at / S
+            reply = asked_tool(memory, tmp_path, "get_position_at", topic="/odom", timestamp=at_s)
+            assert reply["x"] == pytest.approx(true, abs=1e-6)
+            assert any("rec_0.mcap contradicts itself" in note for note in reply["notes"])
+            frames = {"parent": "odom", "child": "base"}
+            reply = asked_tool(memory, tmp_path, "get_transform_at", timestamp=at_s, **frames)
+            assert reply["translation"]["x"] == pytest.approx(true, abs=1e-6)
+            reply = asked_tool(
+                memory, tmp_path, "get_topic_in_range", topic="/odom", start=at_s, end=at_s + 0.15
+            )
+            assert [sample["timestamp"] for sample in reply["samples"]] == [
+                pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
+            ]
+
+    def test_a_search_finds_what_it_finds_in_the_same_bag_with_a_right_index(
+        self, tmp_path: Path
+    ) -> None:
+        self.driven(tmp_path / "wrong")
+        whole = self.driven(tmp_path / "right")
+        whole.write_bytes(self.right)
+        near = json.dumps({"x": (self.at - T0) / S, "y": 0.0})
+        asks = {"topic": "/odom", "condition_type": "near_position", "value": near}
+        wrong, right = (
+            asked_tool(memory_of(tmp_path / name), tmp_path / name, "find_matches", **asks)
+            for name in ("wrong", "right")
+        )
+        [found, *same] = wrong.pop("notes")
+        assert "contradicts itself" in found
+        assert same == right.pop("notes")
+        assert wrong == right
 
 
 class TestAChunkOfWhichAllIndexesTellOneLie:
