@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import signal
 from collections import Counter
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 from mcap.records import Channel, Chunk, Header, Message, Metadata, Schema, SummaryOffset
 from mcap.stream_reader import breakup_chunk
-from rosbags.highlevel import AnyReader
 
 from tests.integration.ros_recordings import (
     Recording,
@@ -145,31 +143,6 @@ def test_every_published_message_is_recorded_once(session: Session) -> None:
         assert dict(found) == session.published
 
 
-def test_what_is_recorded_is_what_the_closed_form_says(session: Session) -> None:
-    with AnyReader([session.small.directory]) as reader:
-        odometry = [c for c in reader.connections if c.topic == "/odom"]
-        read: list[Any] = [
-            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(odometry)
-        ]
-    assert len(read) == session.published["/odom"]
-    for tick, message in enumerate(read):
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        assert stamp == session.t0 + tick * 50_000_000
-        at = message.pose.pose.position
-        assert math.isclose(math.hypot(at.x, at.y - 2.0), 2.0)
-        assert math.isclose(at.x, 2.0 * math.sin(tick / 80), abs_tol=1e-12)
-
-
-def test_the_types_that_have_no_wheel_can_be_read_as_themselves(session: Session) -> None:
-    with AnyReader([session.small.directory]) as reader:
-        vision = [c for c in reader.connections if c.topic == "/vision/scene/scene_objects"]
-        read: list[Any] = [
-            reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(vision)
-        ]
-    labels = [[seen.label for seen in message.detections] for message in read]
-    assert labels == [["table"]] * 5 + [["table", "cup"]] * 3
-
-
 def test_overlapping_recordings_agree_on_publish_time_and_payload_and_not_on_log_time(
     session: Session,
 ) -> None:
@@ -218,10 +191,6 @@ def test_a_split_begins_with_the_message_that_comes_too_late_for_the_one_before(
     for split in splits:
         for place, log in enumerate(split):
             assert log - min(split[: place + 1]) <= SPLIT_S * 10**9
-
-
-def test_with_the_default_chunk_the_active_file_is_empty(session: Session) -> None:
-    assert session.active_bytes == 0
 
 
 def test_a_split_is_closed_while_the_recording_goes_on(session: Session) -> None:

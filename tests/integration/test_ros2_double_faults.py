@@ -32,7 +32,6 @@ from tests.integration.ros_recordings import (
 from tests.support.processes import PATIENCE_S, until
 from tests.support.ros_processes import (
     RECORDERS,
-    SHARED_MEMORY,
     installation,
     publishing_robot,
     ros_environment,
@@ -259,24 +258,6 @@ def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Pat
         assert recording.process.wait(timeout=PATIENCE_S) == 1
     said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
     assert recording.said == said
-
-
-@each_in_time
-def test_what_a_killed_recorder_leaves_in_shared_memory_is_removed_with_its_environment(
-    real: RealRecorder | None, tmp_path: Path
-) -> None:
-    with (
-        ros_environment(tmp_path, real=real) as env,
-        Recording(env, tmp_path / "a", "-e", "/odom") as recording,
-    ):
-        recording.await_said("Recording...")
-        maps = Path(f"/proc/{recording.process.pid}/maps").read_text()
-        # Its own; those named by a port it may share with other tests' recorders.
-        pattern = rf"{SHARED_MEMORY}/fast(?:rtps|dds)_[0-9a-f]{{16}}"
-        own = {Path(name) for name in re.findall(pattern, maps)}
-        recording.stop(signal.SIGKILL)
-        assert any(file.exists() for file in own)
-    assert not any(file.exists() for file in own)
 
 
 @each_in_time

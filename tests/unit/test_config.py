@@ -176,10 +176,6 @@ class TestEnvironment:
         wanted = Path(value) if expected is None else expected
         assert getattr(getattr(settings, section), key) == wanted
 
-    @pytest.mark.parametrize("name", ["http", "streamable_http", "streamable-http"])
-    def test_streamable_http_may_be_written_out_as_a_setting(self, name: str) -> None:
-        assert load_settings([f"server.transport={name}"], {}).server.transport == "http"
-
     @settings(max_examples=examples(30))  # each composes the whole configuration
     @given(st.text(PATH_CHARACTERS, min_size=1))
     def test_any_path_arrives_as_it_was_written(self, name: str) -> None:

@@ -150,28 +150,6 @@ def test_a_message_that_fits_nothing_of_its_entry_is_shown_whole() -> None:
 # `fields`
 
 
-@pytest.mark.parametrize(
-    ("path", "value"),
-    [
-        ("position", {"x": 1.2346, "y": -2, "z": 0}),
-        ("position.x", 1.2346),
-        ("orientation.yaw_deg", 28.65),
-        ("child_frame_id", "base_link"),
-        ("header", {"stamp": 1752500000.123457, "frame_id": "odom"}),
-        ("header.stamp", 1752500000.123457),
-        ("header.stamp.sec", 1752500000),
-        ("pose.pose.position.x", 1.2346),
-        ("pose.pose.orientation", {"x": 0, "y": 0, "z": 0.24740395925, "w": 0.96891242171}),
-        ("pose.covariance.35", 0),
-        ("twist.twist.linear", {"x": 0.3, "y": 0, "z": 0}),
-    ],
-)
-def test_a_field_is_one_of_the_value_or_else_a_full_path_in_the_message(
-    path: str, value: object
-) -> None:
-    assert shown(odometry(), ODOMETRY, path) == {path: value}
-
-
 def test_fields_over_a_list_take_an_element_or_map_over_all() -> None:
     seen = detections("cup", "mug")
     paths = ("detections.label", "detections.1.label", "detections.2.label", "detections.point.x")

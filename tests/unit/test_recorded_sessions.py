@@ -17,9 +17,8 @@ from rosbags.rosbag2 import Reader
 
 from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
-from tests.support.bags import typestore
 from tests.support.closed_form import (
     CAMERA,
     LASER,
@@ -141,22 +140,6 @@ def test_a_transform_is_interpolated_to_the_asked_moment(
         assert answer.clock == "stamp"
 
 
-def test_a_transform_and_its_inverse_agree(memory: Memory, session: Session) -> None:
-    begin, end = spanned(memory, session)
-    t = (begin + end) / 2
-    there = queries.transform(memory, Call(), "odom", "laser", AtTime(at_s=session.at(t)))
-    back = queries.transform(memory, Call(), "laser", "odom", AtTime(at_s=session.at(t)))
-    x, y, _ = mounted(t, LASER)
-    angle = math.radians(yaw_deg(t))
-    expected = (
-        -(x * math.cos(angle) + y * math.sin(angle)),
-        x * math.sin(angle) - y * math.cos(angle),
-        -LASER[2],
-    )
-    assert math.dist(back.transform.translation, expected) < 0.005
-    assert there.transform.rotation[2] == pytest.approx(-back.transform.rotation[2], abs=1e-9)
-
-
 def test_the_path_length_is_speed_times_time(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     span = TimeRange(start_s=session.at(begin - 1), end_s=session.at(end + 1))
@@ -183,16 +166,6 @@ def test_the_last_scissors_are_found_to_the_second(memory: Memory, session: Sess
     )
 
 
-def test_a_thing_never_seen_is_a_complete_search_without_a_match(
-    memory: Memory, session: Session
-) -> None:
-    answer = queries.find_last_match(
-        memory, Call(), "/vision/scene/scene_objects", "contains", "unicorn"
-    )
-    assert answer.found is None
-    assert answer.notes == ()
-
-
 def test_a_timestamp_fed_back_finds_its_own_message(memory: Memory, session: Session) -> None:
     begin, end = spanned(memory, session)
     span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
@@ -213,28 +186,6 @@ def test_every_topic_is_counted_exactly(memory: Memory, session: Session) -> Non
     for topic, row in rows.items():
         times = log_times(session.folder)[topic]
         assert (row.first, row.last) == (times[0], times[-1])
-
-
-def test_samples_decode_as_plain_rosbags_decodes_them(memory: Memory, session: Session) -> None:
-    begin, end = spanned(memory, session)
-    span = TimeRange(start_s=session.at(begin), end_s=session.at(end))
-    answer = queries.topic_range(memory, Call(), "/odom", span, max_samples=1000)
-    wanted = {sample.time: sample.value for sample in answer.samples}
-    compared = 0
-    with Reader(session.folder) as reader:
-        odom = [each for each in reader.connections if each.topic == "/odom"]
-        for connection, stamp, payload in reader.messages(odom):
-            if stamp in wanted:
-                message: Any = typestore().deserialize_cdr(payload, connection.msgtype)
-                value = wanted[stamp]
-                assert isinstance(value, dict)
-                assert value["position"] == {
-                    "x": pytest.approx(message.pose.pose.position.x, abs=5.1e-5),
-                    "y": pytest.approx(message.pose.pose.position.y, abs=5.1e-5),
-                    "z": 0,
-                }
-                compared += 1
-    assert compared == len(wanted) > 100
 
 
 @long_ones
@@ -288,28 +239,9 @@ def test_a_killed_session_is_read_as_far_as_it_can_be(name: str) -> None:
 
 
 @needs_recorded
-def test_a_search_over_a_damaged_bag_says_that_it_was_not_complete() -> None:
-    memory = memory_of(RECORDED / "session_killed")
-    answer = queries.find_last_match(memory, Call(), "/bumper", "equals", value=True)
-    assert answer.found is None
-    assert "session_killed_2.mcap" in answer.notes[0]
-
-
-@needs_recorded
 def test_static_frames_of_three_broadcasters_are_all_known() -> None:
     memory = memory_of(RECORDED / "extra" / "tfs")
     found = queries.frames(memory, Call())
     # Their publishers named no parent: known are all three, and none is an edge to tf2.
     assert found.edges == ()
     assert [note for note in found.notes if note.endswith("a frame has no name: 3")]
-
-
-@long_ones
-def test_now_can_be_the_newest_recorded_moment(session: Session) -> None:
-    memory = memory_of(session.folder, limits=QuerySettings(now="latest"))
-    answer = queries.position(memory, Call(), AtTime(ago_s=10.0))
-    newest = memory.index.snapshot().latest
-    assert newest is not None
-    assert answer.age is not None
-    assert newest - answer.time == answer.age
-    assert 10.0 <= unix_from_ns(answer.age) < 10.1

@@ -17,8 +17,6 @@ from ros2_memory.analysis.facts import (
     GOAL,
     GOALS,
     LABEL,
-    LOG,
-    REPORT,
     STATUS,
     Word,
     charge_levels,
@@ -50,17 +48,6 @@ def test_labels_and_booleans_are_found_in_values() -> None:
     assert stated({"value": True}, "std_msgs/msg/Bool") == {Word(FLAG, "value"): 1}
     assert stated({"a": {"b": False, "list": [True]}}, "x/msg/Y") == {Word(FLAG, "a.b"): 0}
     assert stated({"value": 3.5}, "std_msgs/msg/Float64") == {}
-
-
-def test_log_entries_are_reports_from_warnings_on_and_errors_above() -> None:
-    log: dict[str, JsonValue] = {"name": "planner", "msg": "no path"}
-    warning = Word(REPORT, "warning of planner: no path")
-    assert stated({**log, "level": 20}, LOG) == {}
-    assert stated({**log, "level": 30}, LOG) == {warning: 0}
-    assert stated({**log, "level": 40}, LOG) == {
-        Word(ERROR, "planner: no path"): 0,
-        Word(REPORT, "error of planner: no path"): 0,
-    }
 
 
 def test_statuses_and_goals_have_a_value_each() -> None:

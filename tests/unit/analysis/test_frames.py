@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass, replace
@@ -25,8 +24,6 @@ from ros2_memory.analysis.frames import (
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import StampedTransform, Transform
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, NS_PER_S, ns_from_unix
-from tests.support.rosbags_oracle import stamped_transforms
-from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import transforms
 
 if TYPE_CHECKING:
@@ -34,10 +31,6 @@ if TYPE_CHECKING:
 
 S = NS_PER_S
 IDENTITY = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-FILES = {
-    "evo_tf_example_db3": "evo_tf_example_db3/tf_example.db3",
-    "cougars_auv_mcap": "cougars_auv_mcap/SO_bag_0.mcap",
-}
 
 
 def edge(
@@ -367,49 +360,6 @@ def test_a_tree_on_log_time_is_asked_in_log_time() -> None:
     tree = Tree(replayed(1000 * S), "log")
     assert shift(tree, "odom", "base", 1101 * S) == 1.0
     assert refusal(tree, "odom", "base", 101 * S).reason is NoDataReason.OUTSIDE_RANGE
-
-
-# Public robots
-
-
-def _expected() -> list[object]:
-    if not REAL.is_dir():
-        return []
-    sets = json.loads((REAL / "expected.json").read_text())
-    return [
-        pytest.param(name, case, id=f"{name}-{case['target']}-{case['source']}-{case['stamp_ns']}")
-        for name in FILES
-        for case in sets[name]["expected"]["tf_lookup"]
-    ]
-
-
-@needs_real
-@pytest.mark.parametrize(("name", "case"), _expected())
-def test_lookups_on_public_bags_are_those_of_independent_tools(
-    name: str, case: dict[str, object]
-) -> None:
-    tree = Tree(stamped_transforms(FILES[name]), "stamp")
-    target, source, stamp = str(case["target"]), str(case["source"]), case["stamp_ns"]
-    assert isinstance(stamp, int)
-    if "error" not in case:
-        found = tree.lookup(target, source, stamp)
-        assert found.translation == pytest.approx(case["translation"], abs=2e-6)
-        turned = Rotation.from_quat(found.rotation).inv() * Rotation.from_quat(case["q_xyzw"])
-        assert turned.magnitude() < 5e-6
-        return
-    refused = refusal(tree, target, source, stamp)
-    if case["error"] == "not connected":
-        assert refused.reason is NoDataReason.FRAME_UNKNOWN
-    else:
-        assert refused.reason is NoDataReason.OUTSIDE_RANGE
-
-
-@needs_real
-@pytest.mark.parametrize(
-    ("name", "clock"), [("cougars_auv_mcap", "log"), ("evo_tf_example_db3", "stamp")]
-)
-def test_the_clock_of_a_replayed_robot_is_log_time(name: str, clock: str) -> None:
-    assert Tree(stamped_transforms(FILES[name]), "auto").frames("map").clock == clock
 
 
 # Many times at once

@@ -70,14 +70,6 @@ def test_packing_changes_nothing_but_the_size(
             assert [summary.at(number) for number in range(len(topics_of))] == list(topics_of)
 
 
-@given(several, several)
-def test_summaries_are_equal_where_they_say_the_same(
-    one: tuple[TopicSummary, ...], other: tuple[TopicSummary, ...]
-) -> None:
-    assert (BagSummary(one) == BagSummary(other)) == (one == other)
-    assert hash(BagSummary(one)) == hash(BagSummary(tuple(one)))
-
-
 def test_summaries_of_equal_numbers_differ_by_what_else_they_say() -> None:
     summary = BagSummary((TopicSummary("/a", "std_msgs/msg/Bool", "cdr", 1, 2, 3),))
     assert summary != summary.replaced(complete=False)

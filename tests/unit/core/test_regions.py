@@ -53,14 +53,6 @@ def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) 
         assert inside == region.contains(x, y)
 
 
-def test_a_path_may_be_inside_of_a_horseshoe_twice_in_one_step() -> None:
-    path = Steps(np.array([-1.0]), np.array([3.0]), np.array([5.0]), np.array([3.0]))
-    parts = parts_inside(HORSESHOE, path)
-    assert parts.step.tolist() == [0, 0]
-    assert (6 * parts.start - 1).tolist() == pytest.approx([0.0, 3.0])
-    assert (6 * parts.stop - 1).tolist() == pytest.approx([1.0, 4.0])
-
-
 def test_of_places_within_each_other_the_smallest_is_named() -> None:
     places = (
         Place("kitchen", "map", Rectangle(0, 5, 0, 5)),

@@ -3,13 +3,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from hypothesis import given
-from hypothesis import strategies as st
-
 from ros2_memory.core.reply import (
     AGO,
-    FILE,
-    INSIDE,
     LASTED,
     LOCAL,
     NAME,
@@ -18,7 +13,6 @@ from ros2_memory.core.reply import (
     PLAIN,
     SECONDS,
     TIME,
-    TOTAL,
     YAW,
     Scope,
     an_object,
@@ -29,7 +23,7 @@ from ros2_memory.core.reply import (
     result,
     shown,
 )
-from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 BAGS = Path("/bags")
 
@@ -98,34 +92,6 @@ def test_a_score_of_zero_is_known_and_one_that_is_no_number_is_null() -> None:
     assert "score" not in answer(score=None)
 
 
-def test_a_long_list_is_cut_and_its_number_told() -> None:
-    rows = tuple(Row(n, "") for n in range(5))
-    cut = answer(rows=rows)
-    assert cut["rows"] == [{"at": 0.0, "text": ""}, {"at": 1e-6, "text": ""}]
-    assert cut["rows_count"] == 5
-    assert "rows_count" not in answer(rows=rows[:2])
-
-
-def test_the_last_of_a_list_have_a_note() -> None:
-    last = keys(PLAIN("names").last(2))
-    scope = Scope()
-    reply = last.render(type("Named", (), {"names": ("a", "b", "c")})(), scope)
-    assert reply == {"names": ["b", "c"], "names_count": 3}
-    assert scope.notes == ["names: the last 2 of 3 are listed"]
-
-
-def test_only_what_spans_more_than_half_a_day_has_a_local_time() -> None:
-    assert "local" not in answer(now=12 * 3600 * NS_PER_S)
-    assert answer(now=13 * 3600 * NS_PER_S)["local"]
-
-
-def test_what_is_below_the_bag_directory_is_named_relative_to_it() -> None:
-    files = keys(FILE("file", "path"))
-    at = type("At", (), {"path": BAGS / "r" / "r_0.mcap"})()
-    assert shown(at, Scope(bag_dir=BAGS), files) == {"file": "r/r_0.mcap"}
-    assert shown(at, Scope(bag_dir=Path("/other")), files) == {"file": "r_0.mcap"}
-
-
 def test_an_object_of_its_own_holds_attributes_of_the_same_result() -> None:
     form = keys(an_object(keys("text", TIME("at")))("row", itself_if("text")).if_known)
     assert shown(Row(NS_PER_S, "a"), Scope(), form) == {"row": {"text": "a", "at": 1.0}}
@@ -136,16 +102,3 @@ def test_a_part_of_a_path_that_is_none_makes_the_value_null() -> None:
     form = keys(PLAIN("text", "row.text"))
     assert shown(Answer(0, 0, 0), Scope(), form) == {"text": None}
     assert shown(Answer(0, 0, 0, row=Row(0, "a")), Scope(), form) == {"text": "a"}
-
-
-def test_named_places_and_totals_have_keys_of_their_own() -> None:
-    form = keys(INSIDE("places"), TOTAL("total", "counted"))
-    at = type("At", (), {"places": ("hall", "house"), "counted": (3, False)})()
-    assert shown(at, Scope(), form) == {"in": "hall", "also_in": ["house"], "at_least": 3}
-
-
-@given(st.integers(0, 2**62))
-def test_a_time_that_is_passed_back_finds_its_own_message(at: Ns) -> None:
-    [told] = shown(Row(at, ""), Scope(), keys(TIME("at"))).values()
-    assert isinstance(told, float)
-    assert ns_from_unix(told) >= at - 1024  # what a float resolves, far from the present

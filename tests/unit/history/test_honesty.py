@@ -173,17 +173,6 @@ def test_no_tool_speaks_of_a_split_that_its_window_does_not_touch(
     assert not any("could not be read" in note for note in notes_of(reply))
 
 
-def test_never_seen_is_null_only_where_everything_was_searched(tmp_path: Path) -> None:
-    splits = write_splits(tmp_path, 3)
-    memory = memory_of(tmp_path, clock=FixedClock(T0 + HOUR))
-    never = {"topic": "/vision/*", "condition_type": "contains", "value": "scissors"}
-    assert asked(memory, tmp_path, "find_last_match", **never) is None
-    tear(splits[0])
-    reply = asked(memory, tmp_path, "find_last_match", **never)
-    assert (reply.pop("timestamp"), reply.pop("value")) == (None, None)
-    assert [*reply] == ["notes"]
-
-
 def test_the_split_being_written_is_reported_where_it_may_hold_newer_and_no_future_is(
     tmp_path: Path,
 ) -> None:

@@ -16,7 +16,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import pose_rows, poses_of
 from ros2_memory.history.view import View
-from tests.support.bags import Msg, odom, write_mcap
+from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World
 from tests.support.memories import memory_of
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
@@ -85,17 +85,6 @@ def test_poses_of_a_history_that_is_cut_anywhere(tmp_path: Path, seed: int) -> N
     view = View(world.memory, Call())
     times = [each.time for each in view.stream.messages(["/odom"], EVERYTHING)]
     assert check(world.memory, TimeWindow(times[len(times) // 3], times[len(times) // 2])) == 1
-
-
-def test_poses_that_cannot_be_decoded_are_left_out_and_named(tmp_path: Path) -> None:
-    broken = Msg("/odom", "nav_msgs/msg/Odometry", T0 + 2 * S, b"\x00\x01\x00\x00\xff")
-    write_mcap(tmp_path / "rec/rec_0.mcap", [odom(T0, 1, 0), odom(T0 + S, 2, 0), broken])
-    failures: list[UndecodableError] = []
-    view = View(memory_of(tmp_path), Call())
-    [block] = pose_rows(view, "/odom", EVERYTHING, failures)
-    assert block.poses.positions[:, 0].tolist() == [1.0, 2.0]
-    assert [error.topic for error in failures] == ["/odom"]
-    assert block.parts is None
 
 
 def test_only_whole_parts_have_numbers(tmp_path: Path) -> None:

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
-import sqlite3
-from contextlib import closing
 from typing import TYPE_CHECKING
-
-import pytest
 
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.timebase import Ns
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from tests.support.bags import McapLayout, text, write_db3, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 
@@ -50,25 +44,6 @@ def test_the_splits_of_a_real_recording_are_found_in_order() -> None:
     assert [bag.path.name for bag, *_ in extents] == ["session_mcap_0.mcap"]
     assert "/tf_static" in snapshot.timeline.transient_local
     assert "/tf" not in snapshot.timeline.transient_local
-
-
-@needs_recorded
-def test_a_recorder_killed_with_nothing_on_disk_leaves_a_damaged_split() -> None:
-    snapshot = _scan(RECORDED / "session_killed", McapReader())
-    assert _states(snapshot) == [(f"session_killed_{n}.mcap", BagState.CLOSED) for n in range(2)]
-    assert _names(snapshot.damaged) == ["session_killed_2.mcap"]
-    assert "empty" in snapshot.damaged[0].reason
-
-
-@needs_recorded
-def test_a_recorder_killed_with_small_chunks_leaves_a_split_that_is_served() -> None:
-    snapshot = _scan(RECORDED / "session_killed_chunk64k", McapReader())
-    assert [bag.state for bag in snapshot.bags] == [
-        BagState.CLOSED,
-        BagState.CLOSED,
-        BagState.INCOMPLETE,
-    ]
-    assert snapshot.bags[2].summary.count >= 251
 
 
 @needs_recorded
@@ -108,41 +83,3 @@ def test_both_forms_of_a_public_pair_are_indexed_and_a_text_file_is_damaged() ->
         ("test_sample_truncated.mcap", BagState.INCOMPLETE),
     ]
     assert _names(snapshot.damaged) == ["Dockerfile.mcap"]
-
-
-@pytest.mark.parametrize("reader", [McapReader(), Rosbag2Reader()])
-@pytest.mark.parametrize("content", ["nothing", "a header", "messages"])
-def test_an_mcap_under_way_is_active_and_then_left_behind(
-    tmp_path: Path, reader: BagReader, content: str
-) -> None:
-    path = tmp_path / "rec" / "rec_0.mcap"
-    messages = [text(n * S, "hello" * 50) for n in range(100 if content == "messages" else 0)]
-    write_mcap(path, messages, McapLayout(chunk_size=1024, finish=False))
-    if content == "nothing":
-        path.write_bytes(b"")
-    written = path.stat().st_mtime_ns
-    under_way = _scan(tmp_path, reader, written + 30 * S)
-    assert (_names(under_way.active), under_way.bags) == (["rec_0.mcap"], ())
-    left = _scan(tmp_path, reader, written + 31 * S)
-    assert left.active == ()
-    if content == "messages":
-        assert _states(left) == [("rec_0.mcap", BagState.INCOMPLETE)]
-    else:
-        assert _names(left.damaged) == ["rec_0.mcap"]
-
-
-def test_a_db3_with_its_wal_beside_it_is_active_and_then_left_behind(tmp_path: Path) -> None:
-    source = write_db3(tmp_path / "source.db3", [text(n * S, "hello") for n in range(5)])
-    bags = tmp_path / "bags"
-    bags.mkdir()
-    with closing(sqlite3.connect(source)) as base:
-        base.execute("PRAGMA journal_mode=WAL")
-        base.execute("UPDATE messages SET timestamp = timestamp + 1")
-        base.commit()
-        for end in ("", "-wal"):
-            shutil.copy(f"{source}{end}", bags / f"rec_0.db3{end}")
-    written = (bags / "rec_0.db3").stat().st_mtime_ns
-    assert _names(_scan(bags, Rosbag2Reader(), written + 30 * S).active) == ["rec_0.db3"]
-    left = _scan(bags, Rosbag2Reader(), written + 31 * S)
-    assert _states(left) == [("rec_0.db3", BagState.INCOMPLETE)]
-    assert left.bags[0].summary.count == 5

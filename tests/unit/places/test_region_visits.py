@@ -124,14 +124,6 @@ def test_without_named_places_a_place_must_be_given(tmp_path: Path) -> None:
             visits(memory, Call(), where=unknown)
 
 
-def test_a_place_of_the_poses_own_frame_is_known_in_a_moving_map_too(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 2, seconds=30)
-    everywhere: dict[str, Any] = {"x": [-99, 99], "y": [-99, 99]}
-    found = visits(memory_of(tmp_path), Call(), where=everywhere, frame_id="odom")
-    assert found.frame_id == "odom"
-    assert found.duration / S == pytest.approx(29.8, abs=0.01)
-
-
 @pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
 def test_visits_in_the_poses_own_frame_are_those_of_the_recorded_poses(
     tmp_path: Path, recalls: bool

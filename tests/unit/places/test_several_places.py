@@ -52,10 +52,6 @@ def table(reply: Any) -> dict[str, dict[str, Any]]:
     }
 
 
-def test_the_world_visits_every_room(world: World) -> None:
-    assert {world.room(nth) for nth in range(SECONDS)} == {*ROOMS, None}
-
-
 @settings(max_examples=examples(8), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10_000),

@@ -161,12 +161,6 @@ def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> 
     assert len(spans(memory, 0.0, radius_m=1.0)) == 2
 
 
-def test_a_place_where_it_never_was_has_no_visits(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, line((20, 0.5)))
-    answer = visits(memory, Call(), 500.0, 0.0)
-    assert (answer.visits, answer.more) == ((), False)
-
-
 def test_the_newest_visits_come_first_and_more_are_counted(tmp_path: Path) -> None:
     there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
     memory = remembering(tmp_path, line(*there_and_back))
@@ -245,22 +239,6 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
     for other in ({"frame_id": "odom"}, {"frame_id": "map", "x": 900.0}, {"x": 50.0, "y": 1.0}):
         found = visits(memory, Call(), **pasted | other)
         assert not any("were taken in" in note for note in found.notes)
-
-
-@each_way
-def test_a_map_that_moves_under_odometry_is_followed(tmp_path: Path, recalls: bool) -> None:
-    """The robot drives on in odometry, which slips back as fast: it stands in the map."""
-    poses = line((40, 0.5))
-    moves = [
-        tf(at, transform(at, "map", "odom", (-(at - BEGIN) / S * 0.5, 0.0, 0.0)))
-        for at in (BEGIN + t * S // 2 for t in range(81))
-    ]
-    memory = remembering(tmp_path, [*poses, *moves])
-    memory = with_store(memory, tmp_path) if recalls else memory
-    answer = visits(memory, Call(), 0.0, 0.0, radius_m=0.3)
-    [visit] = answer.visits
-    assert answer.frame_id == "map"
-    assert (visit.arrived, visit.departed) == (BEGIN, BEGIN + round(39.8 * S))
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])

@@ -13,7 +13,6 @@ from mcap.writer import CompressionType, Writer
 from ros2_memory.core.errors import (
     BagContradictionError,
     BagError,
-    ConfigError,
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
@@ -500,7 +499,3 @@ class TestBounds:
             summary = reader.summarize(path)
             assert summary.empty
             assert any("damaged" in note for note in summary.notes)
-
-    def test_folders_of_definitions_that_are_wrong_stop_the_start(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match=r"nowhere is not a folder"):
-            McapReader([tmp_path / "nowhere"])

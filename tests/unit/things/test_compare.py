@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from random import Random
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.insights.compare import differ
 from ros2_memory.results import (
@@ -26,15 +23,13 @@ from ros2_memory.results import (
 from ros2_memory.tools.reply_json import as_json
 from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import Msg, log_entry
-from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, memory_of, replied
 from tests.unit.things.test_find import (
     AWAY,
     BEGIN,
     HERE,
     NAMED,
     looked,
-    random_messages,
     scene,
     write,
 )
@@ -467,33 +462,3 @@ def test_numbers_differ_by_a_tenth_and_by_more_than_noise(
     one: float, two: float, least: float, *, differs: bool
 ) -> None:
     assert differ(one, two, least) is differ(two, one, least) is differs
-
-
-@settings(
-    max_examples=examples(10),
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(
-    seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)
-)
-@example(seed=1, split_s=10.0, part=1.0)
-@example(seed=2, split_s=3.0, part=0.5)
-def test_answers_are_the_same_with_the_catalogue_and_without(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, split_s: float, part: float
-) -> None:
-    bag_dir = tmp_path_factory.mktemp("bags")
-    write(bag_dir, random_messages(Random(seed)), split_s)
-    plain = memory_of(bag_dir, limits=NAMED)
-    known = with_store(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
-    for where in (None, "kitchen"):
-        question = {
-            "start": BEGIN + 40,
-            "end": BEGIN + 80,
-            "with_start": BEGIN,
-            "with_end": BEGIN + 30,
-            **({} if where is None else {"where": where}),
-        }
-        assert asked(known, bag_dir, "compare", **question) == asked(
-            plain, bag_dir, "compare", **question
-        )

@@ -26,7 +26,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, replied, with_store
+from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -292,17 +292,6 @@ def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
     assert "still_there" not in people
 
 
-def test_low_scores_are_left_out_where_that_is_asked(tmp_path: Path) -> None:
-    messages = [
-        message for at in range(20) for message in scene(at, HERE, [("mug", 3.0, 0.5)], score=0.3)
-    ]
-    write(tmp_path, messages)
-    assert ask(tmp_path, label="mug")["total"] == 1
-    reply = ask(tmp_path, label="mug", min_score=0.5)
-    assert reply["total"] == 0
-    assert "20 times" in reply["notes"][0]
-
-
 def test_a_score_that_no_thing_can_have_is_refused(tmp_path: Path) -> None:
     write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     assert "from 0 to 1" in ask(tmp_path, label="mug", min_score=60)["detail"]
@@ -451,13 +440,6 @@ def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -
     assert "each run of odometry" in reply["notes"][0]
 
 
-def test_a_split_that_is_cut_short_is_no_fault_of_the_answer(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 40, HERE, ("mug", 3.0, 0.5)))
-    path = tmp_path / "rec" / "rec_1.mcap"
-    path.write_bytes(path.read_bytes()[:-400])
-    assert ask(tmp_path, label="mug")["total"] == 1
-
-
 @pytest.mark.parametrize("limit", [1, 2])
 def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(
     tmp_path: Path, limit: int
@@ -542,27 +524,6 @@ QUESTIONS: tuple[dict[str, object], ...] = (
 )
 
 
-@settings(
-    max_examples=examples(15),
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(
-    seed=st.integers(0, 2**32), split_s=st.sampled_from([3.0, 10.0, 1000.0]), part=st.floats(0, 1)
-)
-@example(seed=1, split_s=10.0, part=1.0)
-@example(seed=2, split_s=3.0, part=0.5)
-def test_answers_are_the_same_with_the_catalogue_and_without(
-    tmp_path_factory: pytest.TempPathFactory, seed: int, split_s: float, part: float
-) -> None:
-    bag_dir = tmp_path_factory.mktemp("bags")
-    write(bag_dir, random_messages(Random(seed)), split_s)
-    plain = memory_of(bag_dir, limits=NAMED)
-    known = with_store(memory_of(bag_dir, limits=NAMED), bag_dir, part=part)
-    for question in QUESTIONS:
-        assert answer(known, bag_dir, question) == answer(plain, bag_dir, question)
-
-
 def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
     return asked(memory, bag_dir, "find_things", **question)
 
@@ -611,11 +572,6 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
     notes = ask(tmp_path, label="cup", **window)["notes"]
     assert notes[0].startswith(silent)
     assert notes[-1] == "it was detected 30 times in all, and not once in this window"
-
-
-def test_no_map_is_named_where_there_is_none(tmp_path: Path) -> None:
-    write(tmp_path, [each for at in range(20) for each in scene(at, HERE, [], in_map=False)])
-    assert ask(tmp_path)["frame_id"] == "odom"
 
 
 @pytest.mark.parametrize("scores", [(0.8,), (0.9,), (0.7, 0.8), (0.31, 0.33, 0.35)])

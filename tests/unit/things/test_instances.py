@@ -11,13 +11,11 @@ import pytest
 
 from ros2_memory.analysis.sights import SLICE_NS, Sights, Spot
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.things.instances import Estimate, Instance, estimate, most_at_once
+from ros2_memory.things.instances import Estimate, Instance, estimate
 from ros2_memory.things.labels import Labels
 from tests.support.sights import (
     Message,
     PlacedDetection,
-    joined_of,
-    no_sights,
     sights_of_messages,
     whole,
 )
@@ -178,13 +176,6 @@ def test_a_thing_is_missed_only_where_the_robot_looked_and_it_was_gone() -> None
     assert missed > 0
 
 
-def test_people_are_tracks_and_no_places() -> None:
-    for seed in SEEDS:
-        _, result = home(seed)
-        assert [each.key for each in result.movers] == ["person"]
-        assert most_at_once(result.sights.spots[result.movers[0].spots]) in {2, 3}
-
-
 def bag_of(
     *messages: tuple[tuple[float, float, float], list[PlacedDetection]], start: int = 0
 ) -> Sights:
@@ -200,13 +191,6 @@ def seen_at(
     x: float, y: float, label: str = "mug", score: float | None = None
 ) -> list[PlacedDetection]:
     return [PlacedDetection(label, (x, y, 0.7), score)]
-
-
-def test_a_thing_that_was_not_looked_for_since_is_not_missed() -> None:
-    there = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(3)]
-    away = [bag_of(*[((0.0, 0.0, math.pi), [])] * 10, start=100 + 10 * nth) for nth in range(9)]
-    [mug] = estimate(whole([*there, *away]), LABELS).instances
-    assert (mug.missed_by, mug.looks, mug.chance) == (None, 0, 1.0)
 
 
 def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None:
@@ -232,46 +216,8 @@ def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_alwa
     assert 0.01 < mug.chance < 0.2
 
 
-def test_a_second_place_is_a_second_thing_unless_the_first_was_seen_empty() -> None:
-    one = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(3)]
-    back = (0.0, 0.0, math.pi)
-    two = [bag_of(*[(back, seen_at(-2, 0))] * 10, start=100 + 10 * nth) for nth in range(3)]
-    assert len(estimate(whole([*one, *two]), LABELS).instances) == 2
-    empty = [bag_of(*[(HERE, [])] * 10, start=50)]
-    [mug] = estimate(whole([*one, *empty, *two]), LABELS).instances
-    assert [round(each.x / 1000) for each in mug.stays] == [2, -2]
-    assert mug.stays[0].left is not None
-
-
 def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:
     messages = [(HERE, seen_at(2, 0, "cup" if nth % 10 == 0 else "mug")) for nth in range(100)]
     [mug] = estimate(whole([bag_of(*messages)]), LABELS).instances
     assert mug.key == "mug"
     assert mug.stays[0].also == {"cup": 10}
-
-
-def test_a_thing_that_is_rarely_seen_beside_another_is_a_thing() -> None:
-    mug = seen_at(2, 0)
-    messages = [
-        (HERE, [*mug, *seen_at(2.2, 0, "cup")] if nth % 4 == 0 else mug) for nth in range(99)
-    ]
-    found = estimate(whole([bag_of(*messages)]), LABELS).instances
-    assert [each.key for each in found] == ["cup", "mug"]
-
-
-def test_odometry_of_another_run_is_another_place() -> None:
-    bags = [bag_of(*[(HERE, seen_at(2, 0))] * 10, start=10 * nth) for nth in range(4)]
-    sights, epochs = joined_of(bags, [0, 0, 1, 1])
-    assert len(estimate(sights, LABELS, epochs).instances) == 2
-    assert len(estimate(whole(bags), LABELS).instances) == 1
-
-
-def test_low_scores_do_not_count() -> None:
-    bags = [bag_of(*[(HERE, [*seen_at(2, 0, "mug", 0.9), *seen_at(4, 0, "cup", 0.3)])] * 10)]
-    assert [each.key for each in estimate(whole(bags), LABELS, min_score=0.5).instances] == ["mug"]
-    assert len(estimate(whole(bags), LABELS, min_score=0.3).instances) == 2
-
-
-@pytest.mark.parametrize("bags", [[], [no_sights()]], ids=["none", "empty"])
-def test_nothing_seen_is_no_thing(bags: list[Sights]) -> None:
-    assert estimate(whole(bags), LABELS).instances == []

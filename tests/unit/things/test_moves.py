@@ -111,14 +111,6 @@ def test_a_thing_that_was_moved_a_little_is_where_it_was_seen_last(
     assert reply["things_unchanged"] == 0
 
 
-def test_as_of_a_time_before_a_thing_is_where_it_was_then(tmp_path: Path) -> None:
-    home = Home(3, (0.3, 0.6))
-    write(tmp_path, home.messages)
-    [mug] = ask(tmp_path, "find_things", label="mug", end=LAST_DAY - 1)["things"]
-    assert math.dist((mug["place"]["x"], mug["place"]["y"]), home.before["mug"]) < 0.05
-    assert "moved" not in mug
-
-
 @pytest.mark.parametrize(
     ("bias", "sides"), [(0.0, ""), (0.1, ""), (0.1, "000001"), (0.1, "000011"), (0.1, "010101")]
 )

@@ -13,16 +13,14 @@ from mcp.types import ListToolsResult
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.history.view import AtTime
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import _listed
 from ros2_memory.tools import extra_tools, spec_tools
 from ros2_memory.tools.arguments import (
     At,
-    Last,
     LastMatchArguments,
     MotionArguments,
-    RecapArguments,
 )
 from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
@@ -88,18 +86,6 @@ def test_the_seventeen_tools_of_the_specification_come_first_and_in_its_order() 
     assert len(SPECIFIED) == 17
 
 
-@pytest.mark.parametrize("name", TOOLS)
-def test_a_description_shows_the_braces_of_a_reply_once(name: str) -> None:
-    shown = TOOLS[name].description.partition("Example:")[0]
-    assert "{{" not in shown
-    assert shown.count("{") == shown.count("}")
-
-
-@pytest.mark.parametrize("name", [name for name in TOOLS if name.endswith("_seconds_ago")])
-def test_a_description_names_the_age_that_the_reply_tells(name: str) -> None:
-    assert "age_s" in TOOLS[name].description
-
-
 def test_tools_of_the_specification_alone_require_a_time() -> None:
     alone = build_tools(QuerySettings(), additions=False)
     names = {"get_topic_at_time", "get_position_at", "get_velocity_at", "get_transform_at"}
@@ -154,13 +140,6 @@ def test_arguments_of_a_form_of_their_own_show_it(tool: Tool) -> None:
     }
     for name in shown.keys() & tool.arguments.keys():
         assert shown[name] in str(tool.arguments[name]["description"])
-
-
-def test_examples_of_descriptions_are_calls_without_what_is_optional() -> None:
-    shown = {name: tool.description.partition(" Example: ")[2] for name, tool in TOOLS.items()}
-    assert {name: json.loads(text) for name, text in shown.items() if text} == {
-        name: example(TOOLS[name]) for name in ("find_last_match",)
-    }
 
 
 def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
@@ -402,16 +381,6 @@ def test_a_whole_number_may_be_written_with_a_point() -> None:
     assert callable(
         TOOLS["get_topic_in_last"].question({"topic": "/a", "seconds": 1, "max_samples": 20.0})
     )
-
-
-def test_a_time_argument_replaces_the_moment() -> None:
-    arguments = Signature(MotionArguments, At).parse({"timestamp": 5.0})
-    assert dict(arguments)["moment"] == AtTime(at_s=5.0)
-
-
-def test_a_time_argument_replaces_the_span() -> None:
-    arguments = Signature(RecapArguments, Last).parse({"seconds": 60})
-    assert dict(arguments)["span"] == TimeRange(last_s=60.0)
 
 
 @pytest.mark.parametrize("declaration", DECLARATIONS, ids=lambda each: each.names[0].name)

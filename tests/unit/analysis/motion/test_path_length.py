@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,7 +12,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.odometry import TimedPosition, link
 from ros2_memory.analysis.motion.trajectory import Trajectory
-from ros2_memory.core.geometry import simplified
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
@@ -125,18 +122,6 @@ def test_with_5_mm_of_noise_a_way_is_within_3_percent(speed: float, hertz: int) 
             truth = plain_sum(poses) if seed != 1 else 100 * speed
             assert found.totals.distance_m == pytest.approx(truth, rel=0.03)
             assert found.max_speed == pytest.approx(speed, rel=0.2)
-
-
-def test_a_robot_that_stands_and_goes_is_within_3_percent_too() -> None:
-    round_ = np.concatenate([np.zeros(500), np.linspace(0, 1, 50), np.ones(300)])
-    speeds = np.tile(np.concatenate([round_, np.linspace(1, 0, 50)]), 10)
-    for top in (0.1, 0.5, 2.0):
-        x = np.cumsum(speeds * top / 50)
-        poses = np.column_stack([x, 0 * x, 0 * x])
-        assert summarise(poses, 50).totals.distance_m == pytest.approx(x[-1] - x[0], rel=1e-6)
-        assert summarise(noisy(poses, 0.005), 50).totals.distance_m == pytest.approx(
-            x[-1], rel=0.03
-        )
 
 
 @pytest.mark.parametrize(
@@ -416,23 +401,6 @@ def test_a_jump_is_left_out_and_noted_by_both(tmp_path: Path, recalls: bool) -> 
         assert [note for note in reply["notes"] if note.startswith("1 jump of 50.00 m")]
 
 
-@each_way
-def test_recordings_that_hand_over_are_one_way(tmp_path: Path, recalls: bool) -> None:
-    # Both hold the poses from 4 s to 6 s, the second one with other log times.
-    poses = [(nth / 20, nth / 20) for nth in range(201)]
-    for name, begin, end, late in (("one", 0.0, 6.0, 0), ("two", 4.0, 10.0, 100_000)):
-        (tmp_path / name).mkdir()
-        messages = [
-            odom(BEGIN + round(at * S), x, 0.0, log_time=BEGIN + round(at * S) + late)
-            for at, x in poses
-            if begin <= at <= end
-        ]
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
-    for reply in replies(tmp_path, recalls=recalls):
-        assert reply["distance_m"] == 10.0
-        assert "gap_m" not in reply
-
-
 # Waypoints
 
 
@@ -477,41 +445,3 @@ def test_where_a_robot_stopped_on_its_way_are_waypoints_with_their_times() -> No
         times = [(point.time - BEGIN) / S for point in stops]
         assert min(times) == pytest.approx(10, abs=0.5)
         assert max(times) == pytest.approx(70, abs=0.5)
-
-
-def test_a_way_at_one_speed_is_drawn_by_its_corners_alone() -> None:
-    poses = through([(0, 0, 0), (10, 0, 0), (10, 10, 0)], 0.5, 20)
-    for found in (summarise(poses, 20), summarise(poses, 20, range(0, len(poses), 77))):
-        assert [point.position for point in found.waypoints] == [
-            (0.0, 0.0, 0.0),
-            (10.0, 0.0, 0.0),
-            (10.0, 10.0, 0.0),
-        ]
-
-
-def test_of_very_many_turns_as_many_as_may_be_are_drawn() -> None:
-    poses = shuttles(*[10.0 * (nth % 2) for nth in range(200)], hertz=5)
-    found = summarise(poses, 5)
-    assert len(found.waypoints) == 50
-    assert (found.waypoints[0].time, found.waypoints[-1].position) == (BEGIN, (10.0, 0.0, 0.0))
-    assert found.waypoint_error_m > 0.05
-
-
-@given(st.lists(st.floats(-3.0, 3.0), min_size=2, max_size=80), st.integers(2, 50))
-def test_no_way_back_is_dropped_that_is_longer_than_twice_the_stated_limit(
-    xs: list[float], at_most: int
-) -> None:
-    path = np.array([(x, 0.0, 0.0) for x in xs])
-    clock, ends = np.arange(len(xs), dtype=np.float64), np.array([0, len(xs) - 1])
-    kept, error_m = simplified(path, clock, ends, tolerance_m=0.05, at_most=at_most)
-    assert len(kept) <= at_most
-    for begin, end in pairwise(kept.tolist()):
-        rising = 1.0 if xs[end] >= xs[begin] else -1.0
-        reach = -math.inf
-        for x in xs[begin : end + 1]:
-            held = min(max(rising * x, min(rising * xs[begin], rising * xs[end])), rising * xs[end])
-            reach = max(reach, held)
-            assert reach - held <= 2 * error_m + 1e-9
-        for nth in range(begin, end + 1):
-            there = xs[begin] + (xs[end] - xs[begin]) * (nth - begin) / (end - begin)
-            assert abs(xs[nth] - there) <= 10 * error_m + 1e-9

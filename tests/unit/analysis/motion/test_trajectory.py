@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 import random
 from itertools import accumulate, pairwise
@@ -18,8 +17,6 @@ from ros2_memory.core.geometry import normalised
 from ros2_memory.core.model import Pose, Vector3
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
 from ros2_memory.history.driven_path import length_notes
-from tests.support.rosbags_oracle import messages
-from tests.support.shared_bags import REAL, needs_real
 from tests.support.strategies import points
 from tests.unit.analysis.motion.posed import posed, way_of
 
@@ -100,11 +97,6 @@ def test_a_known_path_has_its_length_duration_and_mean_speed() -> None:
     assert found.avg_speed == 14.0 / 8.0
     assert found.max_speed == 2.0
     assert found.max_speed_from == "positions"
-
-
-def test_poses_at_ten_hertz_each_tell_a_speed() -> None:
-    found = summarise(driven(along_x(0, 0.1, 0.2, 0.7, 0.8, 0.9), 100 * MS), LIMIT_MPS)
-    assert found.max_speed == pytest.approx(5.0)
 
 
 # Of these none is at the origin, where odometry may have begun anew.
@@ -321,55 +313,3 @@ def test_a_long_way_is_drawn_within_its_error(noise_m: float, count: int) -> Non
     assert found.totals.path_sum_m == pytest.approx(path_length(positions), rel=1e-9)
     assert farthest_off(positions[::37], found) <= found.waypoint_error_m + 1e-9
     assert found.waypoint_error_m < (0.05 if noise_m == 0 else 1.0)
-
-
-# Public robots
-
-PUBLIC = {
-    ("plotjuggler_pose_db3", "/pose"): "rosbag2_2020_05_03-09_38_43_0.db3",
-    ("mobrob_odom_mcap", "/odom"): "odom_bag_0.mcap",
-    ("cougars_auv_mcap", "/coug2/dvl/dead_reckoning"): "SO_bag_0.mcap",
-    ("cougars_auv_mcap", "/coug2/gps_odom"): "SO_bag_0.mcap",
-    ("novatel_customtypes_nometa_db3", "/novatel/oem7/odom"): "bestpos.db3",
-}
-
-
-def _recorded(name: str, topic: str) -> list[tuple[int, Pose, float | None]]:
-    poses: list[tuple[int, Pose, float | None]] = []
-    for log_time, message in messages(f"{name}/{PUBLIC[name, topic]}", topic):
-        speed = None
-        if hasattr(message, "twist"):
-            linear = message.twist.twist.linear
-            speed = math.hypot(linear.x, linear.y, linear.z)
-        pose = message.pose
-        while hasattr(pose, "pose"):
-            pose = pose.pose
-        position, q = pose.position, pose.orientation
-        held = Pose((position.x, position.y, position.z), (q.x, q.y, q.z, q.w))
-        poses.append((log_time, held, speed))
-    return poses
-
-
-@needs_real
-@pytest.mark.parametrize(("name", "topic"), PUBLIC)
-def test_ways_of_public_robots_are_as_long_as_independent_tools_say(name: str, topic: str) -> None:
-    expected = json.loads((REAL / "expected.json").read_text())[name]["expected"]["trajectories"]
-    poses = _recorded(name, topic)
-    found = summarise(poses, LIMIT_MPS, 1000)
-    assert found.poses == expected[topic]["n"]
-    assert found.totals.jumps == 0
-    assert found.totals.distance_m == pytest.approx(
-        expected[topic]["path_length_3d_m_log_order"], abs=1e-6
-    )
-    assert farthest_off([pose.position for _, pose, _ in poses], found) <= 0.05
-
-
-@needs_real
-def test_the_nan_positions_of_a_public_robot_are_counted_and_make_no_way() -> None:
-    poses = [
-        (log_time, Pose((p.x, p.y, p.z), None), None)
-        for log_time, message in messages("cougars_auv_mcap/SO_bag_0.mcap", "/coug2/odom")
-        for p in (message.pose.pose.position,)
-    ]
-    found = summarise(poses, LIMIT_MPS)
-    assert (found.invalid, found.poses, found.totals.distance_m) == (3, 0, 0.0)
