@@ -211,6 +211,7 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         large=shared.large,
         store=build_columns(own, shared.reader, of_lake=name),
         settings=reading_of(own, shared.schemas),
+        caches=shared.caches,
     )
     if bag_dir is None:
         return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)
