@@ -214,8 +214,8 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         caches=shared.caches,
     )
     if bag_dir is None:
-        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)
-    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir())
+        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=lambda: False)
+    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir)
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:

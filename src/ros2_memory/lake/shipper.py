@@ -84,7 +84,7 @@ class _Seen:
 
 
 class _Ready(NamedTuple):
-    """A bag of a batch, its rows by table, and what the lake has of it, under other days perhaps."""
+    """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
     of: RobotBags
     bag: ShippedBag
