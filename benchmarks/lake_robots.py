@@ -152,7 +152,7 @@ def questions(facts: Sequence[Mapping[str, JsonValue]]) -> Asks:
         "metres by robot and day": ("trajectory_summary", {**span, "by": "day"}),
         "minutes in a place": ("visits", {"x": x, "y": y, "radius_m": _PLACE_M}),
         "how often": ("find_matches", {**seen, "by": "day"}),
-        "least and greatest": ("find_matches", {**charge, "field": "percentage", "by": "day"}),
+        "how often above a limit": ("find_matches", {**charge, "field": "percentage", "by": "day"}),
         "which robot last saw it": ("find_last_match", seen),
         "where things are": ("find_things", {}),
     }
