@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.columns.fill import Progress
+    from ros2_memory.columns.scanner import Caches
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.model import BagFile, JsonValue
     from ros2_memory.core.regions import Place, Region
@@ -413,35 +414,35 @@ def claim(own: OwnRecordings) -> None:
 
 
 class SharedParts(NamedTuple):
-    """What memories of the same settings can share, with its caches: the reader and the decoder.
+    """What memories of the same settings can share: the reader and the decoder, with their caches.
 
-    `large` is the reader's turn to hold much of a bag. `cache_mb` is what each of the caches of
-    chunks and of columns may take; None: as much as makes answers fast.
+    `large` is the reader's turn to hold much of a bag. `caches` are those of columns.
     """
 
     reader: BagReader
     large: LargeReads
     schemas: Mapping[str, Mapping[str, str]]
     extractor: SchemaExtractor
-    cache_mb: int | None = None
+    caches: Caches
 
 
 def shared_parts(settings: Settings, *, cache_mb: int | None = None) -> SharedParts:
     """Returns what reads and decodes the bags of one memory, or of several.
 
-    `cache_mb` is that of `SharedParts`.
+    `cache_mb` is what each of the caches of chunks and of columns may take; None: as configured.
 
     Raises:
         ConfigError: the reader cannot be built, or the schema map is refused.
     """
+    from ros2_memory.columns.scanner import Caches
     from ros2_memory.extract import SchemaExtractor
 
     schemas = load_message_schemas(settings)
     extractor = SchemaExtractor(schemas, settings.data.max_array_length)
     large = LargeReads()
-    return SharedParts(
-        build_reader(settings, cache_mb=cache_mb, large=large), large, schemas, extractor, cache_mb
-    )
+    reader = build_reader(settings, cache_mb=cache_mb, large=large)
+    caches = Caches.of(cache_mb or settings.store.cache_mb)
+    return SharedParts(reader, large, schemas, extractor, caches)
 
 
 def build_memory(
@@ -483,8 +484,8 @@ def build_memory(
         setting=setting or BAG_DIR_SETTING,
         large=shared.large,
     )
-    cache_mb = shared.cache_mb or settings.store.cache_mb
-    scanner = Scanner(columns, bag_dir, reading_of(settings, schemas), shared.large, cache_mb)
+    reading = reading_of(settings, schemas)
+    scanner = Scanner(columns, bag_dir, reading, shared.large, shared.caches)
     limits = query_settings_of(settings)
     return Memory(index, reader, shared.extractor, clock, limits, scanner, large=shared.large)
 

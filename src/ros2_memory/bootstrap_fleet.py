@@ -211,10 +211,11 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         large=shared.large,
         store=build_columns(own, shared.reader, of_lake=name),
         settings=reading_of(own, shared.schemas),
+        caches=shared.caches,
     )
     if bag_dir is None:
-        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=False)
-    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir())
+        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=lambda: False)
+    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir)
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:

@@ -30,6 +30,7 @@ from tests.support.bags import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 
@@ -398,8 +399,8 @@ def test_threads_that_look_up_at_once_get_one_type() -> None:
 
 
 def cached_texts(stores: Typestores) -> list[bytes]:
-    keys = cast("list[tuple[str, str, bytes]]", [*stores._types._values])
-    return [text for _, _, text in keys]
+    keys = (key for _, key in stores._types._all.values)
+    return [text for _, _, text in cast("Iterator[tuple[str, str, bytes]]", keys)]
 
 
 def test_the_cache_of_definitions_is_bounded_by_their_length() -> None:

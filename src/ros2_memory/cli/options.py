@@ -289,7 +289,7 @@ def open_memory(
 
     Without an index where it `scans` not, because the robots of a fleet are asked.
     `setting` is the one that names the bags, where it is another than `recording.bag_dir`,
-    `cache_mb` as in `SharedParts`.
+    `cache_mb` as in `shared_parts`.
     `verbose` shows log events on stderr. Without it warnings are counted, and `reported_errors`
     prints the count when the command ends.
 

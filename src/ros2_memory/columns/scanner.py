@@ -5,7 +5,7 @@ Of a part that nothing needs not even the times are unpacked.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar, cast
 
@@ -94,6 +94,48 @@ def _whole_days(window: TimeWindow) -> TimeWindow:
     return TimeWindow(first * DAY_NS, stop * DAY_NS).intersect(TimeWindow.everything())
 
 
+@dataclass(frozen=True, slots=True)
+class Caches:
+    """What scanners read last, and what they made of it, within one capacity for all of them.
+
+    So the memory of a server does not grow with the robots that it is asked about.
+
+    Attributes:
+        read: by part and path, unpacked columns; by kind and key, fragments.
+        packed: by part and path, what is known of a column.
+        fetched: by part and path, compressed columns that are wanted next.
+        zones: by topic and path, the zones of its parts.
+        heads: by topic and days, its parts.
+        decoded: by file, topic and window, the tables of bags that are not stored, in groups.
+        pairs: by part, the parents and children of its transforms.
+        clock_steps: by pause and the bags beside it, the steps of the clock in it.
+        statics: by session and topics, the static transforms of a timeline.
+        sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
+    """
+
+    read: ByteLru[object]
+    packed: ByteLru[Packed]
+    fetched: ByteLru[bytes] = field(default_factory=lambda: ByteLru(_FETCHED_BYTES))
+    zones: ByteLru[tuple[Zones, int]] = field(default_factory=lambda: ByteLru(32 << 20))
+    heads: ByteLru[_Heads] = field(default_factory=lambda: ByteLru(16 << 20))
+    decoded: ByteLru[list[list[Table]]] = field(default_factory=lambda: ByteLru(DECODED_BYTES))
+    pairs: ByteLru[frozenset[Pair]] = field(default_factory=lambda: ByteLru(4 << 20))
+    clock_steps: ByteLru[tuple[ClockStep, ...]] = field(default_factory=lambda: ByteLru(1 << 20))
+    statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = field(
+        default_factory=lambda: ByteLru(1 << 20)
+    )
+    sights: ByteLru[bytes] = field(default_factory=lambda: ByteLru(16 << 20))
+
+    @classmethod
+    def of(cls, cache_mb: int = 64) -> Caches:
+        """Returns caches; columns and fragments take so much memory in them, in MiB."""
+        return cls(ByteLru(cache_mb << 20), ByteLru((cache_mb << 20) // 5))
+
+    def apart(self) -> Caches:
+        """Returns caches with keys of their own, within the capacities of these."""
+        return Caches(**{one.name: getattr(self, one.name).apart() for one in fields(self)})
+
+
 class Scanner:
     """What is stored of one bag directory, and what was read of it last. Thread-safe.
 
@@ -102,14 +144,10 @@ class Scanner:
         bag_dir: the bag directory.
         settings: what fragments depend on besides the bags, as a text.
         large: the turn to hold much of a bag, which large columns need, too.
-        cache_mb: how much unpacked columns and fragments may take in memory, in MiB.
+        caches: those of all scanners; None where it has some of its own.
 
     Attributes:
-        decoded: by file, topic and window, the tables of bags that are not stored, in groups.
-        pairs: by part, the parents and children of its transforms.
-        clock_steps: by pause and the bags beside it, the steps of the clock in it.
-        statics: by session and topics, the static transforms of a timeline.
-        sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
+        caches: what was read last.
         things: by settings, what was estimated of all bags of a timeline.
     """
 
@@ -119,32 +157,23 @@ class Scanner:
         bag_dir: Path,
         settings: str = "",
         large: LargeReads | None = None,
-        cache_mb: int = 64,
+        caches: Caches | None = None,
     ) -> None:
         self.store = store
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
-        self._read: ByteLru[object] = ByteLru(cache_mb << 20)
-        self._known: ByteLru[Packed] = ByteLru((cache_mb << 20) // 5)
-        self._fetched: ByteLru[bytes] = ByteLru(_FETCHED_BYTES)
-        self._all_zones: ByteLru[tuple[Zones, int]] = ByteLru(32 << 20)
-        self._heads: ByteLru[_Heads] = ByteLru(16 << 20)
-        self.decoded: ByteLru[list[list[Table]]] = ByteLru(DECODED_BYTES)
-        self.pairs: ByteLru[frozenset[Pair]] = ByteLru(4 << 20)
-        self.clock_steps: ByteLru[tuple[ClockStep, ...]] = ByteLru(1 << 20)
-        self.statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = ByteLru(1 << 20)
-        self.sights: ByteLru[bytes] = ByteLru(16 << 20)
+        self.caches = Caches.of() if caches is None else caches.apart()
         self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
         self._settings = settings
         self._fragments: dict[str, object] = {}
         # They follow from columns alone, and are of use where these were dropped.
-        self._outlines = Fragments(store, OUTLINE, "", self._read)
+        self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments[OUTLINE.name] = self._outlines
 
     def fragments(self, kind: Kind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            made = Fragments(self.store, kind, self._settings, self._read)
+            made = Fragments(self.store, kind, self._settings, self.caches.read)
             self._fragments.setdefault(kind.name, made)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
@@ -188,10 +217,10 @@ class Scanner:
             return []
         state = coverage.state
         span = TimeWindow.everything()
-        known = self._heads.get((topic, span))
+        known = self.caches.heads.get((topic, span))
         if known is None and (days := _whole_days(window)).stop - days.start <= _FEW_DAYS_NS:
             span = days
-            known = self._heads.get((topic, span))
+            known = self.caches.heads.get((topic, span))
         if known is None or known.coverage is not coverage:
             failures = self.store.failures
             heads: list[PartHead] = []
@@ -203,7 +232,7 @@ class Scanner:
                 heads.sort(key=lambda head: (head.first, head.number))
             known = _Heads.of(heads, coverage)
             if self.store.failures == failures:
-                self._heads.put((topic, span), known, 1000 + _HEAD_BYTES * len(heads))
+                self.caches.heads.put((topic, span), known, 1000 + _HEAD_BYTES * len(heads))
         return known.within(window)
 
     def matching(
@@ -235,7 +264,7 @@ class Scanner:
         """Returns the zones of a column in some parts of a topic."""
         assert self.store is not None  # noqa: S101 - there are no parts without one
         key = (topic, path)
-        known, newest = self._all_zones.get(key) or (Zones.of([], []), 0)
+        known, newest = self.caches.zones.get(key) or (Zones.of([], []), 0)
         asked = int(parts.max(initial=0))
         if asked > newest:
             failures = self.store.failures
@@ -243,7 +272,7 @@ class Scanner:
             if self.store.failures == failures:
                 # Not each part has each column, so what was asked for counts, too.
                 newest = max([asked, *known.parts[-1:].tolist()])
-                self._all_zones.put(key, (known, newest), known.memory_bytes)
+                self.caches.zones.put(key, (known, newest), known.memory_bytes)
         return known.among(parts)
 
     def part(
@@ -276,7 +305,7 @@ class Scanner:
             partial(self._outlines.get, _outline_key(head)),
             messages=head.messages,
             dropped=head.dropped,
-            memory=self._read,
+            memory=self.caches.read,
             number=head.number,
         )
         counting = coverage.of_part(head.number, head.bags)
@@ -303,7 +332,7 @@ class Scanner:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
         assert self.store is not None  # noqa: S101 - as above
-        known = self._known.get((head.number, path))
+        known = self.caches.packed.get((head.number, path))
         if known is None:
             numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
             failures = self.store.failures
@@ -315,7 +344,7 @@ class Scanner:
                 raise GoneError
             found.update(dict.fromkeys(there, _ABSENT))
             for number, packed in found.items():
-                self._known.put((number, path), packed, _COLUMN_BYTES)
+                self.caches.packed.put((number, path), packed, _COLUMN_BYTES)
             known = found.get(head.number)
             if known is None:
                 raise GoneError
@@ -325,7 +354,7 @@ class Scanner:
         self, head: PartHead, path: str, packed: Packed, together: Sequence[PartHead]
     ) -> Column:
         key = (head.number, path)
-        known = self._read.get(key)
+        known = self.caches.read.get(key)
         if known is not None:
             return cast("Column", known)
         data = b""
@@ -337,7 +366,7 @@ class Scanner:
                 self._large.acquire()
             data = decompressed(stored) if stored else b""
         column = unpack(packed.codec, packed.count, packed.zone.least, data)
-        self._read.put(key, column, column_bytes(column))
+        self.caches.read.put(key, column, column_bytes(column))
         return column
 
     def _stored(self, head: PartHead, path: str, together: Sequence[PartHead]) -> bytes:
@@ -349,15 +378,15 @@ class Scanner:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
         assert self.store is not None  # noqa: S101 - as above
-        stored = self._fetched.get((head.number, path))
+        stored = self.caches.fetched.get((head.number, path))
         if stored is None:
             numbers = [part.number for part in together if part.topic == head.topic]
             nth = numbers.index(head.number) if head.number in numbers else 0
-            goes_on = nth > 0 and self._read.get((numbers[nth - 1], path)) is not None
+            goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
             numbers = numbers[nth:] if goes_on else [head.number]
             found = self.store.part_data(numbers, path, _FETCHED_BYTES // 2)
             for number, data in found.items():
-                self._fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
+                self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
             stored = found.get(head.number)
             if stored is None:
                 raise GoneError

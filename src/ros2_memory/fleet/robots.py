@@ -105,7 +105,7 @@ class Robot:
         bag_dir: the bag directory, which need not exist.
         build: what builds its memory.
         lake: its memory over what was shipped to a lake.
-        is_mounted: whether there is a memory besides that of the lake.
+        is_mounted: returns whether there are bags besides those of the lake; it may hang.
     """
 
     name: str
@@ -113,7 +113,7 @@ class Robot:
     build: Callable[[], Memory]
     _: KW_ONLY
     lake: Memory | None = None
-    is_mounted: bool = True
+    is_mounted: Callable[[], bool] = lambda: True
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
     _memory: Memory | None = field(default=None, init=False)
 
@@ -149,7 +149,7 @@ class Robot:
 
         if not self._has_bags():
             # A folder that is there says best why nothing is, where nothing was shipped either.
-            return answer(of_lake=not self.is_mounted or lake.index.snapshot().latest is not None)
+            return answer(of_lake=not self.is_mounted() or lake.index.snapshot().latest is not None)
         is_lakes = _lacks(self.memory(), lake, since)
         try:
             return answer(of_lake=is_lakes)
@@ -168,7 +168,7 @@ class Robot:
 
     def _has_bags(self) -> bool:
         """Returns whether there are bags besides those of the lake, or may be."""
-        if not self.is_mounted:
+        if not self.is_mounted():
             return False
         snapshot = self.memory().index.snapshot()
         return bool(snapshot.bags) or snapshot.problem is not None

@@ -189,14 +189,14 @@ def _step_in(view: View, pause: Pause) -> ClockStep | None:
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
     key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
-    known = scanner.clock_steps.get(key)
+    known = scanner.caches.clock_steps.get(key)
     if known is None:
         with view.notes.isolated():
             step = _read_step(view, topic, (pause.start, pause.end))
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         known = () if step is None else (step,)
         if is_final:
-            scanner.clock_steps.put(key, known, _STEPS_BYTES)
+            scanner.caches.clock_steps.put(key, known, _STEPS_BYTES)
     return next(iter(known), None)
 
 

@@ -253,7 +253,7 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
         return known
     topics = _recorded(view, view.limits.tf_static_topics)
     key = (among, topics)
-    kept = scanner.statics.get(key)
+    kept = scanner.caches.statics.get(key)
     if kept is not None and kept[0] is timeline:
         sessions.statics[among] = kept[1]
         return kept[1]
@@ -269,7 +269,7 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
     sessions.statics[among] = static
     # What was noted must be noted in each answer.
     if view.notes.added == before and not view.call.used_active:
-        scanner.statics.put(key, (timeline, static), 1000 + 600 * len(static))
+        scanner.caches.statics.put(key, (timeline, static), 1000 + 600 * len(static))
     return static
 
 
@@ -429,10 +429,10 @@ def _pairs_in(
             yield _pairs_of(view, _messages_in(view, rows, among))
         elif among is None or sessions_of(view).folder(rows.recording) in among:
             part = rows.part
-            known = None if part is None else scanner.pairs.get(part)
+            known = None if part is None else scanner.caches.pairs.get(part)
             pairs = _pairs_of_rows(view, rows) if known is None else known
             if part is not None:
-                scanner.pairs.put(part, pairs, 200 + 200 * len(pairs))
+                scanner.caches.pairs.put(part, pairs, 200 + 200 * len(pairs))
             yield pairs
 
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
+    from ros2_memory.columns.scanner import Caches
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
@@ -462,6 +463,7 @@ def lake_memory(
     large: LargeReads,
     store: ColumnStore | None = None,
     settings: str = "",
+    caches: Caches | None = None,
 ) -> Memory:
     """Returns what a bag directory's memory is, but for the index and what reads bags.
 
@@ -473,6 +475,7 @@ def lake_memory(
         large: the turn to hold much of a bag.
         store: of the columns of its bags, which are made again from the lake; None for none.
         settings: what follows from bags depends on, as a text.
+        caches: those of the columns of all robots.
     """
     return Memory(
         index,
@@ -481,6 +484,6 @@ def lake_memory(
         index.clock,
         # Nothing is recorded here, and nothing deleted.
         replace(limits, kept=None, recording="", screened=False),
-        Scanner(store, index.bag_dir, settings, large),
+        Scanner(store, index.bag_dir, settings, large, caches),
         large=large,
     )

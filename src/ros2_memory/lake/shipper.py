@@ -8,8 +8,13 @@ anywhere, and one that runs again, leave every row once; only the lake is asked 
 
 from __future__ import annotations
 
+import os
+import threading
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import pyarrow as pa
 
 from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
@@ -32,7 +37,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
 from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
-from ros2_memory.lake.tables import TABLES, Row, ShippedBag, day_of, of_bags, overlapping
+from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
 if TYPE_CHECKING:
@@ -47,9 +52,10 @@ if TYPE_CHECKING:
 log = get_logger(__name__)
 
 MOST_BAGS: Final = 2_000
-MOST_ROWS: Final = 200_000
 MOST_BYTES: Final = 64 << 20
-"""Of one batch: its rows are in memory, and their packed messages, until it is committed."""
+"""Of one batch: its rows are in memory, as Arrow has them, until it is committed."""
+PATIENCE_S: Final = 30.0
+"""How long a bag directory may take to show that it is there."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
 """A bag lies in the lake up to so far from where it begins and ends now: more of it counted."""
 
@@ -82,7 +88,7 @@ class _Ready(NamedTuple):
 
     of: RobotBags
     bag: ShippedBag
-    rows: Mapping[str, Sequence[Row]]
+    rows: Mapping[str, pa.Table]
     replaced: Sequence[ShippedBag]
 
 
@@ -99,6 +105,7 @@ class Shipper:
         before_commit: called with whether the batch is full, else waits until one is allowed again.
         alive: called for each bag.
         most_bags: of one commit.
+        patience_s: a bag directory that takes longer to be looked into is passed over.
     """
 
     lake: LakeTables
@@ -110,6 +117,7 @@ class Shipper:
     before_commit: Callable[[bool], object] = lambda _: None
     alive: Callable[[], object] = lambda: None
     most_bags: int = MOST_BAGS
+    patience_s: float = PATIENCE_S
 
     def __post_init__(self) -> None:
         """Has everything looked at, in the bag directories and in the lake."""
@@ -123,15 +131,14 @@ class Shipper:
         """
         done = Shipped()
         batch: list[_Ready] = []
-        rows = size = 0
+        size = 0
         for robot in [robot for robot in self.robots if self._forget(robot, done)]:
             for ready in robot.ready(self, done):
                 batch.append(ready)
-                rows += sum(map(len, ready.rows.values()))
-                size += sum(len(cast("bytes", row["packed"])) for row in ready.rows["channels"])
-                if len(batch) >= self.most_bags or rows >= MOST_ROWS or size >= MOST_BYTES:
+                size += sum(rows.nbytes for rows in ready.rows.values())
+                if len(batch) >= self.most_bags or size >= MOST_BYTES:
                     self._commit(batch, done, is_full=True)
-                    batch, rows, size = [], 0, 0
+                    batch, size = [], 0
         if batch:
             self._commit(batch, done, is_full=False)
         return done
@@ -152,6 +159,12 @@ class Shipper:
         Raises:
             LakeError: the lake cannot be written; what is left is done when it is opened again.
         """
+        if not robot.answers(self.patience_s):
+            done.problems.append(
+                f"{robot.name}: {robot.bag_dir} does not answer: is its disk reachable? Until it "
+                "does, nothing of this robot is shipped"
+            )
+            return False
         try:
             wanted = [Tombstone.of(robot.name, one) for one in read_forgettings(robot.bag_dir)]
         except (OSError, ValueError) as error:
@@ -194,9 +207,9 @@ class Shipper:
         rows = 0
         try:
             for name, table in TABLES.items():
-                filled = table.filled([row for ready in batch for row in ready.rows[name]])
-                rows += filled.num_rows
-                self.lake.replace(name, condition, filled)
+                whole = table.sorted(pa.concat_tables([ready.rows[name] for ready in batch]))
+                rows += whole.num_rows
+                self.lake.replace(name, condition, whole)
         except LakeError:
             self._look_again()
             raise
@@ -225,6 +238,23 @@ class RobotBags:
     memory: Memory
     reader: BagReader
     config: str
+    _looking: threading.Thread | None = field(default=None, init=False)
+
+    def answers(self, patience_s: float) -> bool:
+        """Returns whether the bag directory can be looked into.
+
+        One that hangs, as a mount does whose robot is gone, blocks one thread, however often asked.
+        """
+        is_new = self._looking is None
+        if self._looking is None:
+            # A daemon: it must not keep the program from ending.
+            self._looking = threading.Thread(target=_look_into, args=(self.bag_dir,), daemon=True)
+            self._looking.start()
+        self._looking.join(patience_s if is_new else 0.0)
+        if self._looking.is_alive():
+            return False
+        self._looking = None
+        return is_new or self.answers(patience_s)
 
     @property
     def bag_dir(self) -> Path:
@@ -280,7 +310,9 @@ class RobotBags:
                 of_file = by_file.get(shipped.file)
                 if of_file is not None and self._is_cut(of_file, bag):
                     continue
-                rows = rows_of(self.memory, bag, shipped, shipper.messages)
+                found = rows_of(self.memory, bag, shipped, shipper.messages)
+                # As Python has them, they take many times as much.
+                rows = {name: table.filled(found[name]) for name, table in TABLES.items()}
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
                 continue
@@ -422,6 +454,12 @@ class RobotBags:
                 f"{self.name}: no receipts can be written into {self.bag_dir} "
                 f"({error.strerror or error}): its recorder cannot wait for shipping"
             )
+
+
+def _look_into(folder: Path) -> None:
+    """Reads an entry of a folder; why it cannot be read is found out by whoever needs it."""
+    with suppress(OSError), os.scandir(folder) as entries:
+        next(entries, None)
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
@@ -25,33 +26,49 @@ class ByteLru(Generic[T]):
     """
 
     def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._values: OrderedDict[Hashable, tuple[T, int]] = OrderedDict()
-        self._bytes = 0
-        self._lock = threading.Lock()
+        self._all: _Values[T] = _Values(capacity)
+
+    def apart(self) -> ByteLru[T]:
+        """Returns a cache with keys of its own, within the capacity of this one."""
+        found = ByteLru[T](0)
+        found._all = self._all
+        return found
 
     def get(self, key: Hashable) -> T | None:
         """Returns the value of the key, or None."""
-        with self._lock:
-            entry = self._values.get(key)
+        with self._all.lock:
+            entry = self._all.values.get((self, key))
             if entry is None:
                 return None
-            self._values.move_to_end(key)
+            self._all.values.move_to_end((self, key))
             return entry[0]
 
     def put(self, key: Hashable, value: T, size: int) -> None:
         """Caches `value`, which takes about `size` bytes, and drops the least recently used."""
-        with self._lock:
-            replaced = self._values.pop(key, None)
+        every = self._all
+        with every.lock:
+            replaced = every.values.pop((self, key), None)
             if replaced is not None:
-                self._bytes -= replaced[1]
-            if size > self._capacity:
+                every.bytes -= replaced[1]
+            if size > every.capacity:
                 return
-            self._values[key] = (value, size)
-            self._bytes += size
-            while self._bytes > self._capacity:
-                _, (_, dropped) = self._values.popitem(last=False)
-                self._bytes -= dropped
+            every.values[(self, key)] = (value, size)
+            every.bytes += size
+            while every.bytes > every.capacity:
+                _, (_, dropped) = every.values.popitem(last=False)
+                every.bytes -= dropped
+
+
+@dataclass(slots=True)
+class _Values(Generic[T]):
+    """The values of caches that share a capacity, by cache and key; last the one used last."""
+
+    capacity: int
+    values: OrderedDict[tuple[ByteLru[T], Hashable], tuple[T, int]] = field(
+        default_factory=OrderedDict
+    )
+    bytes: int = 0
+    lock: threading.Lock = field(default_factory=threading.Lock)
 
 
 def shared(channel: Channel) -> Channel:

@@ -309,12 +309,12 @@ class Watching:
         # Parts, as these, are of certain recordings.
         bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
         key = (around.window.start, followed, tuple(bags))
-        data = scanner.sights.get(key)
+        data = scanner.caches.sights.get(key)
         if data is None:
             before = self._view.notes.added
             data = self._read(around)
             if self._view.notes.added == before:
-                scanner.sights.put(key, data, 200 + len(data) + 100 * len(bags))
+                scanner.caches.sights.put(key, data, 200 + len(data) + 100 * len(bags))
         return data
 
     def _follows_from(self, around: _Around) -> str:

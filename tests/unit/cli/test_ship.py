@@ -142,7 +142,7 @@ def test_full_batches_do_not_wait_for_each_other(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr("ros2_memory.lake.shipper.MOST_ROWS", 1)
+    monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
     waited: list[float] = []
     monkeypatch.setattr(ship_module, "_wait", waited.append)
     settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]

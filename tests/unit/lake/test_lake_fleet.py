@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import shutil
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 from random import Random
@@ -18,7 +19,7 @@ from ros2_memory import cli
 from ros2_memory.bootstrap_fleet import build_fleet, engine_of
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
 from ros2_memory.index.snapshot import Snapshot
@@ -57,13 +58,33 @@ def test_robots_whose_bags_are_gone_or_were_never_shipped_are_answered_from_wher
     ship_from(tmp_path)
     shutil.rmtree(tmp_path / "hall")
     fleet = served(tmp_path)
-    assert [robot.is_mounted for robot in fleet.robots.values()] == [False, True]
+    assert [robot.is_mounted() for robot in fleet.robots.values()] == [False, True]
     found = reply(fleet, "find_last_match", CUP)
     assert {row["robot_name"] for row in found["matches"]} == {"hall", "attic"}
     [note] = found["notes"]
     assert note.startswith("from the lake, which has what was shipped: hall up to ")
     assert "attic" not in note
     assert reply(fleet, "find_things", {"robot": "attic"})["robot_name"] == "attic"
+
+
+def test_a_server_starts_though_the_folder_of_a_robot_hangs_and_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("hall", "attic"):
+        write_bag(tmp_path / name, 0)
+    ship_from(tmp_path)
+    released, is_dir = threading.Event(), Path.is_dir
+
+    def hanging(path: Path) -> bool:
+        if path == tmp_path / "hall":
+            released.wait()
+        return is_dir(path)
+
+    monkeypatch.setattr(Path, "is_dir", hanging)
+    found = reply(served(tmp_path), "find_last_match", CUP, Call(Deadline.after(12.0)))
+    released.set()
+    assert found["robots_failed"] == {"hall": "timeout"}
+    assert [row["robot_name"] for row in found["matches"]] == ["attic"]
 
 
 @pytest.mark.parametrize("left", [0, 1], ids=["none", "the newest"])

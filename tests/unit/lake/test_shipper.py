@@ -3,9 +3,11 @@
 import os
 import random
 import shutil
+import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
@@ -25,6 +27,7 @@ from tests.support.lakes import (
     shipping,
     write_bag,
 )
+from tests.support.processes import until
 
 ROBOTS = ("hall", "kitchen")
 BAGS = 3
@@ -76,7 +79,7 @@ def _snapshots(folder: Path) -> dict[str, int]:
         return {name: len(lake.current(name).snapshots()) for name in TABLES}
 
 
-def test_a_batch_has_as_many_bytes_of_messages_as_memory_may_hold(
+def test_a_batch_has_as_many_bytes_of_rows_as_memory_may_hold(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with shipping(tmp_path, [robot_bags("hall", fleet / "hall")], most_bags=100) as shipper:
@@ -85,6 +88,30 @@ def test_a_batch_has_as_many_bytes_of_messages_as_memory_may_hold(
         shipper.before_commit = commits.append
         assert shipper.run().bags == len(commits) == BAGS
         assert all(commits)
+
+
+def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    released, scandir = threading.Event(), os.scandir
+
+    def hanging(folder: Any = ".") -> Any:
+        if folder == fleet / "hall":
+            released.wait()
+        return scandir(folder)
+
+    monkeypatch.setattr("ros2_memory.lake.shipper.os.scandir", hanging)
+    robots = [robot_bags(name, fleet / name) for name in ("hall", "kitchen")]
+    with shipping(tmp_path, robots) as shipper:
+        shipper.patience_s = 3.0
+        for bags in (BAGS, 0):
+            done = shipper.run()
+            assert done.bags == bags
+            [problem] = done.problems
+            assert problem.startswith("hall: ")
+            assert "does not answer" in problem
+        released.set()
+        assert until(lambda: shipper.run().bags or None) == BAGS
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(

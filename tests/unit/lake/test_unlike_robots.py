@@ -115,7 +115,7 @@ def test_every_question_is_answered_by_a_lake_as_by_the_bags_or_refused(world: W
 
 def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     asked: dict[str, object] = {"topic": "/vision/*/*", "condition_type": "contains", "value": "x"}
-    unmounted = [replace(robot, is_mounted=False) for robot in world.both().robots.values()]
+    unmounted = [replace(robot, is_mounted=lambda: False) for robot in world.both().robots.values()]
     *_, note = reply(Fleet(unmounted, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
         name: robot.memory().index.snapshot().latest for name, robot in world.lake.robots.items()
