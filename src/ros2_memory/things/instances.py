@@ -154,7 +154,7 @@ class Estimate:
     """The name to show of each key."""
     cells: Cells
     evidence: dict[tuple[str, int], Evidence]
-    """By key and epoch: the evidence for all places."""
+    """By key and epoch: the evidence for the places of things."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
     """Of each spot, the first of `stays` that has it; -1 where none has."""
@@ -268,11 +268,16 @@ def estimate(
     _fold(groups, seen, keys, go_on)
     instances: list[Instance] = []
     movers: list[Mover] = []
+    evidence: dict[tuple[str, int], Evidence] = {}
     for group in groups:
         linked = _link(group, seen, go_on)
         _add_poor(group, linked, seen)
         if not _moves_by_itself(group, linked):
             instances += linked
+            if group.evidence is not None:
+                # Most places are of false detections.
+                places = {stay.place for each in linked for stay in each.stays}
+                evidence[group.key, group.epoch] = group.evidence.among(places)
         elif _is_seen(group, seen):
             movers.append(Mover(group.key, group.epoch, group.rows))
     for each in instances:
@@ -288,11 +293,7 @@ def estimate(
         hit_starts=seen.starts,
         names=names,
         cells=seen.cells,
-        evidence={
-            (group.key, group.epoch): group.evidence
-            for group in groups
-            if group.evidence is not None
-        },
+        evidence=evidence,
     )
     for each in instances:
         each.chance, each.looks, each.missed_by = found.missing(each, each.stays[-1])

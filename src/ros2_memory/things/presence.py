@@ -32,7 +32,7 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.core.timebase import Ns
 
@@ -212,7 +212,20 @@ class Evidence(NamedTuple):
     def at(self, place: int) -> Evidence:
         """Returns that for one place."""
         ends = _keys(np.array([place, place + 1]), np.zeros(2, np.int64))
-        looks, blind = (slice(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind))
+        looks, blind = (
+            np.arange(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind)
+        )
+        return self._some(looks, blind)
+
+    def among(self, places: Iterable[int]) -> Evidence:
+        """Returns that for some places."""
+        some = np.array([*places], np.int64)
+        looks, blind = (
+            np.flatnonzero(np.isin(_place(keys), some)) for keys in (self.looks, self.blind)
+        )
+        return self._some(looks, blind)
+
+    def _some(self, looks: Ints, blind: Ints) -> Evidence:
         return Evidence(
             self.looks[looks],
             self.cell[looks],
