@@ -111,6 +111,7 @@ class Caches:
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
+        things: by settings, what was estimated of all bags of a timeline.
     """
 
     read: ByteLru[object]
@@ -125,6 +126,7 @@ class Caches:
         default_factory=lambda: ByteLru(1 << 20)
     )
     sights: ByteLru[bytes] = field(default_factory=lambda: ByteLru(16 << 20))
+    things: ByteLru[tuple[Timeline, object]] = field(default_factory=lambda: ByteLru(64 << 20))
 
     @classmethod
     def of(cls, cache_mb: int = 64) -> Caches:
@@ -148,7 +150,6 @@ class Scanner:
 
     Attributes:
         caches: what was read last.
-        things: by settings, what was estimated of all bags of a timeline.
     """
 
     def __init__(
@@ -163,7 +164,6 @@ class Scanner:
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
         self.caches = Caches.of() if caches is None else caches.apart()
-        self.things: ByteLru[tuple[Timeline, object]] = ByteLru(8)
         self._settings = settings
         self._fragments: dict[str, object] = {}
         # They follow from columns alone, and are of use where these were dropped.

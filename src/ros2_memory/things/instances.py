@@ -165,6 +165,13 @@ class Estimate:
         for nth, (_, stay) in reversed([*enumerate(self.stays)]):
             self.stay_of[stay.spots] = nth
 
+    @property
+    def memory_bytes(self) -> int:
+        """About how much memory it takes."""
+        tables = sum(table.nbytes for table in (*self.sights.tables, self.hits))
+        looks = len(self.cells.slice) + sum(len(each.looks) for each in self.evidence.values())
+        return tables + 100 * looks
+
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
         """Returns which of some spots are of slices that reach into a window and end before a time.
 

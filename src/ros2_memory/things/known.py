@@ -41,6 +41,8 @@ _FEWER: Final = 4
 """Where that takes longer, so many times fewer are looked at, from then on."""
 _QUICK: Final = 8
 """Where it takes less than this part of it, twice as many are looked at the next time."""
+_KEPT_BYTES: Final = 500
+"""About how much memory it takes to remember a number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,14 +224,16 @@ class _Loader:
     @property
     def _remembered(self) -> KnownThings | Ns | None:
         """The things that are known, or since when there are too many sightings."""
-        before = self._view.memory.columns.things.get(self._own)
+        before = self._view.memory.columns.caches.things.get(self._own)
         if before is None or before[0] is not self._view.timeline:
             return None
         return before[1] if isinstance(before[1], KnownThings | int) else None
 
     def _remember(self, found: KnownThings | Ns) -> None:
         if not self._view.call.used_active and self._view.notes.added == self._noted:
-            self._view.memory.columns.things.put(self._own, (self._view.timeline, found), 1)
+            size = found.estimate.memory_bytes if isinstance(found, KnownThings) else _KEPT_BYTES
+            kept = self._view.timeline, found
+            self._view.memory.columns.caches.things.put(self._own, kept, size)
 
     def _made(self) -> KnownThings:
         parts, crowded = self._gathered
@@ -256,12 +260,12 @@ class _Loader:
 
     @property
     def _most_spots(self) -> int:
-        kept = self._view.memory.columns.things.get(self._key)
+        kept = self._view.memory.columns.caches.things.get(self._key)
         return kept[1] if kept is not None and isinstance(kept[1], int) else _MOST_SPOTS
 
     def _remember_most(self, most: int) -> None:
         kept = self._view.timeline, most
-        self._view.memory.columns.things.put(self._key, kept, 1)
+        self._view.memory.columns.caches.things.put(self._key, kept, _KEPT_BYTES)
 
     @cached_property
     def _gathered(self) -> tuple[list[list[Stretch]], bool]:
