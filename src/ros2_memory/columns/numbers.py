@@ -68,16 +68,18 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     shape, values = shape_of(table, extractor), Values(table)
     if shape is None:
         return None
+    parts: list[FieldNumbers] = []
     try:
-        parts = [_numbers_of(values, *of) for of in _leaves(shape.find(field))]
+        for leaf, limits in _leaves(shape.find(field)):
+            part = _numbers_of(values, leaf, limits)
+            if part is None:
+                return None
+            parts.append(part)
     except UnknownShapeError:
         return None
-    known = [part for part in parts if part is not None]
-    if len(known) < len(parts):
-        return None
-    if not known:
+    if not parts:
         return FieldNumbers(np.empty(0, np.int64), np.empty(0, np.int64), 0.0)
-    return known[0] if len(known) == 1 else _joined(known)
+    return parts[0] if len(parts) == 1 else _joined(parts)
 
 
 def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:

@@ -197,25 +197,23 @@ def lazy_columns(
         column: returns the column, or the owners, at a path of `Layout.slots`.
         dropped: the paths of those that there are not.
     """
-    columns = (
-        [path for path in layout.columns if path not in dropped] if dropped else layout.columns
-    )
-    return Lazily(columns, column), _lazy_elements(layout, column, dropped, "")
+    return _lazy_level(layout, column, frozenset(dropped), "")
 
 
-def _lazy_elements(
-    inside: Layout, column: Callable[[str], Column], dropped: Collection[str], around: str
-) -> Mapping[str, Elements]:
-    """Returns the sequences of a layout inside of another one; `around` is its path and a dot."""
+def _lazy_level(
+    level: Layout, column: Callable[[str], Column], dropped: Collection[str], around: str
+) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
+    """Returns the columns and sequences of one level; `around` is its path and a dot."""
+
+    def whole(name: str) -> str:
+        return f"{around}{name}".rstrip(".")
 
     def elements(path: str) -> Elements:
-        whole, inner = f"{around}{path}", inside.sequences[path]
-        return Elements(
-            cast("IntArray", column(f"{whole}#")),
-            Lazily(inner.columns, lambda name: column(f"{whole}.{name}".rstrip("."))),
-            _lazy_elements(inner, column, dropped, f"{whole}."),
-        )
+        owners = cast("IntArray", column(f"{around}{path}#"))
+        inner = _lazy_level(level.sequences[path], column, dropped, f"{around}{path}.")
+        return Elements(owners, *inner)
 
-    return Lazily(
-        [path for path in inside.sequences if f"{around}{path}#" not in dropped], elements
-    )
+    # Owners that are all equal take no bytes: they stay where the columns beside them are dropped.
+    columns = [name for name in level.columns if whole(name) not in dropped]
+    sequences = [path for path in level.sequences if f"{around}{path}#" not in dropped]
+    return Lazily(columns, lambda name: column(whole(name))), Lazily(sequences, elements)

@@ -69,7 +69,7 @@ class LargeReads:
             self._end(block)
 
     @contextmanager
-    def set_aside(self) -> Iterator[None]:
+    def exempt(self) -> Iterator[None]:
         """Within the block this thread never waits: for what is done under a lock."""
         before, self._own.block = self._block, None
         try:

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
-from ros2_memory.bag_dir.moment_file import Outcome, PendingRequest, stored_moments_in
+from ros2_memory.bag_dir.moment_file import (
+    Outcome,
+    PendingRequest,
+    StoredMoment,
+    stored_moments_in,
+)
 from ros2_memory.bag_dir.state_files import TRIGGERS
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.text import abbreviate
@@ -87,7 +92,7 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
         RefusedError: they cannot be listed.
     """
     try:
-        stored = {each.folder.name: each for each in stored_moments_in(memory.index.bag_dir)}
+        stored = {each.folder.name: each for each in _moments_of(memory)}
     except OSError as error:
         raise RefusedError(unlisted(error)) from error
     if name not in stored:
@@ -100,20 +105,23 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
 def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """Returns the newest saved moments, the newest first; `now` is what "ago" counts from.
 
-    Where one recording alone answers, those that hold bags of it.
-
     Raises:
         OSError: they cannot be listed; see `unlisted`.
     """
+    stored = _moments_of(memory)
+    stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
+    rules = fired_rules(memory.index.bag_dir)
+    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
+
+
+def _moments_of(memory: Memory) -> list[StoredMoment]:
+    """Returns the saved moments; where one recording alone answers, those that hold bags of it."""
     recording = memory.limits.recording
-    stored = [
+    return [
         each
         for each in stored_moments_in(memory.index.bag_dir)
         if not recording or _holds(each.folder, recording)
     ]
-    stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
-    rules = fired_rules(memory.index.bag_dir)
-    return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
 
 
 def _holds(folder: Path, recording: str) -> bool:

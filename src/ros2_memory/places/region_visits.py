@@ -154,13 +154,17 @@ def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) ->
 
 
 def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) -> bool:
-    """Returns whether poses between two visits were never outside for as long as leaving takes."""
+    """Returns whether poses between two visits were never outside for as long as leaving takes.
+
+    Not where no pose is inside on either side.
+    """
     first = max(older.start, older.stop - TRACK_SLICE_NS)
     last = min(newer.stop, newer.start + TRACK_SLICE_NS)
-    inside = _inside(region, *tracks.poses(TimeWindow(first, last + 1))[:3])
-    in_both = inside and inside[0] <= older.stop and inside[-1] >= newer.start
-    apart = (later - earlier for earlier, later in pairwise(inside))
-    return bool(in_both) and max(apart, default=0) < FLICKER_NS
+    times, x, y = tracks.poses(TimeWindow(first, last + 1))[:3]
+    inside = _inside(region, times, x, y)
+    if not inside or inside[0] > older.stop or inside[-1] < newer.start:
+        return False
+    return not any(_absences(times, inside))
 
 
 def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Region) -> bool:

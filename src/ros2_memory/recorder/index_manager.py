@@ -167,7 +167,7 @@ class IndexManager:
         begun, before = time.perf_counter_ns(), self.published
         context = self._context()
         # Who has the turn may wait for this scan.
-        with self._large.set_aside(), _gc_paused() if before is None else nullcontext():
+        with self._large.exempt(), _gc_paused() if before is None else nullcontext():
             try:
                 change = self._table.update(context, patrolling=patrolling)
             except BaseException:

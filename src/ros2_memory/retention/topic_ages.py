@@ -149,7 +149,7 @@ class TopicCutter:
         done = self._done
         waiting = [cut for cut in cuts if done.get(cut.bag.file) != (cut.bag.mtime_ns, cut.topics)]
         self._done = {cut.bag.file: done[cut.bag.file] for cut in cuts if cut.bag.file in done}
-        if not waiting or (self._bag_dir / ERASING_FILE).exists() or not self._may_begin():
+        if (self._bag_dir / ERASING_FILE).exists() or not self._may_begin(waiting):
             return 0
         begun = time.perf_counter_ns()
         until_s = self._monotonic() + SLICE_S
@@ -181,12 +181,12 @@ class TopicCutter:
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
         return bags
 
-    def _may_begin(self) -> bool:
-        """Whether the machine is quiet, or has not been for too long."""
+    def _may_begin(self, waiting: Sequence[TopicCut]) -> bool:
+        """Whether something waits, and the machine is quiet, or has not been since for too long."""
         now_s = self._monotonic()
-        if self._is_quiet():
+        if not waiting or self._is_quiet():
             self._waits_since_s = None
-            return True
+            return bool(waiting)
         if self._waits_since_s is None:
             self._waits_since_s = now_s
             reason = f"the machine is busy: waiting for a quiet minute, {PATIENCE_S:.0f} s at most"

@@ -190,21 +190,24 @@ class Placer:
         """Returns what the localiser said: when, and its standard deviation (m)."""
         timeline = self._view.timeline
         topics = [topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)]
-        found = sorted(each for topic in topics for each in self._covariances(topic, own, window))
+        found = sorted(each for topic in topics for each in self._deviations(topic, own, window))
         times = np.array([time for time, _ in found], np.int64)
         return times, np.array([sigma for _, sigma in found], np.float64)
 
-    def _covariances(
+    def _deviations(
         self, topic: str, own: Session, window: TimeWindow
     ) -> Iterator[tuple[Ns, float]]:
-        """Yields what a localiser says, now and then: covariances have no columns."""
+        """Yields a localiser's standard deviation (m) with its log time, once in `_SAID_NS`.
+
+        From the messages: covariances have no columns.
+        """
         memory = self._view.memory
         for rows in scan(self._view, topic, window):
             if self._sessions.of(rows.recording) != own:
                 continue
-            numbers = rows.times // _SAID_NS
-            first = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
-            for found in messages_of(self._view, rows.some(first)):
+            slices = rows.times // _SAID_NS
+            firsts = np.flatnonzero(np.diff(slices, prepend=slices[:1] - 1))
+            for found in messages_of(self._view, rows.some(firsts)):
                 message = self._view.bags.decode(found)
                 if message is None:
                     continue

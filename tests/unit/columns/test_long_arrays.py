@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import pytest
 
+from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.table import MAX_NUMBERS
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, header, make, write_mcap
+from tests.support.column_worlds import World
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -72,3 +74,26 @@ def test_conditions_on_arrays_are_answered_alike_stored_or_not(
             found = expected or {}
             some += bool(found.get("total") or found.get("timestamp"))
     assert some > 8
+
+
+def test_a_sequence_whose_columns_were_dropped_is_read_from_its_bag(tmp_path: Path) -> None:
+    """In one message, so that the owners of the elements are all equal, and are kept."""
+    numbers = np.random.default_rng(1).normal(size=(40, 7)).tolist()
+    kind = "geometry_msgs/msg/"
+    poses = [
+        make(
+            f"{kind}Pose",
+            position=make(f"{kind}Point", x=a, y=b, z=c),
+            orientation=make(f"{kind}Quaternion", x=d, y=e, z=f, w=g),
+        )
+        for a, b, c, d, e, f, g in numbers
+    ]
+    body = make(f"{kind}PoseArray", header=header(T0, ""), poses=poses)
+    write_mcap(tmp_path / "rec/rec_0.mcap", [Msg("/poses", f"{kind}PoseArray", T0, body)])
+    world = World.of(tmp_path, limits=StoreLimits(max_share=0.0))
+    world.fill()
+    greatest = max(row[0] for row in numbers)
+    for value, expected in ((greatest - 0.01, T0 / NS_PER_S), (greatest + 0.01, None)):
+        condition = {"condition_type": "above", "field": "poses.position.x", "value": value}
+        found = asked(world.memory, tmp_path, "find_last_match", topic="/poses", **condition)
+        assert (found or {}).get("timestamp") == expected

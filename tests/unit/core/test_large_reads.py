@@ -75,7 +75,7 @@ def test_nobody_waits_outside_of_a_block_or_where_it_is_set_aside(is_set_aside: 
     holder = Reader(large, had, "holder")
     until(lambda: had)
     with large.during() if is_set_aside else nullcontext():
-        with large.set_aside():
+        with large.exempt():
             large.acquire()
         if not is_set_aside:
             large.acquire()

@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord, TriggerState
 from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
-from ros2_memory.core.errors import RefusedError
+from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights import saved_moments
@@ -30,6 +30,7 @@ from ros2_memory.insights.saved_moments import (
     MAX_LISTED,
     list_moments,
     remember_moment,
+    show_moment,
 )
 from ros2_memory.insights.status import MAX_MOMENTS
 from ros2_memory.retention.policy import RetentionLimits
@@ -79,6 +80,17 @@ def refusal(memory: Memory, call: Call | None = None) -> str:
 
 def shown(memory: Memory, folder: Path) -> Any:
     return json.loads(Replies(folder, 24_000).answer(list_moments(memory, Call())).text)
+
+
+def test_a_moment_of_another_recording_is_none_where_one_alone_answers(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    beating(tmp_path)
+    with recorder_at_work(tmp_path, SettableClock(NOW)):
+        name = remember(memory).moment
+    assert show_moment(memory, Call(), name).stored.folder.name == name
+    other = replace(memory, limits=replace(memory.limits, recording="theirs"))
+    with pytest.raises(InvalidArgumentsError, match="0 moments are saved"):
+        show_moment(other, Call(), name)
 
 
 def requests(bag_dir: Path) -> list[Path]:

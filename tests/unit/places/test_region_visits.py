@@ -56,6 +56,23 @@ def test_visits_in_a_moving_map_are_when_the_robot_was_there(
     assert len(near) >= 0.97 * len(truth.inside(4.0, 3.0, 0.3))
 
 
+@pytest.mark.parametrize("period_s", [3, 7])
+def test_a_way_between_two_poses_that_leaves_a_place_is_one_visit(
+    tmp_path: Path, period_s: int
+) -> None:
+    corners = ((0, 0), (6, 0), (6, 4), (4, 4), (4, 1), (2, 1), (2, 4), (0, 4))
+    horseshoe = Polygon(tuple((float(x), float(y)) for x, y in corners))
+    at = [BEGIN + nth * period_s * S for nth in range(8)]
+    across = (-6.0, -6.0, -2.5, 1.0, 5.0, 8.5, 12.0, 12.0)
+    poses = [odom(time, x, 3.0) for time, x in zip(at, across, strict=True)]
+    write_mcap(tmp_path / "rec/rec_0.mcap", poses)
+    memory = memory_of(tmp_path)
+    places = (Place("horseshoe", "odom", horseshoe),)
+    memory = replace(memory, limits=replace(memory.limits, places=places))
+    [visit] = visits(memory, Call(), where="horseshoe", limit=10).visits
+    assert (visit.arrived, visit.departed) == (at[3], at[4])
+
+
 def test_without_a_place_all_named_ones_are_told_at_once(tmp_path: Path) -> None:
     write_moving_map(tmp_path, 1, seconds=300)
     memory = in_places(memory_of(tmp_path))

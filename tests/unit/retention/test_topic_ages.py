@@ -221,6 +221,21 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
     assert "/speech" not in counts_of(bag)
 
 
+def test_each_time_that_something_waits_has_an_hour_of_its_own(bag_dir: Path) -> None:
+    now_s = [0.0]
+    cutter = cutter_of(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
+    keeper = house(bag_dir, cutter)
+    for now_s[0] in (0.0, PATIENCE_S, PATIENCE_S + 1, PATIENCE_S + 2):
+        keeper.apply()
+    later = split(bag_dir, 3)
+    now_s[0] = 2 * PATIENCE_S
+    keeper.apply()
+    assert counts_of(later)["/speech"] == 10
+    now_s[0] = 3 * PATIENCE_S
+    keeper.apply()
+    assert "/speech" not in counts_of(later)
+
+
 def test_nothing_is_cut_while_messages_are_forgotten(bag_dir: Path) -> None:
     (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
     (bag_dir / ERASING_FILE).write_text("{}")
