@@ -9,7 +9,7 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import pieces_of
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import Spans, without
+from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.counts.place_bins import place_bins
 from ros2_memory.counts.time_bins import (
@@ -143,7 +143,7 @@ class BinnedWindow:
         begins = starts[held.begun[inside]]
         self.add_counts("count", begins)
         self.add_lengths(
-            "seconds", "duration", list(zip(starts.tolist(), stops.tolist(), strict=True))
+            "seconds", "duration", united(zip(starts.tolist(), stops.tolist(), strict=True))
         )
         self.add_first("first", begins)
         last = self._last_held(starts, stops)

@@ -21,6 +21,7 @@ from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
 from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.counts.bins import BinnedWindow, By
 from ros2_memory.counts.labels import ANY_LABEL, BY_LABEL, count_labels
@@ -40,7 +41,7 @@ from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
     from ros2_memory.results import Bins
 
@@ -131,7 +132,7 @@ def _by_value(
     if is_bounded:
         raise InvalidArgumentsError("where, while cannot be combined with by value")
     fields = () if condition.field is None else (condition.field,)
-    wanted = replace(condition, field=None)
+    wanted = replace(condition, field="value")
     return count_values(view, topics[0], asked, fields=fields, condition=wanted)
 
 
@@ -148,12 +149,27 @@ def _by_events(
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None and (condition.field is not None or not isinstance(value, str)):
         return None, None
+    if wanted is not None and condition.field is None and _has_lists(view, topic):
+        return None, None  # booleans in lists are no events
     parts, since = _events(view, topic, binned.counted)
     _note_limits(view, topic, parts)
     if wanted is not None:
         before = _met_before(binned, topic, condition) if since is None else None
         return _flag_held(binned, topic, parts, condition, before, wanted=wanted), since
     return _label_held(parts, condition), since
+
+
+def _has_lists(view: View, topic: str) -> bool:
+    """Returns whether the newest message of a topic has a list, which may hold booleans."""
+    newest = view.stream.newest(topic, TimeWindow.everything())
+    waiting = [None if newest is None else view.value(newest)]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, list):
+            return True
+        if isinstance(value, dict):
+            waiting.extend(value.values())
+    return False
 
 
 def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvents], Ns | None]:

@@ -279,7 +279,7 @@ def _silent(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns for how many seconds each topic was silent while the robot was on."""
     silent: dict[str, float] = defaultdict(float)
     for each in silences_in(view, window):
-        silent[each.topic] += unix_from_ns(each.end - each.start)
+        silent[each.topic] += unix_from_ns(each.length)
     return silent
 
 

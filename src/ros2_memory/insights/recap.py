@@ -343,7 +343,8 @@ def _topic_events(
         events += map(_error, _errors(view, topic, found, there))
         visible.append(seen)
         throughout.update(seen.throughout(start, end))
-        last_seen |= dict.fromkeys(seen.at_end(found.last, known_to), found.last)
+        for label in seen.at_end(found.last, known_to):
+            last_seen[label] = max(found.last, last_seen.get(label, found.last))
         note_limits(view, topic, found)
     if below:
         sights = counted(below, "sighting", "sightings")

@@ -1,0 +1,102 @@
+"""What is counted, and how long it held: by flags in lists, by value, of several topics at once."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from typing import TYPE_CHECKING, Any, Final
+
+from rosbags.typesys import get_types_from_msg
+
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import Msg, boolean, detections, make, typestore, write_mcap
+from tests.support.memories import asked, memory_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+T: Final = 1_790_000_000
+
+
+def answer(folder: Path, messages: Iterable[Msg], tool: str, **given: object) -> Any:
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    bags = groupby(ordered, key=lambda each: each.log_time // NS_PER_S // 600)
+    for nth, (_, split) in enumerate(bags):
+        write_mcap(folder / "run" / f"run_{nth}.mcap", [*split])
+    return asked(memory_of(folder), folder, tool, **given)
+
+
+def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
+    condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
+    reply = answer(folder, messages, "find_matches", **condition)
+    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
+
+
+def test_a_boolean_in_a_list_counts_beside_one_that_is_in_none(tmp_path: Path) -> None:
+    store = typestore()
+    store.register(get_types_from_msg("bool pressed\n", "acme_msgs/msg/Button"))
+    panel = "bool enabled\nacme_msgs/Button[] buttons\n"
+    store.register(get_types_from_msg(panel, "acme_msgs/msg/Panel"))
+    button = store.types["acme_msgs/msg/Button"]
+    messages = [
+        Msg(
+            "/panel",
+            "acme_msgs/msg/Panel",
+            (T + nth) * NS_PER_S,
+            make("acme_msgs/msg/Panel", enabled=False, buttons=[button(pressed=20 <= nth < 40)]),
+        )
+        for nth in range(60)
+    ]
+    found = counted(tmp_path, messages, "/panel", condition_type="equals", value=True)
+    assert (found["count"], found["seconds"]) == (1, 20.0)
+
+
+def test_a_number_that_is_contained_counts_by_its_value(tmp_path: Path) -> None:
+    kind = "std_msgs/msg/Int32"
+    messages = [
+        Msg("/level", kind, (T + nth) * NS_PER_S, make(kind, data=3 if nth > 100 else 1))
+        for nth in range(200)
+    ]
+    condition = {"condition_type": "contains", "value": 3, "field": "data"}
+    found = counted(tmp_path, messages, "/level", by="value", **condition)
+    assert found["count"] == 1
+
+
+def test_what_two_topics_show_at_once_lasts_once(tmp_path: Path) -> None:
+    messages = [
+        detections((T + nth) * NS_PER_S + late, ["person"], topic=topic)
+        for nth in range(100)
+        for topic, late in (("/cam1/objects", 0), ("/cam2/objects", 10**8))
+    ]
+    condition = {"condition_type": "contains", "value": "person"}
+    found = counted(tmp_path, messages, "/cam*/objects", **condition)
+    assert 99 <= found["seconds"] <= found["recorded_s"] + 1
+
+
+def test_a_topic_is_silent_only_while_the_robot_is_on(tmp_path: Path) -> None:
+    night = 8 * 3600
+    camera = [*range(600), *range(1800 + night, 3600 + night)]
+    others = [*range(1200), *range(1200 + night, 3600 + night)]
+    messages = [boolean((T + at) * NS_PER_S + 9, True, topic="/camera") for at in camera]
+    messages += [
+        boolean((T + at) * NS_PER_S + nth, True, topic=f"/t{nth}")
+        for at in others
+        for nth in range(4)
+    ]
+    windows = {"start": T, "end": T + 2400 + night, "with_start": T + 2400 + night}
+    reply = answer(tmp_path, messages, "compare", **windows, with_end=T + 3599 + night)
+    assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}
+
+
+def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:
+    messages = [
+        each
+        for nth in range(100)
+        for each in (
+            detections((T + nth) * NS_PER_S, ["cup"] if nth >= 60 else [], topic="/a"),
+            detections((T + nth) * NS_PER_S - 2 * 10**8, ["cup"] if nth > 60 else [], topic="/b"),
+        )
+    ]
+    reply = answer(tmp_path, messages, "recap", start=T, end=T + 99.5)
+    [cup] = [each for each in reply["events"] if "cup" in each["text"]]
+    assert cup["goes_on"]
