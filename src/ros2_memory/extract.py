@@ -439,7 +439,7 @@ def _velocity(node: object, axis: int) -> Vector3 | None:
 
 def _px4_frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
     found = None if route is None else number(route.of(message))
-    return "" if found is None else named.get(int(found), "")
+    return "" if found is None or not math.isfinite(found) else named.get(int(found), "")
 
 
 def _converted(name: str, node: object) -> object:

@@ -40,6 +40,7 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
     WallClock,
+    named_span_s,
     ns_from_unix,
     rest_of_end_s,
     unix_from_ns,
@@ -67,6 +68,7 @@ _AGO: Final = re.compile(
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _LARGEST_UNIX_S: Final = 1e11
 """A larger number is in milliseconds or nanoseconds."""
+_DATE_WITHOUT_DASHES: Final = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
@@ -350,6 +352,9 @@ def parse_time(text: str, now: float) -> float:
         return now
     with suppress(ValueError):
         number = float(words)
+        if _DATE_WITHOUT_DASHES.fullmatch(words):
+            dashed = f"{words[:4]}-{words[4:6]}-{words[6:]}"
+            raise InvalidArgumentsError(f"{text} as Unix seconds is in 1970; the date is {dashed}")
         if abs(number) > _LARGEST_UNIX_S:
             seconds = number / (1e9 if abs(number) > _LARGEST_UNIX_S * 1e4 else 1e3)
             raise InvalidArgumentsError(
@@ -369,6 +374,23 @@ def parse_time(text: str, now: float) -> float:
             return datetime.combine(date, time.fromisoformat(of_day)).timestamp()
         return unix_from_text(text)
     raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
+
+
+def parse_end(text: str, now: float, start: float) -> float:
+    """Returns the Unix seconds at which a window that starts at a time ends, as the tools take it.
+
+    A date alone is the end of its day, and a minute its own end where the window starts with it.
+
+    Raises:
+        InvalidArgumentsError: the text is no time.
+    """
+    end, named = parse_time(text, now), 0.0
+    if text.strip().lower() in {"today", "yesterday"}:
+        text = datetime.fromtimestamp(end).astimezone().date().isoformat()
+    with suppress(ValueError):  # `now`, or how long ago
+        named = named_span_s(text)
+    goes_on = named > 60 or end == start
+    return end + (named if goes_on else 0.0) + rest_of_end_s(text)
 
 
 def day_of(memory: "Memory", day: str | None) -> TimeWindow:
@@ -444,7 +466,7 @@ class Times:
             first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
             until = unix_from_ns(MAX_NS)
             if self.end is not None:
-                until = parse_time(self.end, now) + rest_of_end_s(self.end)
+                until = parse_end(self.end, now, first)
             return TimeWindow.from_unix(first, until)
         if self.start is not None or self.end is not None:
             raise InvalidArgumentsError("give --last, or --start and --end, not both")

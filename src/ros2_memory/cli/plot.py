@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -435,13 +436,11 @@ def signals_of(
 
 def _varying(values: Sequence[JsonValue]) -> list[str]:
     """Returns the numeric fields that change; all of the first value where none does."""
-    first = {name: number for name, number in _numbers(values[0]) if not math.isnan(number)}
-    changing = {
-        name
-        for value in values
-        for name, number in _numbers(value)
-        if number != first.get(name, number) and not math.isnan(number)
-    }
+    first: dict[str, float] = {}
+    changing: set[str] = set()
+    for name, number in chain.from_iterable(map(_numbers, values)):
+        if not math.isnan(number) and first.setdefault(name, number) != number:
+            changing.add(name)
     return [name for name in first if name in changing] or [*first]
 
 

@@ -361,7 +361,7 @@ def _newest_frame(view: View, topic: str) -> str:
             raise InvalidArgumentsError(describe_lack(view, "position", found))
         if failures:
             note_left_out(view, failures[0])
-        return pose.frame_id
+        return pose.frame_id.lstrip("/")
     if failures:
         raise failures[0]
     return ""
@@ -387,8 +387,8 @@ def robot_body(view: View) -> Body | None:
     if not moving:
         return None
     above = {child: _above(child, parents) for child in moving}
-    body = min(moving, key=lambda each: (_rank(each), len(above[each]), each))
     map_frame = view.limits.map_frame
+    body = min(moving, key=lambda each: (_rank(each, map_frame), len(above[each]), each))
     root = map_frame if map_frame in above[body] else above[body][-1]
     return Body(root, body, tuple(sorted({each for each in moving if each != body})))
 
@@ -402,8 +402,10 @@ def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
     return found
 
 
-def _rank(frame: str) -> int:
+def _rank(frame: str, map_frame: str | None) -> int:
     name = frame.rpartition("/")[2]
+    if name == map_frame or name.startswith("odom"):
+        return len(_BODIES) + 1  # of the world: it moves as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
 

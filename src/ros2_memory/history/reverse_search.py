@@ -171,7 +171,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     asked = test.frame_id if isinstance(test, NearPosition) else None
     for topic in topics[:_MOST_FRAMES] if asked else ():
         frames = _frames_of(view, topic)
-        if frames and asked not in frames:
+        if frames and (asked or "").lstrip("/") not in {each.lstrip("/") for each in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
                 f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"

@@ -88,7 +88,7 @@ class Timeline:
         for at, segment in enumerate(self.segments):
             segments += _segments_of(touched[at]) if at in touched else [segment]
         changed = Timeline(segments)
-        if touched.keys() == {len(segments) - 1}:
+        if touched.keys() == {len(segments) - 1} and len(segments) == len(self.segments):
             # Mostly the end changes, often while a file there grows.
             changed._before_last = self._before_last
         return changed

@@ -15,7 +15,7 @@ from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
-from ros2_memory.messages.conversions import triple, xyz
+from ros2_memory.messages.conversions import number, triple, xyz
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue, Vector3
@@ -190,8 +190,8 @@ def _hypothesis(result: dict[str, JsonValue]) -> dict[str, JsonValue]:
 
 def _score(value: dict[str, JsonValue]) -> float | None:
     for name in SCORES:
-        score = value.get(name)
-        if isinstance(score, int | float) and not isinstance(score, bool) and not math.isnan(score):
+        score = number(value.get(name))
+        if score is not None and not math.isnan(score):
             return score
     return None
 

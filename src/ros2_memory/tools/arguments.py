@@ -184,6 +184,8 @@ def _as_hours(value: object) -> object:
         first, last = (time.fromisoformat(str(each)) for each in parts)  # type: ignore[attr-defined]
     except (TypeError, ValueError):
         raise ValueError("is not two times of day") from None
+    if first.tzinfo is not None or last.tzinfo is not None:
+        raise ValueError("is local time: leave the offset from UTC out")
     return first, last
 
 

@@ -286,7 +286,15 @@ def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
     """
     mark = state.latched.setdefault(event.topic, LatchedMark())
     payload = hashlib.blake2b(record.payload, digest_size=8).hexdigest()
-    others = [each for name, each in mark.published.items() if name != event.recording]
+    # What was published later than now was so before the clock was set back: that is no repeat. Not
+    # so where the log clock is simulated.
+    latest = event.time + SILENCE_NS
+    is_dated = record.publish_time <= latest
+    others = [
+        each
+        for name, each in mark.published.items()
+        if name != event.recording and not (is_dated and each > latest)
+    ]
     begun = mark.begun.setdefault(event.recording, event.time)
     if record.publish_time in {0, record.log_time}:
         is_repeat = event.recording not in mark.published and payload == mark.payload

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.cli.ask import with_times
-from ros2_memory.cli.options import parse_time
+from ros2_memory.cli.options import parse_end, parse_time
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
@@ -499,3 +499,16 @@ def test_every_command_prints_json(
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
     code = 1 if words[0] == "forget" else 0  # bags of others stay
     assert exits(code, *words, "--json").json
+
+
+def test_a_window_that_ends_with_a_date_has_all_of_that_day() -> None:
+    start = parse_time("2026-11-20", 0)
+    assert parse_end("2026-11-20", 0, start) == pytest.approx(parse_time("2026-11-21", 0))
+    assert parse_end("2026-11-20T09:00", 0, start) == parse_time("2026-11-20T09:00", 0)
+    assert parse_end("1784023260", 0, start) == 1784023260
+
+
+def test_a_date_without_dashes_is_no_second_of_1970() -> None:
+    with pytest.raises(InvalidArgumentsError, match="the date is 2026-11-21"):
+        parse_time("20261121", 0)
+    assert parse_time("20269999", 0) == 20269999

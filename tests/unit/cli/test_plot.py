@@ -16,7 +16,7 @@ from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import Geodetic, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import battery, boolean, odom, text, tf, transform, write_mcap
+from tests.support.bags import Msg, battery, boolean, make, odom, text, tf, transform, write_mcap
 from tests.support.memories import memory_of
 from tests.unit.test_positions import fix
 
@@ -269,3 +269,16 @@ def test_a_recap_without_poses_has_the_rest(tmp_path: Path, exits: Program) -> N
     drawn = tmp_path / "recap.svg"
     exits(0, "plot", "recap", tmp_path / "rec", "--out", drawn)
     assert drawn.stat().st_size > 1000
+
+
+def test_a_field_that_is_not_known_at_first_is_drawn(tmp_path: Path) -> None:
+    kind = "std_msgs/msg/Float32"
+    values = [math.nan, *range(20, 40)]
+    messages = [
+        Msg("/f", kind, T0 + nth * NS_PER_S, make(kind, data=float(each)))
+        for nth, each in enumerate(values)
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    asked = plot.opened(memory_of(tmp_path), TimeWindow.everything())
+    _, [signal], _ = plot.signals_of(asked, "/f", ())
+    assert len(signal.values) == len(values)

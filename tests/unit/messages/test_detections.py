@@ -192,3 +192,8 @@ def test_all_things_of_a_message_are_looked_at() -> None:
 @given(json_values)
 def test_no_value_is_too_odd(value: JsonValue) -> None:
     assert all(thing.label.strip() for thing in detections_of(value))
+
+
+def test_a_score_that_no_float_can_hold_is_none() -> None:
+    [found] = detections_of({"label": "cup", "score": 10**400})
+    assert (found.label, found.score) == ("cup", None)

@@ -19,6 +19,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
+from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
@@ -434,3 +435,40 @@ def test_what_is_a_jump_for_the_path_is_one_for_visits(
     between = {"x": 0.7, "y": 0.0, "radius_m": 0.3, "by": "hour"}
     counted = asked(memory, tmp_path, "visits", **between, **span)
     assert dict(zip(counted["columns"][1:], counted["all"], strict=True))["entries"] == visited
+
+
+@pytest.mark.parametrize("body", ["base_link", "chassis"])
+def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path, body: str) -> None:
+    at = [BEGIN + nth * S // 10 for nth in range(600)]
+    messages = [
+        each
+        for nth, time in enumerate(at)
+        for each in (
+            tf(time, transform(time, "odom", body, (nth * 0.05, 0.0, 0.0))),
+            tf(time, transform(time, "map", "odom", (1 + 0.001 * nth, 2.0, 0.0))),
+        )
+    ]
+    write_mcap(tmp_path / "rec/rec_0.mcap", messages)
+    found = asked(memory_of(tmp_path), tmp_path, "get_position_at", timestamp=BEGIN / S + 40)
+    assert found["x"] == pytest.approx(1.4 + 20.0, abs=0.1)
+
+
+def test_a_frame_is_the_same_with_a_slash_and_without_one(tmp_path: Path) -> None:
+    poses = [odom(BEGIN + nth * S // 5, nth * 0.1, 0.0) for nth in range(200)]
+    for each in poses:
+        body: Any = each.body
+        body.header.frame_id = "/odom"
+    write_mcap(tmp_path / "rec/rec_0.mcap", poses)
+    memory = memory_of(tmp_path)
+    places = (Place("spot", "odom", Circle(10.0, 0.0, 1.0)),)
+    memory = replace(memory, limits=replace(memory.limits, places=places))
+    assert asked(memory, tmp_path, "visits", where="spot")["total"] == 1
+    near = {"topic": "/odom", "condition_type": "near_position"}
+    value = {"x": 10, "y": 0, "frame_id": "odom"}
+    assert asked(memory, tmp_path, "find_last_match", value=value, **near)["timestamp"]
+
+
+def test_hours_of_the_day_are_local(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec/rec_0.mcap", [odom(BEGIN, 0.0, 0.0)])
+    reply = asked(memory_of(tmp_path), tmp_path, "visits", x=0, y=0, between="04:00Z-05:00Z")
+    assert "leave the offset from UTC out" in reply["detail"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -397,3 +398,19 @@ class TestFaults:
         robot.look()
         assert robot.spans() == [(1, 12), (15, 23)]
         assert (robot.record().fired, robot.record().moments) == (3, 2)
+
+
+def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(
+    tmp_path: Path,
+) -> None:
+    def latched(second: int, up: bool) -> Msg:
+        return replace(boolean(T0 + second * S, up), publish_time=T0 + second * S - 10**6)
+
+    year = 365 * 86_400
+    bags = watched(tmp_path, rule())
+    for begun in (year, 100, 4000):
+        bags.begin(T0 + begun * S)
+        states = [(20, False), (30, True), (40, False)]
+        bags.split([latched(begun + at, up) for at, up in states], layout=LATCHED)
+        bags.close_all()
+    assert len(bags.fired_at()) == 3

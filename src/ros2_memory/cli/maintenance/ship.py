@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 from ros2_memory.bootstrap import SharedParts, shared_parts
 from ros2_memory.bootstrap_fleet import build_robots, lake_location
-from ros2_memory.cli.options import AsJson, End, Overrides, Start, Verbose, load_for, parse_time
+from ros2_memory.cli.options import (
+    AsJson,
+    End,
+    Overrides,
+    Start,
+    Verbose,
+    load_for,
+    parse_end,
+    parse_time,
+)
 from ros2_memory.cli.output import print_json, print_line, print_notes
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeError
@@ -19,7 +28,7 @@ from ros2_memory.core.malloc import share_one_arena
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.sd_notify import READY, WATCHDOG, notify
 from ros2_memory.core.text import abbreviate, counted, listed
-from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix, rest_of_end_s
+from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -111,7 +120,8 @@ def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWin
     if robot is None or start is None or end is None:
         raise InvalidArgumentsError("give all of --forget, --start and --end, or none of them")
     now = time.time()
-    return TimeWindow.from_unix(parse_time(start, now), parse_time(end, now) + rest_of_end_s(end))
+    first = parse_time(start, now)
+    return TimeWindow.from_unix(first, parse_end(end, now, first))
 
 
 def _forget(

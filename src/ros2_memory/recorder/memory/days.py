@@ -505,8 +505,9 @@ class MemoryDays:
         for record in added:
             hours[record.log_time // HOUR_NS].append(record)
         if topics:
-            summary = self._reader.summarize(path)
-            for hour in range(summary.start // HOUR_NS, summary.end // HOUR_NS + 1):
+            # Not all from the first to the last: where the clock was set, years lie between.
+            batches = self._reader.batches(path, topics, _EVERYTHING, bare=topics)
+            for hour in {at // HOUR_NS for batch in batches for at in batch.log_times.tolist()}:
                 hours.setdefault(hour, [])
         for hour in sorted(hours):
             window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)

@@ -870,3 +870,29 @@ def test_days_of_earlier_versions_are_read(bag_dir: Path) -> None:
     seen = {"topic": "/vision/scene/scene_objects", "condition_type": "contains"}
     found = reply_over(bag_dir, "find_last_match", **seen, value="mug")
     assert found["value"]["detections"][0]["label"] == "mug"
+
+
+def test_a_day_across_a_step_of_the_clock_is_read_by_the_hours_that_it_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def boot(name: str, begin: int) -> None:
+        """A clock that begins in 1970, and is set in the middle of a split."""
+        early = [boolean(begin + nth * S, True) for nth in range(10)]
+        later = [boolean(T0 + begin + nth * S, False) for nth in range(10)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", [*early, *later])
+
+    boot("rec_A", 0)
+    boot("rec_B", 20 * S)
+    own_all(tmp_path)
+    asked: list[object] = []
+    read = McapReader.records
+
+    def counted(reader: McapReader, path: Path, *given: Any, **more: Any) -> Iterator[Any]:
+        asked.append(path)
+        assert len(asked) < 50
+        return iter(read(reader, path, *given, **more))
+
+    monkeypatch.setattr(McapReader, "records", counted)
+    for name in ("rec_A", "rec_B"):
+        keep_all(days_of(tmp_path), tmp_path, name)
+    assert asked
