@@ -16,6 +16,7 @@ from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
 import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
@@ -567,18 +568,34 @@ def _labels(node: object) -> Iterator[str]:
 
 
 def _without(message: object, is_hidden: Callable[[str], bool]) -> object:
-    """Returns a decoded message without those entries of its lists that have a hidden label."""
-    changed = {
-        name: [one for one in value if not any(map(is_hidden, _labels(one)))]
-        for name, value in _fields(message)
-        if isinstance(value, list)
-    }
-    changed = {
-        name: left for name, left in changed.items() if len(left) < len(getattr(message, name))
-    }
-    if not changed or not is_dataclass(message) or isinstance(message, type):
+    """Returns a decoded message without those entries of its lists that have a hidden label.
+
+    What lies at the same place of a list of texts belongs to it: `name`, `position`.
+    """
+    if not is_dataclass(message) or isinstance(message, type):
         return message
-    return replace(message, **changed)
+    lists = {
+        name: value for name, value in _fields(message) if isinstance(value, list | np.ndarray)
+    }
+    hidden = {
+        name: {nth for nth, one in enumerate(value) if any(map(is_hidden, _labels(one)))}
+        for name, value in lists.items()
+    }
+    changed: dict[str, object] = {}
+    for name, value in lists.items():
+        gone = hidden[name].union(
+            *(
+                hidden[other]
+                for other, texts in lists.items()
+                if len(texts) == len(value) and all(isinstance(one, str) for one in texts)
+            )
+        )
+        if gone:
+            left = [nth for nth in range(len(value)) if nth not in gone]
+            changed[name] = (
+                value[left] if isinstance(value, np.ndarray) else [value[nth] for nth in left]
+            )
+    return replace(message, **changed) if changed else message
 
 
 def _fields(node: object) -> Iterator[tuple[str, object]]:

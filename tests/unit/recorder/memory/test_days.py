@@ -50,6 +50,7 @@ from tests.support.bags import (
     boolean,
     detections,
     goals,
+    header,
     make,
     odom,
     text,
@@ -896,3 +897,31 @@ def test_a_day_across_a_step_of_the_clock_is_read_by_the_hours_that_it_has(
     for name in ("rec_A", "rec_B"):
         keep_all(days_of(tmp_path), tmp_path, name)
     assert asked
+
+
+def test_without_the_name_of_a_hidden_joint_others_keep_their_own_values(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/JointState"
+    messages = [
+        Msg(
+            "/joint_states",
+            kind,
+            T0 + nth * S,
+            make(
+                kind,
+                header=header(T0 + nth * S, ""),
+                name=["neck_yaw", "face_pitch", "arm"],
+                position=np.array([0.1, 0.2, 0.3]),
+                velocity=np.zeros(0),
+                effort=np.zeros(0),
+            ),
+        )
+        for nth in range(5)
+    ]
+    write_mcap(tmp_path / "rec_A" / "rec_A_0.mcap", messages)
+    own_all(tmp_path)
+    keep_all(days_of(tmp_path), tmp_path)
+    reader = McapReader()
+    [first, *_] = reader.records(tmp_path / DAY_FILE, ["/joint_states"], TimeWindow.everything())
+    kept: Any = reader.decode(first)
+    assert kept.name == ["neck_yaw", "arm"]
+    assert kept.position.tolist() == pytest.approx([0.1, 0.3], abs=0.001)
