@@ -228,17 +228,6 @@ class Database:
                         continue
             return
 
-    def shrink(self) -> None:
-        """Returns the memory of pages that were read and written: others are asked next, perhaps.
-
-        SQLite keeps up to 2 MB for each database, and a server has one for each robot.
-        """
-
-        def free(connection: sqlite3.Connection) -> None:
-            connection.execute("PRAGMA shrink_memory")
-
-        self.read(free, None)
-
     def look_after(self, *, thorough: bool = False) -> None:
         """Reopens the file where it was deleted, replaced, or could not be opened before.
 

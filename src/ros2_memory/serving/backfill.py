@@ -130,7 +130,6 @@ class Backfill:
         make_fragments(self._memory, self.filling.whole_since(), waiting)
         self.filling.thin()
         self.filling.trim()
-        self.filling.store.shrink()
         if self._of_others is None:
             self._of_others = self._memory.columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
