@@ -147,7 +147,8 @@ def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
 ) -> None:
     scanner = crowded.columns
     assert scanner is not None
-    monkeypatch.setattr(scanner, "things", WithoutEstimates(8))
+    caches = replace(scanner.caches, things=WithoutEstimates(1 << 20))
+    monkeypatch.setattr(scanner, "caches", caches)
     monkeypatch.setattr(known, "_FEWER", 100)
     monkeypatch.setattr(known, "_ESTIMATING_S", 0.0)
     labels_and_notes(crowded, Deadline.after(60))
