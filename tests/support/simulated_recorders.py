@@ -161,7 +161,7 @@ class World:
         housekeeper: Housekeeper | None = None,
         expected: Sequence[str] = (),
         required: Sequence[Required] = (),
-        sign: Callable[[], None] | None = None,
+        keep_alive: Callable[[], None] | None = None,
         background: Background | None = None,
         **orders: object,
     ) -> None:
@@ -208,7 +208,7 @@ class World:
             monotonic=lambda: self.mono,
             free_bytes_of=self._free_bytes,
             device=lambda _directory: self.device,
-            sign=sign,
+            keep_alive=keep_alive,
         )
 
     def _free_bytes(self, directory: Path) -> int:

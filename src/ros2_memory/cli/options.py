@@ -40,11 +40,10 @@ from ros2_memory.core.timebase import (
     MIN_NS,
     Ns,
     WallClock,
-    named_span_s,
     ns_from_unix,
-    rest_of_end_s,
     unix_from_ns,
     unix_from_text,
+    window_end_s,
 )
 
 if TYPE_CHECKING:
@@ -377,20 +376,15 @@ def parse_time(text: str, now: float) -> float:
 
 
 def parse_end(text: str, now: float, start: float) -> float:
-    """Returns the Unix seconds at which a window that starts at a time ends, as the tools take it.
-
-    A date alone is the end of its day, and a minute its own end where the window starts with it.
+    """Returns the Unix seconds at which a window ends that starts at a time; see `window_end_s`.
 
     Raises:
         InvalidArgumentsError: the text is no time.
     """
-    end, named = parse_time(text, now), 0.0
+    end = parse_time(text, now)
     if text.strip().lower() in {"today", "yesterday"}:
         text = datetime.fromtimestamp(end).astimezone().date().isoformat()
-    with suppress(ValueError):  # `now`, or how long ago
-        named = named_span_s(text)
-    goes_on = named > 60 or end == start
-    return end + (named if goes_on else 0.0) + rest_of_end_s(text)
+    return window_end_s(text, end, start)
 
 
 def day_of(memory: "Memory", day: str | None) -> TimeWindow:

@@ -133,9 +133,9 @@ class Caches:
         """Returns caches; columns and fragments take so much memory in them, in MiB."""
         return cls(ByteLru(cache_mb << 20), ByteLru((cache_mb << 20) // 5))
 
-    def apart(self) -> Caches:
+    def namespace(self) -> Caches:
         """Returns caches with keys of their own, within the capacities of these."""
-        return Caches(**{one.name: getattr(self, one.name).apart() for one in fields(self)})
+        return Caches(**{one.name: getattr(self, one.name).namespace() for one in fields(self)})
 
 
 class Scanner:
@@ -163,7 +163,7 @@ class Scanner:
         self.store = store
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
-        self.caches = Caches.of() if caches is None else caches.apart()
+        self.caches = Caches.of() if caches is None else caches.namespace()
         self._settings = settings
         self._fragments: dict[str, object] = {}
         # They follow from columns alone, and are of use where these were dropped.

@@ -359,9 +359,9 @@ class ColumnStore(Database):
         return self.read(ask, {})
 
     def part_data(self, parts: Sequence[int], path: str, most_bytes: int) -> dict[int, bytes]:
-        """Returns the compressed bytes of a column of parts, in their order; none of what is gone.
+        """Returns the compressed bytes of a column by part, in the order of `parts`.
 
-        Of more than `most_bytes` those are left out that follow.
+        Parts that were deleted are left out, and those that follow `most_bytes` in all.
         """
 
         def ask(connection: sqlite3.Connection) -> dict[int, bytes]:

@@ -91,7 +91,7 @@ def identity_at(descriptor: int) -> Identity:
 
 
 def mode_of(path: Path) -> int:
-    """Returns the type and mode of what has this name, also of a link; 0 where nothing has.
+    """Returns `st_mode` of a path, of a symbolic link its own; 0 where there is nothing.
 
     Not by `Path.exists`, which takes what the disk does not tell for missing since Python 3.14.
 

@@ -33,15 +33,15 @@ def notify(*assignments: str) -> bool:
     return True
 
 
-class SignOfLife:
-    """Tells systemd that this process goes on, as often as its watchdog asks for."""
+class Watchdog:
+    """Keeps systemd's watchdog from ending this process (`WatchdogSec`)."""
 
     def __init__(self) -> None:
         self._every_s = watchdog_interval_s()
         self._due_s = 0.0
 
-    def give(self) -> None:
-        """Sends `WATCHDOG` where half of the interval has passed; may be called at any rate."""
+    def keep_alive(self) -> None:
+        """Sends `WATCHDOG=1` where half of the interval has passed; may be called at any rate."""
         if self._every_s is not None and time.monotonic() >= self._due_s:
             notify(WATCHDOG)
             self._due_s = time.monotonic() + self._every_s / 2

@@ -37,6 +37,7 @@ _DIGITS: Final = re.compile(r"[0-9]{9,}(\.[0-9]+)?")
 _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
 _SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
 _LONGEST_TIME: Final = 64
+_MINUTE_S: Final = 60.0
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
@@ -156,16 +157,26 @@ def rest_of_end_s(text: str) -> float:
     return rest_of_text_s(written) if weekday else 0.0
 
 
-def named_span_s(text: str) -> float:
+def window_end_s(text: str, end_s: float, start_s: float | None) -> float:
+    """Returns the Unix seconds at which a window ends by a text that is the time `end_s`.
+
+    A date alone is the end of its local day, and a minute its own end where the window starts with
+    it; see also `rest_of_end_s`.
+    """
+    named_s = _named_span_s(_without_weekday(text.strip())[1])
+    goes_on = named_s > _MINUTE_S or start_s == end_s
+    return end_s + (named_s if goes_on else 0.0) + rest_of_end_s(text)
+
+
+def _named_span_s(written: str) -> float:
     """Returns how long the minute or the local day that a text names goes on after its begin (s).
 
-    Up to its last microsecond; 0 for a text with seconds, or Unix seconds.
+    Up to its last microsecond; 0 for a text with seconds, Unix seconds, and what is no ISO 8601.
     """
-    _, written = _without_weekday(text.strip())
-    if _DIGITS.fullmatch(written) or _SECONDS.search(written):
+    if _SECONDS.search(written) or not _ISO.fullmatch(written):
         return 0.0
     if ":" in written:
-        return 60 - 1e-6
+        return _MINUTE_S - 1e-6
     read = datetime.fromisoformat(written)
     if (read.hour, read.minute) != (0, 0) or "T" in written.upper():
         return 0.0

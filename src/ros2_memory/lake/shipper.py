@@ -245,16 +245,12 @@ class RobotBags:
 
         One that hangs, as a mount does whose robot is gone, blocks one thread, however often asked.
         """
-        is_new = self._looking is None
-        if self._looking is None:
+        if self._looking is None or not self._looking.is_alive():
             # A daemon: it must not keep the program from ending.
-            self._looking = threading.Thread(target=_look_into, args=(self.bag_dir,), daemon=True)
+            self._looking = threading.Thread(target=_list_one, args=(self.bag_dir,), daemon=True)
             self._looking.start()
-        self._looking.join(patience_s if is_new else 0.0)
-        if self._looking.is_alive():
-            return False
-        self._looking = None
-        return is_new or self.answers(patience_s)
+            self._looking.join(patience_s)
+        return not self._looking.is_alive()
 
     @property
     def bag_dir(self) -> Path:
@@ -456,8 +452,8 @@ class RobotBags:
             )
 
 
-def _look_into(folder: Path) -> None:
-    """Reads an entry of a folder; why it cannot be read is found out by whoever needs it."""
+def _list_one(folder: Path) -> None:
+    """Lists one entry of a folder, which takes as long as its disk does; errors are no matter."""
     with suppress(OSError), os.scandir(folder) as entries:
         next(entries, None)
 

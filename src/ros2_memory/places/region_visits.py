@@ -156,7 +156,7 @@ def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) ->
 def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) -> bool:
     """Returns whether poses between two visits were never outside for as long as leaving takes.
 
-    Not where no pose is inside on either side.
+    False where there is no pose inside before or after.
     """
     first = max(older.start, older.stop - TRACK_SLICE_NS)
     last = min(newer.stop, newer.start + TRACK_SLICE_NS)

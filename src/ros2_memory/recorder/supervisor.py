@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.core.sd_notify import SignOfLife
+from ros2_memory.core.sd_notify import Watchdog
 from ros2_memory.recorder.event_log import EventLog
 from ros2_memory.recorder.handover.transfer import Step
 from ros2_memory.recorder.policies import (
@@ -68,8 +68,8 @@ class Supervisor:
         monotonic: a clock that never steps, in seconds.
         free_bytes_of: measures what the file system of a directory has left.
         device: gives the device that a directory lies on.
-        sign: gives the service manager a sign of life; called before each task, since a slow disk
-            takes seconds for what one writes.
+        keep_alive: tells the service manager's watchdog that the recorder runs; called before each
+            task, since a slow disk takes seconds for what one writes.
 
     Attributes:
         stopped: whether it does nothing at this time.
@@ -83,14 +83,14 @@ class Supervisor:
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
         device: Callable[[Path], int] = device_of,
-        sign: Callable[[], None] | None = None,
+        keep_alive: Callable[[], None] | None = None,
     ) -> None:
         self._orders = orders
         self._bag_dir = orders.bag_dir
         self._reception = orders.reception
         self._monotonic = monotonic
         self._free_bytes_of = free_bytes_of
-        self._sign = sign or SignOfLife().give
+        self._keep_alive = keep_alive or Watchdog().keep_alive
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
         self._events = EventLog(orders.clock)
@@ -191,7 +191,7 @@ class Supervisor:
         for name, every_s, needs_disk, task in tasks:
             if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
                 continue
-            self._sign()
+            self._keep_alive()
             try:
                 task(now)
             except OSError as error:

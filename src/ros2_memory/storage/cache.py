@@ -28,7 +28,7 @@ class ByteLru(Generic[T]):
     def __init__(self, capacity: int) -> None:
         self._all: _Values[T] = _Values(capacity)
 
-    def apart(self) -> ByteLru[T]:
+    def namespace(self) -> ByteLru[T]:
         """Returns a cache with keys of its own, within the capacity of this one."""
         found = ByteLru[T](0)
         found._all = self._all

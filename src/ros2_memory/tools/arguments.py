@@ -30,7 +30,7 @@ from pydantic import (
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import named_span_s, rest_of_end_s, rest_of_text_s, unix_from_text
+from ros2_memory.core.timebase import rest_of_end_s, rest_of_text_s, unix_from_text, window_end_s
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.places.where import WhileCondition
 
@@ -47,7 +47,6 @@ MOST_TIMES: Final = 20
 """Moments that one call asks about."""
 MOST_WAYPOINTS: Final = 200
 _INCLUSIVE: Final = "Inclusive."
-_MINUTE_S: Final = 60.0
 _OF_THE_OTHER: Final = "Of the other."
 FORMS_OF_TIME: Final = "Unix s or 2026-11-20T14:05."
 TIME_KINDS: Final = ("number", "string")
@@ -103,17 +102,14 @@ def _read_time(value: object) -> object:
 
 
 def _read_until(value: object, info: ValidationInfo[object]) -> object:
-    """Returns the end of a window: a time as `_read_time` does, but see `rest_of_end_s`.
-
-    A date alone is the end of its day, and a minute its own end where the window starts with it.
-    """
+    """Returns the end of a window: a time as `_read_time` does, but see `window_end_s`."""
     seconds = _read_time(value)
     if not isinstance(value, str) or not isinstance(seconds, float):
         return seconds
-    name, named = info.field_name or "", named_span_s(value)
-    start = info.data.get(name.replace("end", "start"))
-    ends_it = "end" in name and (start == seconds or named > _MINUTE_S)
-    return seconds + (named if ends_it else 0.0) + rest_of_end_s(value)
+    name = info.field_name or ""
+    if "end" not in name:  # before a time, or around one
+        return seconds + rest_of_end_s(value)
+    return window_end_s(value, seconds, info.data.get(name.replace("end", "start")))
 
 
 def _read_moment(value: object) -> tuple[object, float]:
@@ -185,7 +181,7 @@ def _as_hours(value: object) -> object:
     except (TypeError, ValueError):
         raise ValueError("is not two times of day") from None
     if first.tzinfo is not None or last.tzinfo is not None:
-        raise ValueError("is local time: leave the offset from UTC out")
+        raise ValueError("has an offset from UTC: these hours are local, so leave it out")
     return first, last
 
 

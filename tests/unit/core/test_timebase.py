@@ -25,6 +25,7 @@ from ros2_memory.core.timebase import (
     unix_from_ns,
     unix_from_text,
     unix_rounded_up,
+    window_end_s,
 )
 from tests.support.strategies import moments
 
@@ -162,6 +163,22 @@ def test_the_last_decimal_of_a_text_is_all_part_of_it(text: str, rest_s: float) 
     assert rest_of_text_s(text) == pytest.approx(rest_s, abs=1e-9)
     was_rounded = text.startswith("Tue")
     assert rest_of_end_s(text) == pytest.approx(rest_s if was_rounded else 0.0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "start_s", "lasts_s"),
+    [
+        ("2026-11-20", 1.0, 86_400),
+        ("2026-11-20T14:05", 1.0, 0.0),
+        ("2026-11-20T14:05", 5.0, 60.0),
+        ("1784023200", 5.0, 0.0),
+        ("now", 5.0, 0.0),
+    ],
+)
+def test_a_window_ends_with_the_day_or_the_minute_that_is_meant(
+    text: str, start_s: float, lasts_s: float
+) -> None:
+    assert window_end_s(text, 5.0, start_s) == pytest.approx(5.0 + lasts_s, abs=1e-5)
 
 
 def test_a_local_time_has_its_weekday(berlin: str) -> None:

@@ -1,14 +1,13 @@
-"""What is counted, and how long it held: by flags in lists, by value, of several topics at once."""
+"""What counts, and how long it held: flags in lists, numbers by value, two topics at once."""
 
 from __future__ import annotations
 
-from itertools import groupby
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, boolean, detections, make, typestore, write_mcap
+from tests.support.bags import Msg, detections, make, typestore, write_mcap
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
@@ -18,17 +17,11 @@ if TYPE_CHECKING:
 T: Final = 1_790_000_000
 
 
-def answer(folder: Path, messages: Iterable[Msg], tool: str, **given: object) -> Any:
-    ordered = sorted(messages, key=lambda each: each.log_time)
-    bags = groupby(ordered, key=lambda each: each.log_time // NS_PER_S // 600)
-    for nth, (_, split) in enumerate(bags):
-        write_mcap(folder / "run" / f"run_{nth}.mcap", [*split])
-    return asked(memory_of(folder), folder, tool, **given)
-
-
 def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    write_mcap(folder / "run" / "run_0.mcap", ordered)
     condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
-    reply = answer(folder, messages, "find_matches", **condition)
+    reply = asked(memory_of(folder), folder, "find_matches", **condition)
     return dict(zip(reply["columns"][1:], reply["all"], strict=True))
 
 
@@ -71,32 +64,3 @@ def test_what_two_topics_show_at_once_lasts_once(tmp_path: Path) -> None:
     condition = {"condition_type": "contains", "value": "person"}
     found = counted(tmp_path, messages, "/cam*/objects", **condition)
     assert 99 <= found["seconds"] <= found["recorded_s"] + 1
-
-
-def test_a_topic_is_silent_only_while_the_robot_is_on(tmp_path: Path) -> None:
-    night = 8 * 3600
-    camera = [*range(600), *range(1800 + night, 3600 + night)]
-    others = [*range(1200), *range(1200 + night, 3600 + night)]
-    messages = [boolean((T + at) * NS_PER_S + 9, True, topic="/camera") for at in camera]
-    messages += [
-        boolean((T + at) * NS_PER_S + nth, True, topic=f"/t{nth}")
-        for at in others
-        for nth in range(4)
-    ]
-    windows = {"start": T, "end": T + 2400 + night, "with_start": T + 2400 + night}
-    reply = answer(tmp_path, messages, "compare", **windows, with_end=T + 3599 + night)
-    assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}
-
-
-def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:
-    messages = [
-        each
-        for nth in range(100)
-        for each in (
-            detections((T + nth) * NS_PER_S, ["cup"] if nth >= 60 else [], topic="/a"),
-            detections((T + nth) * NS_PER_S - 2 * 10**8, ["cup"] if nth > 60 else [], topic="/b"),
-        )
-    ]
-    reply = answer(tmp_path, messages, "recap", start=T, end=T + 99.5)
-    [cup] = [each for each in reply["events"] if "cup" in each["text"]]
-    assert cup["goes_on"]

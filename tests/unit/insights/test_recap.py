@@ -666,3 +666,18 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
+
+
+def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:
+    messages = [
+        each
+        for at in range(100)
+        for each in (
+            detections(BEGIN + at * S - S // 5, ["cup"] if at > 60 else [], topic="/b"),
+            detections(BEGIN + at * S, ["cup"] if at >= 60 else [], topic="/a"),
+        )
+    ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    found = over(memory_of(tmp_path), 0, 99.5)
+    [cup] = [each for each in found.events if "cup" in each.text]
+    assert cup.goes_on

@@ -149,3 +149,19 @@ def test_several_topics_that_fall_silent_together_are_one_event(tmp_path: Path) 
     reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]
     assert event["text"] == "/sensor_0, /sensor_1, /sensor_2 and 2 more were silent"
+
+
+def test_compare_counts_how_long_a_topic_was_silent_while_the_robot_was_on(tmp_path: Path) -> None:
+    morning = 8 * 3600 + 1200
+    for begin in (0, 600, morning, morning + 600, morning + 1200, morning + 1800):
+        names = ["/t0", "/t1", "/t2", "/t3", *["/camera"] * (begin not in {600, morning})]
+        messages = [
+            boolean((BEGIN + begin + at) * S + nth, data=True, topic=name)
+            for at in range(600)
+            for nth, name in enumerate(names)
+        ]
+        write_mcap(tmp_path / "run" / f"run_{begin}.mcap", messages)
+    first = {"start": BEGIN, "end": BEGIN + morning + 1200}
+    other = {"with_start": BEGIN + morning + 1200, "with_end": BEGIN + morning + 2399}
+    reply = asked(memory_of(tmp_path), tmp_path, "compare", **first, **other)
+    assert reply["silent_s"] == {"/camera": {"this": 1200.0, "with": 0.0}}

@@ -471,4 +471,4 @@ def test_a_frame_is_the_same_with_a_slash_and_without_one(tmp_path: Path) -> Non
 def test_hours_of_the_day_are_local(tmp_path: Path) -> None:
     write_mcap(tmp_path / "rec/rec_0.mcap", [odom(BEGIN, 0.0, 0.0)])
     reply = asked(memory_of(tmp_path), tmp_path, "visits", x=0, y=0, between="04:00Z-05:00Z")
-    assert "leave the offset from UTC out" in reply["detail"]
+    assert "these hours are local, so leave it out" in reply["detail"]

@@ -285,7 +285,7 @@ class TestSlowDisk:
         world = World(
             tmp_path,
             session_duration_s=20,
-            sign=lambda: signs.append(world.mono),
+            keep_alive=lambda: signs.append(world.mono),
             background=Background(),
         )
 

@@ -47,7 +47,7 @@ def test_equal_channels_become_one() -> None:
 
 def test_caches_apart_share_a_capacity_and_no_key() -> None:
     cache: ByteLru[str] = ByteLru(10)
-    one, other = cache.apart(), cache.apart()
+    one, other = cache.namespace(), cache.namespace()
     one.put("a", "one's", 6)
     assert (one.get("a"), other.get("a"), cache.get("a")) == ("one's", None, None)
     other.put("a", "other's", 6)
