@@ -16,8 +16,7 @@ from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, EpisodicSe
 from tests.integration.browser import Browser, browsing, needs_chromium
 from tests.integration.chat_host import ChatHost, chat_host
 from tests.integration.test_page import ATTACK, painted, write_history
-from tests.support.planner_judges import ASKED_AT_S
-from tests.support.planner_world import recorded
+from tests.support.demo_bags import ASKED_AT_S, recorded
 from tests.support.robot_run import T0_S
 
 if TYPE_CHECKING:
@@ -90,8 +89,8 @@ def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def robot(scratch: Path) -> Iterator[Robot]:
-    with recorded(scratch / "demo") as world:
-        yield Robot(world.folder)
+    with recorded(scratch / "demo"):
+        yield Robot(scratch / "demo")
 
 
 @pytest.fixture(scope="module")

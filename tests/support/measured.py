@@ -47,7 +47,6 @@ UNMEASURED: Final = (
     "test_instances.py::test_nearly_every_label",
     "test_*_real_bags.py",
     "test_path_length.py",
-    "test_planner_questions.py",
     "test_real_bags*.py",
     "test_recorded_sessions.py",
     "test_reply_size.py",
@@ -99,8 +98,7 @@ def nothing_measured() -> Iterator[None]:
     """Within it nothing is traced.
 
     In a worker of pytest-xdist two measurements run: pytest-cov begins one before it knows that it
-    is in a worker, and keeps nothing of it. With the other alone stopped that one goes on, and all
-    questions of `test_planner_questions.py` take 77 s of processor time instead of 20 s.
+    is in a worker, and keeps nothing of it. With the other alone stopped that one goes on.
     """
     stopped: list[Coverage] = []
     while (measuring := Coverage.current()) is not None:

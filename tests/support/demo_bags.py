@@ -1,34 +1,30 @@
-"""The bags of the demo's robot at the moment at which a planner asks about it."""
+"""The bags of the demo's robot at a moment at which somebody asks about it."""
 
 from __future__ import annotations
 
 import os
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.demo.judges import CallContext
 from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
-from tests.support.planner_judges import ASKED_AT_S, HEARD_AFTER_S, STARTED_S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
 
-@dataclass(frozen=True)
-class World:
-    """The bags of a robot that is heard still, and what is known of it."""
-
-    folder: Path
-    asked: CallContext
+STARTED_S: Final = 1_784_023_200
+"""When the robot started, in Unix seconds: it was on its dock."""
+HEARD_AFTER_S: Final = 17
+"""Seconds after its start from which on it is recorded."""
+ASKED_AT_S: Final = STARTED_S + 240.5
 
 
 @contextmanager
-def recorded(folder: Path) -> Iterator[World]:
+def recorded(folder: Path) -> Iterator[None]:
     """Three laps of which the last split is open: the robot stands on its dock again."""
     start = ns_from_unix(STARTED_S)
     now = ns_from_unix(ASKED_AT_S)
@@ -37,5 +33,5 @@ def recorded(folder: Path) -> Iterator[World]:
     recorder.write_until(now)
     for path in folder.rglob("*.mcap"):
         os.utime(path, ns=(now, now))  # however long it took to write them
-    yield World(folder, CallContext(timeline, now, now, recorder.closed_ends(now, now)))
+    yield
     recorder.stop()
