@@ -2,25 +2,25 @@
 
 Zstd chunks with a message index for each channel, publishers' QoS on every channel, every channel
 in every split's summary, and, as rosbag2 does it, all earlier splits of the recording described in
-each; `metadata.yaml` closes a recording. Record layouts: the MCAP specification.
+each; `metadata.yaml` closes a recording.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 from dataclasses import dataclass, field
 from functools import cache
+from io import BytesIO
 from itertools import starmap
 from textwrap import indent
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import zstandard
+from mcap.writer import CompressionType, Writer
 
 from benchmarks import payloads
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
 QOS: Final = """\
@@ -40,10 +40,6 @@ QOS: Final = """\
     nsec: 854775807
   avoid_ros_namespace_conventions: false"""
 """What rosbag2 records of a publisher's quality of service."""
-_MAGIC: Final = b"\x89MCAP0\r\n"
-_MESSAGE: Final = struct.Struct("<BQHIQQ")
-_ENTRY: Final = struct.Struct("<QQ")
-_ZSTD: Final = struct.pack("<I4s", 4, b"zstd")
 _LEFT: Final = 0.6
 """The part of a split that reaches the disk before the power fails."""
 
@@ -74,18 +70,6 @@ class Split(NamedTuple):
     counts: tuple[int, ...]
 
 
-class _Chunk(NamedTuple):
-    """What the summary says of a chunk that lies in the file."""
-
-    times: tuple[int, int]
-    at: int
-    length: int
-    indexes: Mapping[int, int]
-    indexes_length: int
-    packed: int
-    unpacked: int
-
-
 @dataclass
 class Recording:
     """A folder of splits that are written one after the other; it is made."""
@@ -106,7 +90,7 @@ class Recording:
             counts[row.topic] += 1
         split = Split(path, rows[0].log_time, rows[-1].log_time, tuple(counts))
         self.splits.append(split)
-        path.write_bytes(self._file(rows, split))
+        path.write_bytes(self._mcap(rows))
         # A bag that was closed long ago, as most bags of a history were.
         os.utime(path, ns=(split.stop, split.stop))
 
@@ -122,69 +106,28 @@ class Recording:
         os.truncate(last.path, int(last.path.stat().st_size * _LEFT))
         os.utime(last.path, ns=(last.stop, last.stop))
 
-    def _file(self, rows: Sequence[Row], split: Split) -> bytes:
-        data = bytearray(_MAGIC)
-        data += _record(0x01, _text("ros2") + _text("ros2-memory benchmark"))
-        chunks = list(self._chunks(rows, data))
-        metadata_at = len(data)
-        told = _text(metadata(self.splits, ())[:-1])
-        pairs = _text("serialized_metadata") + told
-        data += _record(0x0C, _text("rosbag2") + struct.pack("<I", len(pairs)) + pairs)
-        metadata_length = len(data) - metadata_at
-        data += _record(0x0F, bytes(4))
-        groups = (
-            (0x03, b"".join(_schema(*each) for each in _schemas(self.topics))),
-            (0x04, b"".join(_channel(each, self.topics) for each in range(len(self.topics)))),
-            (0x0B, _statistics(split, len(chunks), self.topics)),
-            (0x08, b"".join(map(_chunk_index, chunks))),
-            (0x0D, _record(0x0D, _ENTRY.pack(metadata_at, metadata_length) + _text("rosbag2"))),
-        )
-        summary_at, offsets = len(data), b""
-        for opcode, group in groups:
-            offsets += _record(0x0E, struct.pack("<BQQ", opcode, len(data), len(group)))
-            data += group
-        offsets_at = len(data)
-        data += offsets + _record(0x02, struct.pack("<QQI", summary_at, offsets_at, 0)) + _MAGIC
-        return bytes(data)
-
-    def _chunks(self, rows: Sequence[Row], data: bytearray) -> Iterable[_Chunk]:
-        """Appends the chunks to a file's bytes. A chunk ends with the message that fills it."""
-        packer = zstandard.ZstdCompressor(level=1)
-        parts: list[bytes] = []
-        entries: dict[int, list[bytes]] = {}
-        size, begin, known = 0, rows[0].log_time, set[int]()
-        for number, (log_time, publish_time, topic, payload) in enumerate(rows):
-            if topic not in known:
-                known.add(topic)
-                schema = next(
-                    each for each in _schemas(self.topics) if self.topics[topic].type == each[1]
-                )
-                parts.append(_schema(*schema) + _channel(topic, self.topics))
-                size += len(parts[-1])
-            entries.setdefault(topic, []).append(_ENTRY.pack(log_time, size))
-            length = _MESSAGE.size - 9 + len(payload)
-            parts.append(_MESSAGE.pack(0x05, length, topic + 1, number, log_time, publish_time))
-            parts.append(payload)
-            size += 9 + length
-            if size < self.chunk_bytes and number < len(rows) - 1:
-                continue
-            times, at = (begin, log_time), len(data)
-            packed = packer.compress(b"".join(parts))
-            data += _record(
-                0x06,
-                struct.pack("<QQQI", *times, size, 0)
-                + _ZSTD
-                + struct.pack("<Q", len(packed))
-                + packed,
+    def _mcap(self, rows: Sequence[Row]) -> bytes:
+        file = BytesIO()
+        writer = Writer(file, self.chunk_bytes, CompressionType.ZSTD, enable_crcs=False)
+        writer.start("ros2", "ros2-memory benchmark")
+        schemas = {
+            each: writer.register_schema(each, "ros2msg", definition(each).encode())
+            for each in dict.fromkeys(topic.type for topic in self.topics)
+        }
+        channels = [
+            writer.register_channel(
+                topic.name,
+                "cdr",
+                schemas[topic.type],
+                {"offered_qos_profiles": QOS.format(durability=topic.durability)},
             )
-            length, indexes = len(data) - at, {}
-            for channel, found in entries.items():
-                indexes[channel + 1] = len(data)
-                index = b"".join(found)
-                data += _record(0x07, struct.pack("<HI", channel + 1, len(index)) + index)
-            yield _Chunk(times, at, length, indexes, len(data) - at - length, len(packed), size)
-            parts, entries, size = [], {}, 0
-            begin = rows[number + 1].log_time if number < len(rows) - 1 else log_time
+            for topic in self.topics
+        ]
+        for number, (log_time, publish_time, topic, payload) in enumerate(rows):
+            writer.add_message(channels[topic], log_time, payload, publish_time, number)
+        writer.add_metadata("rosbag2", {"serialized_metadata": metadata(self.splits, ())[:-1]})
+        writer.finish()
+        return file.getvalue()
 
 
 def metadata(splits: Sequence[Split], topics: Sequence[Topic]) -> str:
@@ -228,54 +171,3 @@ def _split_told(split: Split) -> str:
 def definition(type_name: str) -> str:
     """A type's definition with all that it contains, as bags have it."""
     return payloads.typestore().generate_msgdef(type_name, ros_version=2)[0]
-
-
-def _schemas(topics: Sequence[Topic]) -> list[tuple[int, str]]:
-    return list(enumerate(dict.fromkeys(topic.type for topic in topics), 1))
-
-
-@cache
-def _schema(number: int, type_name: str) -> bytes:
-    text = _text(type_name) + _text("ros2msg") + _text(definition(type_name))
-    return _record(0x03, struct.pack("<H", number) + text)
-
-
-def _channel(number: int, topics: Sequence[Topic]) -> bytes:
-    topic = topics[number]
-    schema = next(at for at, name in _schemas(topics) if name == topic.type)
-    qos = _text("offered_qos_profiles") + _text(QOS.format(durability=topic.durability))
-    text = _text(topic.name) + _text("cdr") + struct.pack("<I", len(qos)) + qos
-    return _record(0x04, struct.pack("<HH", number + 1, schema) + text)
-
-
-def _statistics(split: Split, chunks: int, topics: Sequence[Topic]) -> bytes:
-    counts = b"".join(struct.pack("<HQ", at, n) for at, n in enumerate(split.counts, 1) if n)
-    head = struct.pack(
-        "<QHIIIIQQI",
-        sum(split.counts),
-        len(_schemas(topics)),
-        len(topics),
-        0,
-        1,
-        chunks,
-        split.start,
-        split.stop,
-        len(counts),
-    )
-    return _record(0x0B, head + counts)
-
-
-def _chunk_index(chunk: _Chunk) -> bytes:
-    indexes = b"".join(struct.pack("<HQ", *each) for each in chunk.indexes.items())
-    head = struct.pack("<QQQQI", *chunk.times, chunk.at, chunk.length, len(indexes))
-    sizes = struct.pack("<Q", chunk.indexes_length) + _ZSTD
-    return _record(0x08, head + indexes + sizes + _ENTRY.pack(chunk.packed, chunk.unpacked))
-
-
-def _record(opcode: int, content: bytes) -> bytes:
-    return struct.pack("<BQ", opcode, len(content)) + content
-
-
-def _text(text: str) -> bytes:
-    data = text.encode()
-    return struct.pack("<I", len(data)) + data
