@@ -7,17 +7,14 @@ failed: then its last split ends in the middle of a chunk, without a summary.
 
 from __future__ import annotations
 
-import os
-from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from textwrap import indent
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import yaml
-from benchmarks.bags import QOS, definition
-from mcap.writer import CompressionType, Writer
+from benchmarks.bags import Recording as WrittenRecording
+from benchmarks.bags import Row, Topic
 
 from tests.home.messages import (
     TF_STATIC,
@@ -32,26 +29,16 @@ from tests.home.truth import places
 from tests.home.world import Recording, World, world_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from tests.home.days import Scale
 
 _CHUNK_BYTES: Final = 16 * 1024
-_LEFT: Final = 0.6
-"""The part of a split that reaches the disk before the power fails."""
 
-
-class _Split(NamedTuple):
-    path: Path
-    start: int
-    stop: int
-    counts: Counter[str]
-
-    @property
-    def messages(self) -> int:
-        """Returns how many messages it holds."""
-        return self.counts.total()
+_TOPICS: Final = [
+    Topic(name, kind, "transient_local" if name in TRANSIENT_LOCAL else "volatile")
+    for name, kind in TYPES.items()
+]
 
 
 def write_world(scale: Scale, folder: Path) -> None:
@@ -86,99 +73,29 @@ def _record(scale: Scale, folder: Path, number: int) -> None:
     """Writes one recording."""
     world = world_of(scale)
     recording = world.recordings[number]
-    place = folder / recording.name
-    place.mkdir()
+    written = WrittenRecording(folder / recording.name, _TOPICS, _CHUNK_BYTES)
+    numbers = {topic.name: nth for nth, topic in enumerate(_TOPICS)}
     rows = records(world, recording)
-    splits: list[_Split] = []
     at = 0
-    for nth, (_, stop) in enumerate(recording.splits(scale.split_s)):
+    for _, stop in recording.splits(scale.split_s):
         end = int(world.clock_ns(np.array([stop]))[0])
         first = at
         while at < len(rows) and rows[at].log_time < end:
             at += 1
-        if at == first:
-            continue
-        path = place / f"{recording.name}_{nth}.mcap"
-        latched = _latched(world, recording, rows[first].log_time)
-        part = [latched, *rows[first:at]]
-        counts = Counter(row.topic for row in part)
-        splits.append(_Split(path, part[0].log_time, part[-1].log_time, counts))
-        _write(splits, part)
-    closed = [split.path for split in splits]
+        if at > first:
+            part = [_latched(world, recording, rows[first].log_time), *rows[first:at]]
+            written.write(
+                [
+                    Row(row.log_time, row.publish_time, numbers[row.topic], row.payload)
+                    for row in part
+                ]
+            )
     if recording.cut:
-        whole = splits[-1].path.read_bytes()
-        splits[-1].path.write_bytes(whole[: int(_LEFT * len(whole))])
+        written.cut()
     else:
-        text = "rosbag2_bagfile_information:\n" + indent(metadata(splits), "  ") + "\n"
-        (place / "metadata.yaml").write_text(text, encoding="utf-8")
-    for path, split in zip(closed, splits, strict=True):
-        os.utime(path, ns=(split.stop, split.stop))
+        written.close()
 
 
 def _latched(world: World, recording: Recording, log_time: int) -> Record:
     booted = int(world.clock_ns(np.array([recording.booted]))[0])
     return Record(log_time, booted, TF_STATIC, fixed_frames(booted))
-
-
-def _write(splits: Sequence[_Split], rows: Sequence[Record]) -> None:
-    with splits[-1].path.open("xb") as stream:
-        writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        writer.start(profile="ros2", library="ros2-memory benchmark")
-        schemas = {
-            name: writer.register_schema(name, "ros2msg", definition(name).encode())
-            for name in dict.fromkeys(TYPES.values())
-        }
-        channels = {
-            topic: writer.register_channel(
-                topic, "cdr", schemas[name], {"offered_qos_profiles": _qos(topic)}
-            )
-            for topic, name in TYPES.items()
-        }
-        for sequence, row in enumerate(rows):
-            writer.add_message(
-                channels[row.topic], row.log_time, row.payload, row.publish_time, sequence
-            )
-        writer.add_metadata("rosbag2", {"serialized_metadata": metadata(splits)})
-        writer.finish()
-
-
-def _qos(topic: str) -> str:
-    return QOS.format(durability="transient_local" if topic in TRANSIENT_LOCAL else "volatile")
-
-
-def _topic(topic: str, messages: int) -> str:
-    return (
-        f"  - topic_metadata:\n      name: {topic}\n      type: {TYPES[topic]}\n"
-        "      serialization_format: cdr\n      offered_qos_profiles:\n"
-        + indent(_qos(topic), " " * 8)
-        + f'\n      type_description_hash: ""\n    message_count: {messages}'
-    )
-
-
-def metadata(splits: Sequence[_Split]) -> str:
-    """Returns rosbag2's metadata (version 9) of a recording that has these splits."""
-    first, last = splits[0].start, splits[-1].stop
-    lines = [
-        "version: 9",
-        "storage_identifier: mcap",
-        f"duration:\n  nanoseconds: {last - first}",
-        f"starting_time:\n  nanoseconds_since_epoch: {first}",
-        f"message_count: {sum(split.messages for split in splits)}",
-        "topics_with_message_count:",
-        *(_topic(topic, sum(split.counts[topic] for split in splits)) for topic in TYPES),
-        'compression_format: ""',
-        'compression_mode: ""',
-        "relative_file_paths:",
-        *(f"  - {split.path.name}" for split in splits),
-        "files:",
-        *(
-            f"  - path: {split.path.name}\n    starting_time:\n"
-            f"      nanoseconds_since_epoch: {split.start}\n"
-            f"    duration:\n      nanoseconds: {split.stop - split.start}\n"
-            f"    message_count: {split.messages}"
-            for split in splits
-        ),
-        "custom_data: ~",
-        "ros_distro: jazzy",
-    ]
-    return "\n".join(lines)
