@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, Final
 import pytest
 
 from tests.support.bags import VISION_DEFINITIONS
+from tests.support.examples import LONG
 from tests.support.processes import PATIENCE_S
 from tests.support.real_recorder import (
     RealRecorder,
@@ -45,8 +46,11 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 SHARED_MEMORY: Final = Path("/dev/shm")  # noqa: S108
 ROS: Final = ROOT / "build" / os.environ.get("EPISODIC_ROS_WHEELS", "ros")
 """The environment of the double: Jazzy's wheels, or the newest ones (ros-newest)."""
-RECORDERS: Final = ("real", "double")
-"""What a test of recording is run with, by the names of parameters."""
+RECORDERS: Final = ("real", "double") if LONG else ("recorder",)
+"""What a test of recording is run with, by the names of parameters.
+
+The real recorder where there is one, else the double; a long run takes both.
+"""
 
 _HAS_ROS: Final = any(ROS.glob("lib/*/site-packages/rclpy"))
 _NO_ROS: Final = (
@@ -78,6 +82,8 @@ def installation(request: pytest.FixtureRequest) -> RealRecorder | None:
 
     Skips where that one is not there; `require_real_recorder` says when it fails instead.
     """
+    if request.param == "recorder":
+        return real_or_double()
     if request.param == "real":
         return require_real_recorder()
     _require_double()
