@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import time
 from typing import TYPE_CHECKING
 
@@ -9,6 +10,7 @@ import pytest
 
 from tests.home.days import Scale
 from tests.home.recording import write_world
+from tests.home.year import Year
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,6 +22,15 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The world of the usual scale, which takes seconds to make: bags, places and labels."""
     folder = tmp_path_factory.mktemp("home")
     write_world(Scale(), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def thinned_home(home: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same world when retention has deleted its bags: of each day stays what `memory/` has."""
+    folder = tmp_path_factory.mktemp("thinned") / "home"
+    shutil.copytree(home, folder)
+    Year(folder / "bags", Scale().split_s).age(Scale().days - 1)
     return folder
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import shutil
 from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.layout import is_thinned
 from tests.home.days import CLOCK_STEP_S, Scale
 from tests.home.truth import truth_of
-from tests.home.year import Year
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of
 
@@ -29,15 +26,12 @@ def test_the_blind_time_and_the_step_of_the_clock_are_all_that_is_reported(
     _is_reported(home / "bags")
 
 
-def test_they_are_reported_when_their_bags_are_deleted(home: Path, tmp_path: Path) -> None:
-    bags = tmp_path / "bags"
-    shutil.copytree(home / "bags", bags)
-    whole = [path for path in bags.rglob("*.mcap") if not is_thinned(path)]
-    Year(bags, SCALE.split_s).age(SCALE.days - 1)
-    left = [path for path in whole if path.exists()]
+def test_they_are_reported_when_their_bags_are_deleted(home: Path, thinned_home: Path) -> None:
+    whole = [path.relative_to(home) for path in home.rglob("*.mcap")]
+    left = [path for path in whole if (thinned_home / path).exists()]
     newest = max(whole).parent
     assert left == [path for path in whole if path.parent == newest]
-    _is_reported(bags)
+    _is_reported(thinned_home / "bags")
 
 
 def _is_reported(bags: Path) -> None:

@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
@@ -92,11 +91,6 @@ class Year:
         left: list[tuple[Path, int]] = []
         while left != (left := self._bags()):
             self._house.apply()
-
-    @property
-    def size(self) -> int:
-        """The bytes of all thinned days."""
-        return sum(size for path, size in self._bags() if is_thinned(path))
 
     def _bags(self) -> list[tuple[Path, int]]:
         return [(path, path.stat().st_size) for path in sorted(self._bag_dir.rglob("*.mcap"))]
