@@ -12,7 +12,7 @@ import time
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from itertools import chain
+from itertools import chain, repeat, starmap
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
@@ -92,7 +92,8 @@ adam çocuk cocuk insan kadın kadin kişi kisi yüz
 _PEOPLE: Final = frozenset(_WORDS_FOR_PEOPLE.split())
 _WORD: Final = re.compile(r"[A-Z]*[^\W\d_A-Z]+|[A-Z]+")
 """Words also begin at capitals: `TrackedPersons`."""
-_NAMES: Final = LISTS_OF_LABELS.union(LABELS, ("child_frame_id", "frame_id", "name", "names"))
+_OF_DETECTIONS: Final = LISTS_OF_LABELS.union(LABELS)
+_NAMES: Final = _OF_DETECTIONS.union(("child_frame_id", "frame_id", "name", "names"))
 """Fields that may name people."""
 _FIRST_DAY: Final = "2014"
 """Days before it have a wrong date: there was no ROS 2."""
@@ -220,10 +221,12 @@ class MemoryDays:
             OSError: the folder cannot be read, or a day not be deleted.
         """
         oldest = "" if now is None else memory_file(utc_day(now - self._limits.max_age_ns))
+        today = "" if now is None else memory_file(utc_day(now))
         for path in self._days():
             if _FIRST_DAY <= path.name < oldest:
                 self._delete(path)
-        days = self._days()
+        # Those of a clock that was ahead first: they would push out all others, and never age.
+        days = sorted(self._days(), key=lambda path: "" < today < path.name, reverse=True)
         size = sum(path.stat().st_size for path in days)
         for path in days:
             if size <= self._limits.max_bytes:
@@ -367,12 +370,11 @@ class MemoryDays:
                     # Thinned, it would look like one whose messages hold until the next.
                     metadata = tuple(one for one in channel.metadata if one[0] != _QOS)
                     channel = replace(channel, latched=False, metadata=metadata)
-                stays = record._replace(channel=channel)
-                if channel.topic in chosen.latched:
-                    if not self._shows_people(stays):
-                        yield stays
-                elif (smaller := self._smaller(stays)) is not None:
-                    yield smaller
+                stays = self._smaller(
+                    record._replace(channel=channel), rounds=channel.topic not in chosen.latched
+                )
+                if stays is not None:
+                    yield stays
 
     def _tables(self, path: Path) -> Iterator[Table]:
         """Yields the messages of a bag as tables; what is damaged of it is left out.
@@ -401,38 +403,42 @@ class MemoryDays:
         if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
             raise error
 
-    def _smaller(self, record: Record) -> Record | None:
-        """Returns a message with rounded numbers, without people whose label may not stay.
+    def _smaller(self, record: Record, *, rounds: bool) -> Record | None:
+        """Returns a message without people whose label may not stay, maybe with rounded numbers.
 
-        None where it cannot be parted from them.
+        None where it cannot be parted from them, or where no transform of it is left.
         """
         try:
-            message = _without(self._reader.decode(record), self._is_hidden)
-            if self._names_people(message, record.channel.type):
+            whole, channel = self._reader.decode(record), record.channel
+            message = _without(whole, self._is_hidden)
+            if message is not whole and getattr(message, "transforms", None) == []:
                 return None
-            left = rounded(message, self._reader.definition(record.channel))
-            return record._replace(payload=self._reader.encode(record.channel, left))
+            if self._names_people(message, channel.type):
+                return None
+            if rounds:
+                message = rounded(message, self._reader.definition(channel))
+            if message is whole:
+                return record
+            return record._replace(payload=self._reader.encode(channel, message))
         except UndecodableError:
             return None
-
-    def _shows_people(self, record: Record) -> bool:
-        """Returns whether a message names people who may not stay, or cannot be decoded."""
-        try:
-            return self._names_people(self._reader.decode(record), record.channel.type)
-        except UndecodableError:
-            return True
 
     def _names_people(self, message: object, type_name: str) -> bool:
         shown = self._extractor.exact(message, type_name)
         texts = [value for _, value in _fields(message) if isinstance(value, str)]
-        labels = [seen.label for value in (shown, *texts) for seen in detections_of(value)]
-        return any(map(self._is_hidden, [*labels, *_labels(message)]))
+        seen = [each.label for value in (shown, *texts) for each in detections_of(value)]
+        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), seen), *_labels(message)]))
 
-    def _is_hidden(self, label: str) -> bool:
-        """Returns whether a label is of people, or a number that may be: 0 is a person in COCO."""
-        if label in self._limits.labels:
+    def _is_hidden(self, field: str, text: str) -> bool:
+        """Returns whether a text in such a field is of people.
+
+        As the label of a detection a number may be: 0 is a person in COCO. Joints and frames have
+        numbers, too, and those are none.
+        """
+        if text in self._limits.labels:
             return False
-        return self._is_of_people(label) or label.strip().isdecimal()
+        is_number = field in _OF_DETECTIONS and text.strip().isdecimal()
+        return is_number or self._is_of_people(text)
 
     def _is_of_people(self, name: str) -> bool:
         """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
@@ -557,17 +563,20 @@ def _by_topic(record: Record) -> tuple[str, Ns]:
     return record.channel.topic, record.log_time
 
 
-def _labels(node: object) -> Iterator[str]:
-    """Yields the labels of an entry of a list: a name, or its `results[0].hypothesis.class_id`."""
+def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
+    """Yields the names in an entry of a list, each with its field.
+
+    Such as its `name`, or the `class_id` of its `results[0].hypothesis`.
+    """
     if isinstance(node, str):
-        yield node
+        yield field, node
     for name, value in _fields(node):
         for one in value if isinstance(value, list) else [value]:
             if name in _NAMES or not isinstance(one, str):
-                yield from _labels(one)
+                yield from _labels(one, name)
 
 
-def _without(message: object, is_hidden: Callable[[str], bool]) -> object:
+def _without(message: object, is_hidden: Callable[[str, str], bool]) -> object:
     """Returns a decoded message without those entries of its lists that have a hidden label.
 
     What lies at the same place of a list of texts belongs to it: `name`, `position`.
@@ -578,7 +587,7 @@ def _without(message: object, is_hidden: Callable[[str], bool]) -> object:
         name: value for name, value in _fields(message) if isinstance(value, list | np.ndarray)
     }
     hidden = {
-        name: {nth for nth, one in enumerate(value) if any(map(is_hidden, _labels(one)))}
+        name: {nth for nth, one in enumerate(value) if any(starmap(is_hidden, _labels(one, name)))}
         for name, value in lists.items()
     }
     changed: dict[str, object] = {}

@@ -46,8 +46,11 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
     ]
     pauses = [(pause.start, pause.end) for pause in snapshot.suspects]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
+    since = bags[0].start if known.since is None else known.since
+    if since > snapshot.scanned_at:  # by a clock that was ahead
+        since = min(since, bags[0].start)
     return Thinned(
-        bags[0].start if known.since is None else known.since,
+        since,
         tuple(sorted(silences.values(), key=lambda each: each[1])),
         (*_few_a_day([*known.pauses, *(pause for pause in pauses if is_in(pause[0]))]),),
         tuple(sorted({*known.set_back, *(step for step in steps if is_in(step[0]))})),

@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from ros2_memory.bootstrap import build_memory
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.history.context import Call
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
@@ -148,11 +149,13 @@ def content_of(path: Path) -> bytes:
     return data
 
 
-def keep_all(days: MemoryDays, bag_dir: Path, name: str = "rec_A") -> None:
+def keep_all(
+    days: MemoryDays, bag_dir: Path, name: str = "rec_A", *, clock: Clock | None = None
+) -> None:
     index = IndexManager(
         bag_dir,
         BagDirReader(McapReader()),
-        SettableClock(T0 + 10**6 * S),
+        clock or SettableClock(T0 + 10**6 * S),
         refresh_s=0.0,
         split_duration_s=60.0,
     )
@@ -925,3 +928,59 @@ def test_without_the_name_of_a_hidden_joint_others_keep_their_own_values(tmp_pat
     kept: Any = reader.decode(first)
     assert kept.name == ["neck_yaw", "arm"]
     assert kept.position.tolist() == pytest.approx([0.1, 0.3], abs=0.001)
+
+
+def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
+    """All that many robots say of their static frames is one message."""
+    at = [T0 + n * S for n in range(10)]
+    frames = ("base_link", "person_1", "2")
+    exact = tf(T0, *(transform(T0, "map", each, (0.123456789, 0, 0)) for each in frames))
+    messages = [replace(exact, topic="/tf_static"), *(odom(each, 1.0, 2.0) for each in at)]
+    write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", messages)
+    own_all(bag_dir)
+    keep_all(days_of(bag_dir), bag_dir)
+    [kept] = [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.topic == "/tf_static"]
+    message: Any = McapReader().decode(kept)
+    assert [each.child_frame_id for each in message.transforms] == ["base_link", "2"]
+    assert {each.transform.translation.x for each in message.transforms} == {0.123456789}
+
+
+def test_joints_of_numbers_stay_where_labels_of_numbers_go(tmp_path: Path) -> None:
+    """Servos on a bus are called 1, 2 and 3."""
+    kind = "sensor_msgs/msg/JointState"
+    body = make(
+        kind,
+        header=header(T0, "1"),
+        name=["1", "2", "3"],
+        position=np.array([0.1, 0.2, 0.3]),
+        velocity=np.zeros(0),
+        effort=np.zeros(0),
+    )
+    seen = [detections(T0 + nth * S, ("0", "mug")) for nth in range(3)]
+    joints = [Msg("/joint_states", kind, T0, body)]
+    write_mcap(tmp_path / "rec_A" / "rec_A_0.mcap", [*joints, *seen])
+    own_all(tmp_path)
+    keep_all(days_of(tmp_path), tmp_path)
+    reader = McapReader()
+    [kept] = reader.records(tmp_path / DAY_FILE, ["/joint_states"], TimeWindow.everything())
+    message: Any = reader.decode(kept)
+    assert message.name == ["1", "2", "3"]
+    assert message.position.tolist() == pytest.approx([0.1, 0.2, 0.3], abs=0.001)
+    assert labels_in(tmp_path / DAY_FILE) == {"mug"}
+
+
+def test_a_clock_that_was_ahead_hides_nothing_and_pushes_no_day_out(bag_dir: Path) -> None:
+    ahead = 400 * 86_400
+    now = SettableClock(T0 + (ahead + 100) * S)
+    for start, name in ((ahead, "rec_A"), (0, "rec_B"), (86_400, "rec_C")):
+        split(bag_dir, start, name=name)
+        own_all(bag_dir)
+        keep_all(days_of(bag_dir), bag_dir, name, clock=now)
+        (bag_dir / name / f"{name}_{start // 60}.mcap").unlink()
+        now = SettableClock(T0 + 86_400 * S)
+    assert read_thinned(bag_dir).since == T0
+    assert "are not known" not in str(reply_over(bag_dir, "data_time_range"))
+    days = sorted(path.name for path in (bag_dir / "memory").glob("*.mcap"))
+    size = sum(path.stat().st_size for path in (bag_dir / "memory").glob("*.mcap"))
+    days_of(bag_dir, limits=MemoryLimits(max_bytes=size - 1)).limit(T0 + 90_000 * S)
+    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == days[:2]
