@@ -17,7 +17,6 @@ from ros2_memory.core.text import counted
 from ros2_memory.recorder.handover.transfer import (
     READY_TIMEOUT_S,
     SUBSCRIBE_TIMEOUT_S,
-    HandoverPlan,
     HandoverTransfer,
     Step,
 )
@@ -174,10 +173,11 @@ class RecordingSessions:
         self.handover = HandoverTransfer(
             old,
             new,
-            HandoverPlan(now, subscribe_timeout_s=self._orders.subscribe_timeout_s),
+            now,
             self._orders.reader,
             simulated=self._orders.simulated,
             is_listed=self._orders.topics.selection.matches,
+            subscribe_timeout_s=self._orders.subscribe_timeout_s,
         )
         self._events.info("rotation_begun", recording=old.name, next=name)
 

@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import ctypes
 import os
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.child import run_bounded
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
 
 TIMEOUT_S: Final = 5.0
 """How long `timedatectl` may take; the bus may have to start timedated."""
@@ -25,10 +22,7 @@ _ASK: Final = ("timedatectl", "show", "--property=NTPSynchronized", "--value")
 _PASSED_ON: Final = ("PATH", "DBUS_SYSTEM_BUS_ADDRESS")
 
 
-def is_synchronised(
-    environment: Mapping[str, str] | None = None,
-    kernel_error_us: Callable[[], int | None] | None = None,
-) -> bool:
+def is_synchronised() -> bool:
     """Whether timedated reports the clock synchronised, or the kernel where there is no timedated.
 
     timedated first: the recorder's unit sets `ProtectClock=yes`, whose filter refuses adjtimex(2),
@@ -37,20 +31,16 @@ def is_synchronised(
     of the clock resets, and which grows beyond 16 s about nine hours after the last of them ended.
 
     It may take some seconds. Raises nothing; False also where neither can be asked.
-
-    Args:
-        environment: where `timedatectl` is looked up; the process's own environment where None.
-        kernel_error_us: gives the kernel's error bound in microseconds, or None if unknown.
     """
-    answer = _ask_timedated(os.environ if environment is None else environment)
+    answer = _ask_timedated()
     if answer is not None:
         return answer
-    error_us = (kernel_error_us or kernel_error)()
+    error_us = kernel_error()
     return error_us is not None and error_us < MAX_ERROR_US
 
 
-def _ask_timedated(environment: Mapping[str, str]) -> bool | None:
-    env = {name: environment[name] for name in _PASSED_ON if name in environment}
+def _ask_timedated() -> bool | None:
+    env = {name: os.environ[name] for name in _PASSED_ON if name in os.environ}
     try:
         finished = run_bounded(_ASK, {**env, "LC_ALL": "C"}, TIMEOUT_S)
     except (RecorderError, OSError):

@@ -243,7 +243,10 @@ class GarbageCollector:
         if self._memory is not None:
             # As bags do, days age by the newest that is recorded, and by a clock that is right.
             newest = snapshot.latest if stock.synchronised else None
-            self._limit_memory(None if newest is None else min(newest, snapshot.scanned_at))
+            try:
+                self._memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
+            except (EpisodicError, OSError) as error:
+                _log.error("memory_not_limited", reason=str(error))
         if free_bytes_wanted is None and result.fits:
             self._cut_topics(stock, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
@@ -376,13 +379,6 @@ class GarbageCollector:
             _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)
         else:
             self._memory_fails_since = None
-
-    def _limit_memory(self, now: Ns | None) -> None:
-        try:
-            if self._memory is not None:
-                self._memory.limit(now)
-        except (EpisodicError, OSError) as error:
-            _log.error("memory_not_limited", reason=str(error))
 
     def _note(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""

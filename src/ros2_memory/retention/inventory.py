@@ -29,7 +29,7 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import known_identity
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.index.file_state import Classification, FileState
+from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
 from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
@@ -125,14 +125,6 @@ _LEFT_OPEN: Final = frozenset({FileState.INCOMPLETE, FileState.HELD_BACK})
 else a disk too full for their cuts would stay full."""
 
 
-class _Entry(NamedTuple):
-    """A bag that may still change, and what it was made from."""
-
-    classification: Classification
-    stamp: Stamp
-    bag: StoredBag
-
-
 class _Folder(NamedTuple):
     """A recording's directory: its device, and the size of what goes with its last bag."""
 
@@ -160,7 +152,6 @@ class Inventory:
         self._root = root
         self._own = own
         self._static_topics = frozenset(static_topics)
-        self._entries: dict[str, _Entry] = {}
         self._unchanged: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
 
@@ -188,15 +179,15 @@ class Inventory:
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
-        owned: dict[str, Callable[[str], bool]] = {}
+        judges: dict[str, Callable[[str], bool]] = {}
         for state, bag in chain(self._changing(known), self._settled(known)):
             path, recording = bag.path, bag.recording
             if path in deleted:
                 continue
-            if recording not in owned:
-                owned[recording] = self._judge(recording)
-            name = path[len(recording) + 1 :]
-            own, is_named = owned[recording](name), recording in named
+            if self._own is not None and recording not in judges:
+                judges[recording] = self._own.judge_of(recording)
+            name, is_named = path[len(recording) + 1 :], recording in named
+            own = self._own is None or judges[recording](name)
             is_saved = path in known.saved
             # One is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
@@ -230,35 +221,33 @@ class Inventory:
         )
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
-        """Yields the bags that the index has notes on."""
-        for path, classification in known.counted.items():
-            entry = self._entries.get(path)
-            stamp = known.files[path].stamp
-            if not (entry and entry.classification is classification and entry.stamp is stamp):
-                bag = self._stored(path, classification, known)
-                entry = self._entries[path] = _Entry(classification, stamp, bag)
-            yield classification.state, entry.bag
+        """Yields the bags that the index has notes on: few, which may still change."""
+        for path, found in known.counted.items():
+            stamp, other = known.files[path].stamp, other_form(path)
+            file = (stamp.inode, stamp.size)
+            bag = self._stored(path, found.bag, stamp.mtime_ns, file, known.now)
+            if other in known.hidden:
+                bag = bag._replace(second=_file(bag.device, known.files[other].stamp))
+            yield found.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags of which the index keeps rows."""
         rows = self._unchanged
         for bag, inode in known.unchanged.values():
-            stored = rows.get(bag.file)
-            if stored is None or (stored.inode, stored.size, stored.written) != (
-                inode,
-                bag.size,
-                bag.mtime_ns,
-            ):
-                recording = sys.intern(bag.file.rpartition("/")[0])
-                device = self._folder(recording, known.now).device
-                span, file = self._span(bag), (device, inode, bag.size)
-                stored = StoredBag(bag.file, recording, *span, bag.mtime_ns, *file)
+            stored, now = rows.get(bag.file), (inode, bag.size, bag.mtime_ns)
+            if stored is None or (stored.inode, stored.size, stored.written) != now:
+                stored = self._stored(bag.file, bag, bag.mtime_ns, now[:2], known.now)
                 rows[bag.file] = stored
             yield FileState.CLOSED, stored
 
-    def _judge(self, recording: str) -> Callable[[str], bool]:
-        """Returns what decides by its name whether a bag in a directory may be deleted."""
-        return (lambda _: True) if self._own is None else self._own.judge_of(recording)
+    def _stored(
+        self, path: str, bag: BagFile | None, written: Ns, file: tuple[int, int], now: Ns
+    ) -> StoredBag:
+        """Returns a bag; `file` is its inode and size."""
+        recording = sys.intern(path.rpartition("/")[0])
+        span = _UNDATED if bag is None else self._span(bag)
+        device = self._folder(recording, now).device
+        return StoredBag(path, recording, *span, written, device, *file)
 
     def _counts(self, state: FileState, bag: StoredBag) -> bool:
         """Whether a bag that is kept counts among the other bytes."""
@@ -277,23 +266,6 @@ class Inventory:
             device = -1
         stamps = {stamp.inode: stamp for stamp in known.saved.values()}
         return tuple(_file(device, stamp) for stamp in stamps.values())
-
-    def _stored(self, path: str, classification: Classification, known: KnownBags) -> StoredBag:
-        recording = sys.intern(path.rpartition("/")[0])
-        device = self._folder(recording, known.now).device
-        other = other_form(path)
-        bag, stamp = classification.bag, known.files[path].stamp
-        second = known.files.get(other) if other in known.hidden else None
-        return StoredBag(
-            path,
-            recording,
-            *(_UNDATED if bag is None else self._span(bag)),
-            stamp.mtime_ns,
-            device,
-            stamp.inode,
-            stamp.size,
-            None if second is None else _file(device, second.stamp),
-        )
 
     def _span(self, bag: BagFile) -> tuple[Ns, Ns]:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
@@ -325,18 +297,11 @@ class Inventory:
         return known
 
     def _forget(self, known: KnownBags) -> None:
-        gone = self._entries.keys() - known.counted.keys()
-        for path in gone:
-            del self._entries[path]
         if len(self._unchanged) > len(known.unchanged):
-            for path in [path for path in self._unchanged if path not in known.unchanged]:
-                gone.add(path)
-                del self._unchanged[path]
-        if gone:
-            bags = chain((entry.bag for entry in self._entries.values()), self._unchanged.values())
-            recordings = {bag.recording for bag in bags}
-            for path in self._folders.keys() - recordings:
-                del self._folders[path]
+            left = {path: bag for path, bag in self._unchanged.items() if path in known.unchanged}
+            recordings = self._folders.keys() & {bag.recording for bag in left.values()}
+            self._unchanged = left
+            self._folders = {path: self._folders[path] for path in recordings}
 
 
 def state_bytes_in(bag_dir: Path) -> int:

@@ -322,11 +322,8 @@ class MomentKeeper:
             raise
         flush(folder.parent)
         stored[folder.name] = made
-        if begun.rule is None:
-            _log.info("moment_kept", folder=folder.name, bags=len(made.files))
-        else:
-            rule = begun.rule
-            _log.info("moment_kept", folder=folder.name, bags=len(made.files), rule=rule)
+        rule = {} if begun.rule is None else {"rule": begun.rule}
+        _log.info("moment_kept", folder=folder.name, bags=len(made.files), **rule)
         return made
 
     def _advance(
@@ -453,10 +450,8 @@ def _gone(name: str) -> str:
 
 def _of_number(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    return next(
-        (moment for moment in stored.values() if moment.moment.request.number == request.number),
-        None,
-    )
+    by_number = {each.moment.request.number: each for each in stored.values()}
+    return by_number.get(request.number)
 
 
 def _linked(

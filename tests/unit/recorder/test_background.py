@@ -21,16 +21,6 @@ def test_jobs_of_one_task_run_in_order_and_those_of_another_beside_them() -> Non
     assert not background.is_under_way("slow")
 
 
-def test_a_task_that_ended_begins_again() -> None:
-    background, done = Background(), list[int]()
-    for number in range(50):
-        background.add("task", partial(done.append, number))
-        if number % 3:
-            background.wait(None)
-    background.wait(None)
-    assert done == [*range(50)]
-
-
 @pytest.mark.parametrize(
     ("error", "reason"),
     [

@@ -3,7 +3,7 @@ from __future__ import annotations
 import os
 import threading
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 import structlog
@@ -18,8 +18,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.retention.collect import GarbageCollector
-from ros2_memory.retention.delete import remove_bag, remove_emptied
+from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.housekeepers import (
@@ -34,9 +33,10 @@ from tests.support.housekeepers import (
     size_of,
 )
 from tests.support.memories import extractor
+from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableMapping
+    from collections.abc import Iterator
     from pathlib import Path
 from unittest.mock import Mock
 
@@ -68,10 +68,6 @@ def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
     return bag(path, start, count, McapLayout(chunk_size=400, finish=False))
 
 
-def events(captured: list[MutableMapping[str, Any]], name: str) -> list[MutableMapping[str, Any]]:
-    return [each for each in captured if each["event"] == name]
-
-
 class TestRetention:
     def test_the_oldest_bags_go_and_their_recording_after_them(self, tmp_path: Path) -> None:
         old, new = recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
@@ -100,14 +96,6 @@ class TestRetention:
         assert first.exists()
         keeper_of(tmp_path, max_bytes=total - 1).apply()
         assert not first.exists()
-
-    def test_what_is_too_old_goes_by_the_time_inside_and_not_by_that_of_the_file(
-        self, tmp_path: Path
-    ) -> None:
-        old, young = bag(tmp_path / "a/a_0.mcap", 0), bag(tmp_path / "a/a_1.mcap", 3 * 3600)
-        os.utime(young, ns=(T0, T0))
-        keeper_of(tmp_path, max_age_h=2).apply()
-        assert (old.exists(), young.exists()) == (False, True)
 
     def test_what_is_too_old_stays_while_the_clock_is_not_known_to_be_right(
         self, tmp_path: Path
@@ -255,13 +243,6 @@ class TestWhatIsNeverDeleted:
         keeper_of(tmp_path, max_bytes=1).apply()
         assert damaged.exists()
 
-    def test_damaged_files_from_elsewhere_do_not_push_the_history_out(self, tmp_path: Path) -> None:
-        (tmp_path / "a").mkdir()
-        (tmp_path / "a/huge.mcap").write_bytes(bytes(100_000))
-        first, *_ = recording(tmp_path, "b", 0)
-        keeper_of(tmp_path, max_bytes=size_of(tmp_path) - 100_000).apply()
-        assert first.exists()
-
     def test_what_lies_behind_a_link(self, tmp_path: Path) -> None:
         bags, outside = tmp_path / "bags", tmp_path / "outside"
         kept = recording(outside, "x", 0)
@@ -339,13 +320,6 @@ class TestMakingRoom:
         left = [name for name in files_in(tmp_path) if name.endswith(".mcap")]
         assert left == ["a/a_2.mcap", "a/a_3.mcap", "a/a_4.mcap", "a/a_5.mcap"]
 
-    def test_where_deleting_frees_less_than_it_should_more_is_deleted(self, tmp_path: Path) -> None:
-        recording(tmp_path, "a", 0, splits=6)
-        whole = size_of(tmp_path)
-        keeper = keeper_of(tmp_path, measure_free=lambda at: (whole - size_of(at)) // 2)
-        keeper.make_room(30_000)
-        assert (whole - size_of(tmp_path)) // 2 >= 30_000
-
     def test_where_no_deletion_is_enough_nothing_is_deleted_and_that_is_said_once(
         self, tmp_path: Path
     ) -> None:
@@ -406,27 +380,6 @@ class TestInTheBackground:
         assert not first.exists()
         assert all(asked)
 
-    @pytest.mark.parametrize(
-        ("error", "reported"),
-        [
-            (OSError("the disk is gone"), "the disk is gone"),
-            (KeyError("x"), "a fault in this program (KeyError); see its log"),
-        ],
-        ids=["of the disk", "of this program"],
-    )
-    def test_a_failure_is_reported(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, reported: str
-    ) -> None:
-        keeper = background_keeper_of(tmp_path)
-        with monkeypatch.context() as patch:
-            patch.setattr(GarbageCollector, "apply", Mock(side_effect=error))
-            keeper.apply()
-            keeper.wait()
-        assert keeper.faults() == {"apply": reported}
-        keeper.apply()
-        keeper.wait()
-        assert keeper.faults() == {}
-
 
 class TestQuestionsMeanwhile:
     @pytest.mark.parametrize("kept", [1, 0])
@@ -479,19 +432,6 @@ class TestRemoval:
             remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
         assert (tmp_path / "moved/a_0.mcap").exists()
 
-    def test_nothing_outside_the_bag_directory_is_touched(self, tmp_path: Path) -> None:
-        path = bag(tmp_path / "a/a_0.mcap", 0)
-        status = path.stat()
-        (tmp_path / "bags").mkdir()
-        with pytest.raises(ValueError, match="is not in the subpath"):
-            remove_bag(tmp_path / "bags", path, (status.st_dev, status.st_ino))
-        assert path.exists()
-
-    def test_the_bag_directory_itself_stays(self, tmp_path: Path) -> None:
-        (tmp_path / "metadata.yaml").write_text("x")
-        remove_emptied(tmp_path, tmp_path)
-        assert (tmp_path / "metadata.yaml").exists()
-
 
 @pytest.mark.parametrize(("unclean", "found"), [(True, ["unclean"]), (False, [])])
 def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
@@ -522,21 +462,6 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     newest = max(topic.last for topic in after.topics) / 1e9
     assert f"the newest message is of {newest:.3f}; later ones that had not" in reported["reason"]
     assert [each["path"] for each in events(captured, "empty_split_removed")] == [str(empty)]
-
-
-def test_a_metadata_file_of_no_bytes_is_no_last_word(tmp_path: Path) -> None:
-    open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-    (tmp_path / OWN / "metadata.yaml").write_bytes(b"")
-    keeper_of(tmp_path).repair()
-    assert McapReader().summarize(open_one).complete
-
-
-def test_a_recording_that_the_dead_recorder_named_is_repaired_at_once(tmp_path: Path) -> None:
-    open_one = left_open(tmp_path / "rec" / "rec_0.mcap")
-    clock = later(0)
-    recording_now(tmp_path, "rec", clock=clock)
-    keeper_of(tmp_path, clock=clock).repair()
-    assert McapReader().summarize(open_one).complete
 
 
 def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
@@ -573,18 +498,6 @@ def test_a_file_that_a_process_holds_open_is_left_alone(tmp_path: Path) -> None:
     assert not McapReader().summarize(theirs).complete
     keeper_of(tmp_path).apply()
     assert McapReader().summarize(theirs).complete
-
-
-def test_splits_that_a_full_disk_cut_short_are_repaired_later_on(tmp_path: Path) -> None:
-    recording(tmp_path, OWN, 0)
-    cut = left_open(tmp_path / OWN / f"{OWN}_7.mcap", 50)
-    empty = tmp_path / OWN / f"{OWN}_8.mcap"
-    empty.write_bytes(b"")
-    keeper = keeper_of(tmp_path)
-    keeper.repair()
-    keeper.apply()
-    assert McapReader().summarize(cut).complete
-    assert not empty.exists()
 
 
 def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -165,18 +164,6 @@ def test_of_a_bag_that_lies_there_compressed_too_only_one_is_indexed(
     assert snapshot.active == snapshot.damaged == snapshot.unread == ()
 
 
-def test_two_whole_forms_are_one_bag_while_one_is_young_and_two_when_both_are_kept(
-    tmp_path: Path,
-) -> None:
-    yard = Yard(tmp_path, ".mcap", ".mcap.zstd")
-    plain(tmp_path / "rec_0.mcap", [1, 2])
-    yard.age()
-    os.utime(plain(tmp_path / "rec_0.mcap.zstd", [1, 2]), ns=(NOW, NOW))
-    assert _names(yard.scan_after().bags) == ["rec_0.mcap"]
-    yard.age()
-    assert sorted(_names(yard.scan_after().bags)) == ["rec_0.mcap", "rec_0.mcap.zstd"]
-
-
 def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_other(
     tmp_path: Path,
 ) -> None:
@@ -191,49 +178,12 @@ def test_a_form_that_is_not_read_is_no_complaint_until_it_is_kept_beside_the_oth
     assert _names(yard.scan_after(31).unread) == ["rec_0.mcap.zstd", "rec_1.mcap.zstd"]
 
 
-def test_a_bag_that_vanishes_while_it_is_read_is_left_out_and_found_if_it_comes_back(
-    yard: Yard,
-) -> None:
-    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [1])
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [2])
-    yard.age()
-    yard.reader.before_summary = lambda read: read.unlink() if read == path else None
-    snapshot = yard.scan_after()
-    assert _names(snapshot.bags) == ["rec_1.mcap"]
-    assert snapshot.damaged == ()
-    yard.reader.before_summary = bool
-    plain(path, [1])
-    yard.age()
-    assert _names(yard.scan_after().bags) == ["rec_0.mcap", "rec_1.mcap"]
-
-
-def test_a_bag_directory_that_is_unmounted_takes_its_bags_along(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], silent=["/scan"])
-    plain(yard.bag_dir / "rec" / "rec_1.mcap", [1], closed=False)
-    (yard.bag_dir / "rec" / "rec_2.mcap").touch()
-    yard.age()
-    before = yard.scan_after()
-    yard.bag_dir.rename(yard.bag_dir.with_name("elsewhere"))
-    gone = yard.scan_after()
-    assert (gone.bags, replace(gone, problem=None)) == ((), Snapshot(scanned_at=NOW))
-    assert gone.problem
-    yard.bag_dir.with_name("elsewhere").rename(yard.bag_dir)
-    after = yard.scan_after()
-    assert (after.bags, after) == (before.bags, before)
-
-
 def test_a_snapshot_is_kept_until_it_is_older_than_refresh_s(yard: Yard) -> None:
     first = yard.index.snapshot()
     yard.clock.at += 5 * S - 1
     assert yard.index.snapshot() is first
     yard.clock.at += 1
     assert yard.index.snapshot().scanned_at == NOW + 5 * S
-
-
-def test_a_clock_that_was_set_back_has_the_snapshot_renewed(yard: Yard) -> None:
-    yard.index.snapshot()
-    yard.clock.at -= 1
-    assert yard.index.snapshot().scanned_at == NOW - 1
 
 
 def test_a_question_that_reaches_past_the_newest_end_looks_for_newer_bags(yard: Yard) -> None:
@@ -299,17 +249,3 @@ def test_a_scan_that_changed_something_is_one_log_event(yard: Yard) -> None:
         "active": 0,
     }
     assert scanned["duration_ms"] >= 0
-
-
-def test_a_growing_active_bag_is_no_log_event(yard: Yard) -> None:
-    path = plain(yard.bag_dir / "rec" / "rec_0.mcap", [0], closed=False)
-    yard.age(NOW)
-    yard.scan_after()
-    with capture_logs() as events:
-        for moment in range(4):
-            if moment == 1:
-                events.clear()  # that it is being written is news, that it still is none
-            grow(path, moment)
-            os.utime(path, ns=(yard.clock.at,) * 2)
-            assert _names(yard.scan_after(1).active) == ["rec_0.mcap"]
-    assert events == []

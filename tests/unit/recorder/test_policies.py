@@ -32,9 +32,6 @@ class TestSilence:
         watch.began(0, 5)
         return watch
 
-    def test_a_robot_that_never_spoke_is_left_alone(self) -> None:
-        assert silent_at(self.watch(), {0: 0}, 1000) is None
-
     def test_headers_and_latched_messages_of_a_young_recording_are_no_speech(self) -> None:
         assert silent_at(self.watch(), {0: 0, 1: 500, 4.5: 900}, 1000) is None
 

@@ -86,11 +86,6 @@ class TestSessions:
         assert len(world.recorders) > 1
         world.supervisor.stop()
 
-    def test_without_rules_there_is_no_state(self, tmp_path: Path) -> None:
-        world = World(tmp_path, housekeeper=keeper_of(tmp_path)).started(10)
-        world.supervisor.stop()
-        assert not (tmp_path / SCREENED_FILE).exists()
-
 
 class TestTheHouse:
     def test_what_a_crash_left_open_is_repaired_and_then_screened(self, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -53,11 +52,3 @@ def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(
     assert changes.closed == ("rec_1_0.mcap",)
     assert len(changes.faults) == 1
     assert splits.observe(1) == SplitChanges()
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read every directory")
-def test_a_directory_that_may_not_be_read_is_reported(splits: Splits) -> None:
-    write(splits, 0, "/a")
-    splits.directory.chmod(0)
-    assert len(splits.observe(0).faults) == 1
-    splits.directory.chmod(0o755)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -83,17 +82,6 @@ def test_a_bag_directory_that_is_a_link_itself_is_cleared(tmp_path: Path) -> Non
     assert left(tmp_path / "real") == []
 
 
-def test_what_is_named_like_a_bag_and_is_no_file_stays(tmp_path: Path) -> None:
-    (tmp_path / "dir.mcap").mkdir()
-    os.mkfifo(tmp_path / "pipe.mcap")
-    clear_bags(tmp_path)
-    assert left(tmp_path) == ["dir.mcap", "pipe.mcap"]
-
-
-def test_a_directory_that_is_not_there_is_clear(tmp_path: Path) -> None:
-    assert clear_bags(tmp_path / "bags").files == 0
-
-
 @pytest.mark.parametrize("path", ["/", "~", "~/.."])
 def test_the_root_homes_and_what_holds_them_are_refused(path: str) -> None:
     with pytest.raises(RecorderError, match="clear_on_startup refuses"):
@@ -142,7 +130,3 @@ def test_a_recording_with_anything_in_it_stays(tmp_path: Path, name: str, conten
     (recording / name).write_bytes(content)
     assert not remove_if_empty(recording)
     assert len(list(recording.iterdir())) == 2
-
-
-def test_a_recording_that_is_not_there_is_not_removed(tmp_path: Path) -> None:
-    assert not remove_if_empty(tmp_path / "rec_1")

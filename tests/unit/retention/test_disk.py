@@ -40,15 +40,6 @@ def test_a_directory_that_is_not_there_lies_where_it_would_be_made(tmp_path: Pat
     assert device_of(Path("/proc")) != tmp_path.stat().st_dev
 
 
-def test_it_is_away_while_another_disk_lies_there(home: HomeDisk, devices: Devices) -> None:
-    assert not home.is_away(["rec_a"])
-    devices.number = 2
-    assert home.is_away(["rec_a"])
-    assert home.is_away([])
-    devices.number = 1
-    assert not home.is_away([])
-
-
 def test_it_is_known_by_its_recordings_under_another_number(
     tmp_path: Path, home: HomeDisk, devices: Devices
 ) -> None:
@@ -69,13 +60,3 @@ def test_what_is_recorded_on_another_disk_makes_it_none_of_its_own(
     assert home.is_away([])
     (tmp_path / "rec_b").mkdir()
     assert home.is_away(["rec_b"])
-
-
-@pytest.mark.parametrize("away", [False, True])
-def test_where_it_cannot_be_found_out_it_is_as_before(
-    home: HomeDisk, devices: Devices, away: bool
-) -> None:
-    devices.number = 2 if away else 1
-    assert home.is_away([]) is away
-    devices.fails = True
-    assert home.is_away([]) is away

@@ -23,7 +23,7 @@ from ros2_memory.insights.status import memory_status
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
-from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.housekeepers import (
@@ -41,7 +41,6 @@ from tests.support.housekeepers import (
     made_moment,
     own_all,
     recording,
-    recording_now,
     size_of,
 )
 from tests.support.memories import memory_of
@@ -98,16 +97,6 @@ class TestRetention:
         assert all(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
 
-    def test_on_a_full_disk_the_recorders_own_go_and_then_nothing(
-        self, mixed: tuple[Path, list[Path], list[Path]]
-    ) -> None:
-        bag_dir, mine, others = mixed
-        house = house_of(bag_dir, keeps_foreign=True, measure_free=lambda _: 0)
-        for _ in range(3):
-            house.make_room(1)
-        assert all(path.exists() for path in others)
-        assert [path for path in mine if path.exists()] == mine[-1:]
-
     def test_the_budget_counts_the_recorders_own_and_moments_alone(
         self, mixed: tuple[Path, list[Path], list[Path]]
     ) -> None:
@@ -130,13 +119,6 @@ class TestRetention:
         # The first two are kept in a moment, and would free nothing.
         assert [path.exists() for path in mine[:4]] == [True, True, False, True]
 
-    def test_a_foreign_bag_ages_no_bag_of_the_recorder(self, tmp_path: Path) -> None:
-        mine = recording(tmp_path, A, 0)
-        own_all(tmp_path)
-        foreign(tmp_path, "later/x_0.mcap", start=3 * 3600)
-        house_of(tmp_path, keeps_foreign=True, max_age_h=1).apply()
-        assert all(path.exists() for path in mine)
-
     def test_with_delete_all_bags_are_weighed(
         self, mixed: tuple[Path, list[Path], list[Path]]
     ) -> None:
@@ -144,18 +126,6 @@ class TestRetention:
         house_of(bag_dir, keeps_foreign=False, max_bytes=LITTLE).apply()
         assert not any(path.exists() for path in others)
         assert [path for path in mine if path.exists()] == mine[-1:]
-
-    def test_an_adopted_recording_is_the_recorders(self, tmp_path: Path) -> None:
-        [old] = foreign(tmp_path, "session_mcap/session_0.mcap")
-        recording(tmp_path, A, 0)
-        (tmp_path / "session_mcap" / "broken.mcap").write_bytes(b"no bag")
-        own_all(tmp_path)
-        house = house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE)
-        with structlog.testing.capture_logs() as logs:
-            house.apply()
-        assert not old.exists()
-        [reported] = [each for each in logs if each["event"] == "retention_applied"]
-        assert reported["foreign_bytes"] == 0
 
     def test_a_restored_recording_is_kept_until_it_is_adopted(self, tmp_path: Path) -> None:
         bags = tmp_path / "bags"
@@ -259,17 +229,6 @@ class TestRepair:
         keeper_of(tmp_path, keeps_foreign=True).repair()
         assert not (tmp_path / A).exists()
         assert (tmp_path / B / f"{B}_0.mcap").exists()
-
-    def test_what_a_killed_recorder_began_stays_if_anything_lies_there(
-        self, tmp_path: Path
-    ) -> None:
-        own_all(tmp_path)
-        OwnRecordings(tmp_path).begin(A)
-        (tmp_path / A).mkdir()
-        (tmp_path / A / "notes").touch()
-        (tmp_path / A / f"{A}_0.mcap").touch()
-        keeper_of(tmp_path, keeps_foreign=True).repair()
-        assert (tmp_path / A / f"{A}_0.mcap").exists()
 
     def test_another_programs_bag_is_neither_rewritten_nor_removed(self, tmp_path: Path) -> None:
         own_all(tmp_path)
@@ -384,12 +343,6 @@ class TestReports:
         memory.index.refresh()
         assert memory_status(memory, Call()).budget.foreign == 0
 
-    def test_a_recording_that_has_just_begun_is_not_foreign(self, tmp_path: Path) -> None:
-        own_all(tmp_path)
-        foreign(tmp_path, "rec_now/x_0.mcap")
-        recording_now(tmp_path, "rec_now")
-        assert memory_status(self.memory(tmp_path), Call()).budget.foreign == 0
-
     def test_nothing_is_reported_where_it_is_not_known_or_does_not_matter(
         self, tmp_path: Path
     ) -> None:
@@ -433,23 +386,10 @@ class TestAdopt:
         assert "adopted: old/a (2 bag files, " in reported
         assert "retention deletes them from now on" in reported
 
-    def test_by_its_name_in_the_bag_directory(self, tmp_path: Path, capsys: Capture) -> None:
-        foreign(tmp_path, "session_mcap/s_0.mcap")
-        assert cli.main(["adopt", "session_mcap"]) == 0
-        assert cli.main(["adopt", "session_mcap"]) == 0
-        assert "1 directory is the recorder's own already" in capsys.readouterr().out
-        assert len(lines(tmp_path)) == 2
-
     def test_all_of_the_bag_directory_but_what_lies_loose(self, tmp_path: Path) -> None:
         foreign(tmp_path, "loose.mcap", "a/a_0.mcap", "latched/carried.mcap", "moments/m/r/r.mcap")
         assert cli.main(["adopt", str(tmp_path)]) == 0
         assert [*OwnRecordings(tmp_path).names()] == ["a"]
-
-    def test_it_adopts_nothing_else_where_there_was_no_list(self, tmp_path: Path) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", {"recorded_by": "ros2-memory"})
-        foreign(tmp_path, "session_mcap/s_0.mcap")
-        assert cli.main(["adopt", "session_mcap"]) == 0
-        assert {*OwnRecordings(tmp_path).names()} == {"session_mcap"}
 
     @pytest.mark.parametrize("name", ["nowhere", "/", "..", "link"])
     def test_what_is_no_directory_of_bags_here_is_refused(
@@ -459,11 +399,6 @@ class TestAdopt:
         (tmp_path / "link").symlink_to(tmp_path / "a")
         assert cli.main(["adopt", name]) == 2
         assert "ros2-memory adopt: " in capsys.readouterr().err
-
-    def test_a_directory_without_a_bag_is_said(self, tmp_path: Path, capsys: Capture) -> None:
-        (tmp_path / "a").mkdir()
-        assert cli.main(["adopt", "a"]) == 1
-        assert "there are no bag files" in capsys.readouterr().out
 
     def test_links_are_neither_adopted_nor_counted(self, tmp_path: Path, capsys: Capture) -> None:
         [target] = foreign(tmp_path, "old/x_0.mcap")
@@ -482,20 +417,3 @@ class TestAdopt:
         assert cli.main(["adopt", "old", "a"]) == 0
         assert "adopted: old (1 bag file, " in capsys.readouterr().out
         assert [*OwnRecordings(tmp_path).names()] == ["old"]
-
-    def test_where_nothing_is_recorded_nothing_is_adopted(
-        self, tmp_path: Path, capsys: Capture
-    ) -> None:
-        foreign(tmp_path, "a/a_0.mcap")
-        assert cli.main(["adopt", "a", "--set", "recorder=none"]) == 2
-        assert "recorder=none" in capsys.readouterr().err
-        assert not (tmp_path / ".episodic").exists()
-
-
-def test_a_bag_of_latched_messages_that_are_carried_is_not_foreign(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "latched" / "carried.mcap", [boolean(T0, True)])
-    own_all(tmp_path)
-    with structlog.testing.capture_logs() as logs:
-        house_of(tmp_path, keeps_foreign=True).apply()
-    [reported] = [each for each in logs if each["event"] == "retention_applied"]
-    assert reported["foreign_bytes"] == 0

@@ -19,14 +19,12 @@ from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.housekeepers import (
     NOW,
-    PLENTY,
     T0,
     A,
     B,
     S,
     bag,
     house_of,
-    in_moments,
     kept,
     recording,
     size_of,
@@ -79,69 +77,6 @@ class TestRetention:
         house_of(tmp_path, max_bytes=small, clock=clock, keeps_foreign=True).apply()
         assert [path.exists() for path in made] == [False, False, True, True]
 
-    def test_a_kept_bag_is_one_bag_wherever_it_is_counted(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        memory = memory_of(tmp_path)
-        plain = queries.list_recorded_topics(memory, Call())
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 12, 38, "two")
-
-        def counted() -> tuple[int, int]:
-            snapshot = memory.index.refresh()
-            fresh = memory_of(tmp_path).index.snapshot()
-            assert [bag.file for bag in fresh.bags] == [bag.file for bag in snapshot.bags]
-            [row] = queries.list_recorded_topics(memory, Call())
-            return len(snapshot.bags), row.count
-
-        assert queries.list_recorded_topics(memory, Call()) == plain
-        assert counted() == (6, 60)
-        for path in made[1:3]:
-            path.unlink()
-        assert counted() == (6, 60)
-        shutil.rmtree(min((tmp_path / "moments").iterdir()))
-        assert counted() == (6, 60)
-        shutil.rmtree(tmp_path / "moments")
-        assert counted() == (4, 40)
-
-    def test_the_budget_counts_a_kept_bag_once_and_never_as_freed(self, tmp_path: Path) -> None:
-        made = recording(tmp_path, A, 0)
-        kept(house_of(tmp_path), tmp_path, 0, 15)
-        total = size_of(tmp_path)
-        with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path, max_bytes=total).apply()
-            assert all(path.exists() for path in made)
-            house_of(tmp_path, max_bytes=total - 1).apply()
-        # The first two would free nothing.
-        assert [path.exists() for path in made] == [True, True, False, True, True, True]
-        reported = [event for event in captured if event["event"] == "retention_applied"]
-        assert [event["total_bytes"] for event in reported] == [total, size_of(tmp_path)]
-
-    def test_a_bag_that_lies_in_moments_alone_counts_once_in_the_budget(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, A, 0)
-        recording(tmp_path, B, 3 * 3600)
-        house = house_of(tmp_path, max_age_h=1)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 15, 35, "two")
-        house.apply()
-        assert not (tmp_path / A).exists()
-        with structlog.testing.capture_logs() as captured:
-            house.apply()
-        [reported] = [event for event in captured if event["event"] == "retention_applied"]
-        sidecars = [path.stat() for path in (tmp_path / "moments").rglob("handover.json")]
-        assert reported["total_bytes"] - size_of(tmp_path) in {0, sidecars[0].st_size}
-
-    def test_moments_stay_where_the_budget_cannot_be_held(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path, max_bytes=1)
-        kept(house, tmp_path, 0, 15)
-        for _ in range(2):
-            house.apply()
-            house.make_room(PLENTY * 2)
-        assert len(in_moments(tmp_path)) == 2
-
     def test_a_transform_that_held_then_is_carried_for_as_long_as_the_moment_is_kept(
         self, tmp_path: Path
     ) -> None:
@@ -179,14 +114,6 @@ class TestRetention:
         house.apply()
         [sidecar] = (tmp_path / "moments").rglob("handover.json")
         assert sidecar.samefile(tmp_path / A / "handover.json")
-
-    def test_what_is_kept_beside_bags_counts_in_the_budget(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        kept(house_of(tmp_path), tmp_path, 15, 25)
-        with structlog.testing.capture_logs() as captured:
-            house_of(tmp_path).apply()
-        [reported] = [event for event in captured if event["event"] == "retention_applied"]
-        assert reported["total_bytes"] == size_of(tmp_path)
 
 
 STEPS = st.lists(

@@ -147,22 +147,6 @@ class TestTheBagOfCarriedMessages:
         known = (after.channel.topic, after.channel.schema, *after.channel.metadata[:1])
         assert known == (before.channel.topic, before.channel.schema, *before.channel.metadata)
 
-    def test_another_message_of_the_topic_supersedes_what_was_carried(self, tmp_path: Path) -> None:
-        splits = [
-            [docked(T0 + n * 10 * S, f"dock {n}"), *drive(T0 + n * 10 * S, T0 + (n + 1) * 10 * S)]
-            for n in range(4)
-        ]
-        recording(tmp_path, "rec", *splits)
-        keep_only(tmp_path, "rec/rec_2.mcap", "rec/rec_3.mcap")
-        assert [each.log_time for each in records(tmp_path)] == [T0 + 10 * S]
-        keep_only(tmp_path, "rec/rec_3.mcap")
-        assert [each.log_time for each in records(tmp_path)] == [T0 + 20 * S]
-
-    def test_nothing_is_written_where_nothing_is_latched(self, tmp_path: Path) -> None:
-        recording(tmp_path, "rec", drive(T0, T0 + 9 * S), drive(T0 + 10 * S, T0 + 20 * S))
-        keep_only(tmp_path, "rec/rec_1.mcap")
-        assert files_in(tmp_path) == ["rec", "rec/rec_1.mcap"]
-
     def test_it_is_not_written_again_where_nothing_changes(self, tmp_path: Path) -> None:
         again = docked(T0, "home", received=T0 + 10 * S)
         recording(tmp_path, "rec", [docked(T0, "home"), *drive(T0, T0 + 9 * S)])
@@ -173,12 +157,6 @@ class TestTheBagOfCarriedMessages:
         keep_only(tmp_path, "thi/thi_0.mcap")
         after = (tmp_path / "latched/carried.mcap").stat()
         assert (after.st_ino, after.st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
-
-    def test_it_is_never_deleted_itself(self, tmp_path: Path) -> None:
-        at_home(tmp_path)
-        keep_only(tmp_path, "rec/rec_1.mcap")
-        keeper_of(tmp_path, max_bytes=0, max_age_h=0.001).apply()
-        assert "latched/carried.mcap" in files_in(tmp_path)
 
     def test_messages_of_a_sqlite_bag_are_carried(self, tmp_path: Path) -> None:
         write_db3(tmp_path / "rec/old_0.db3", [frame(T0, "laser", 0.1), *drive(T0, T0 + 9 * S)])
@@ -243,15 +221,6 @@ class TestTheBagOfCarriedMessages:
             keeper_of(tmp_path, max_bytes=1, grace_s=10**6).apply()
         assert "rec/rec_0.mcap" not in files_in(tmp_path)
         assert held(memory_of(tmp_path), DOCK, T0 + 15 * S) == (T0, {"value": "home"})
-
-    @needs_recorded
-    def test_frames_of_several_broadcasters_survive_all_splits_but_the_last(
-        self, tmp_path: Path
-    ) -> None:
-        copied(RECORDED / "extra/tfs", tmp_path / "tfs")
-        before = static_children(tmp_path)
-        keep_only(tmp_path, "tfs/tfs_5.mcap")
-        assert static_children(tmp_path) == before == {"c1", "c2", "c3"}
 
     @needs_recorded
     def test_a_real_recording_looks_its_frames_up_as_before(self, tmp_path: Path) -> None:
@@ -353,16 +322,6 @@ class TestTheBagOfCarriedMessages:
 
 def looked_up(memory: Memory, moment: int) -> object:
     return queries.transform(memory, Call(), "odom", "laser", at(moment)).transform
-
-
-def static_children(bag_dir: Path) -> set[str]:
-    reader = McapReader()
-    children = set()
-    for path in bag_dir.rglob("*.mcap"):
-        for record in reader.records(path, ["/tf_static"], TimeWindow.everything()):
-            message: object = reader.decode(record)
-            children |= {each.child_frame_id for each in message.transforms}  # type: ignore[attr-defined]
-    return children
 
 
 def records(bag_dir: Path) -> list[Record]:

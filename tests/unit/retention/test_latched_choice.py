@@ -14,33 +14,6 @@ if TYPE_CHECKING:
 
 
 class TestWorthCarrying:
-    def test_the_newest_of_each_hold(self) -> None:
-        a, b, c = message(1, "/a"), message(2, "/a"), message(3, "/b")
-        assert worth_carrying([a, b, c], nowhere, {}) == {b, c}
-
-    def test_one_that_held_while_something_was_recorded_that_is_kept(self) -> None:
-        a, b = message(10, "/a"), message(20, "/a")
-        assert worth_carrying([a, b], during(15), {}) == {a, b}
-        assert worth_carrying([a, b], during(9), {}) == {b}
-        assert worth_carrying([a, b], during(20), {}) == {b}
-
-    def test_the_first_transform_of_a_frame_holds_before_it_was_received(self) -> None:
-        a, b = message(10, "/tf_static", "c"), message(20, "/tf_static", "c")
-        assert worth_carrying([a, b], during(5), {}) == {a, b}
-
-    def test_one_that_a_kept_bag_repeats_later(self) -> None:
-        a, b = message(1, "/a"), message(2, "/a")
-        assert worth_carrying([a, b], nowhere, {a.identity: 50}) == {a, b}
-
-    def test_not_one_that_is_in_a_kept_bag_as_early(self) -> None:
-        a = message(1, "/a")
-        assert worth_carrying([a], nowhere, {a.identity: 1}) == set()
-
-    def test_of_copies_only_the_earliest(self) -> None:
-        a = message(5, "/a", published=1)
-        copy = message(9, "/a", published=1)
-        assert worth_carrying([copy, a], nowhere, {}) == {a}
-
     @given(st.data())
     def test_what_is_carried_is_carried_on_whatever_the_order(self, data: st.DataObject) -> None:
         drawn = data.draw(st.lists(st.tuples(st.integers(0, 20), st.sampled_from("ab"))))
@@ -55,10 +28,6 @@ def message(moment: int, topic: str, child: str = "", *, published: int | None =
     holds = ((topic, ""), (topic, child)) if child else ((topic, ""),)
     sent = moment if published is None else published
     return Latched(moment, MessageIdentity(topic, sent, child.encode()), holds)
-
-
-def nowhere(start: int, stop: int) -> bool:
-    return False
 
 
 def during(moment: int) -> Callable[[int, int], bool]:

@@ -42,22 +42,6 @@ def folders(bag_dir: Path, *names: str) -> None:
         (bag_dir / name).mkdir()
 
 
-def test_a_recording_is_as_old_as_what_was_recorded_after_it(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    time = RecordedTime(tmp_path)
-    end = recorded(time, "a", 90)
-    recorded(time, "b", 30, since_s=end)
-    assert time.since(["a", "b"]) == {"a": 30 * S, "b": 0}
-
-
-def test_it_goes_on_after_a_boot_where_the_monotonic_clock_begins_anew(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    recorded(RecordedTime(tmp_path), "a", 120, since_s=90_000)
-    again = RecordedTime(tmp_path)
-    recorded(again, "b", 60, since_s=2)
-    assert again.since(["a", "b"]) == {"a": 60 * S, "b": 0}
-
-
 def test_a_kill_forgets_a_minute_at_most(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     recorded(RecordedTime(tmp_path), "a", 119)
@@ -97,19 +81,6 @@ def test_pauses_do_not_count_and_write_nothing(tmp_path: Path) -> None:
     assert time.since(["a"]) == {"a": 5 * S}
 
 
-def test_dates_are_right_once_a_synchronised_clock_confirms_them(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    time = RecordedTime(tmp_path)
-    end = recorded(time, "a", 20)
-    assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset("a"), True)
-    time.confirm_clock()
-    end = recorded(time, "a", 20, since_s=end)
-    assert (time.doubtful(["a"]), time.asks_for_clock()) == (frozenset(), False)
-    recorded(time, "b", 20, since_s=end)
-    assert (time.doubtful("ab"), time.asks_for_clock()) == (frozenset("b"), True)
-    assert RecordedTime(tmp_path).doubtful("ab") == {"b"}
-
-
 def test_dates_of_a_recording_in_which_the_clock_was_set_stay_doubtful(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     for before, after in ((T0_S - 3600, T0_S), (T0_S, T0_S + 3600)):
@@ -126,15 +97,6 @@ def test_dates_of_a_recording_in_which_the_clock_was_set_stay_doubtful(tmp_path:
         assert RecordedTime(tmp_path).doubtful("ab") == {"a"}
 
 
-def test_a_step_of_a_second_leaves_dates_right(tmp_path: Path) -> None:
-    folders(tmp_path, "a")
-    time = RecordedTime(tmp_path)
-    end = recorded(time, "a", 20)
-    time.confirm_clock()
-    recorded(time, "a", 20, since_s=end, lead_s=T0_S + 1)
-    assert time.doubtful(["a"]) == frozenset()
-
-
 def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_path: Path) -> None:
     folders(tmp_path, "a", "b")
     assert RecordedTime(tmp_path).doubtful("ab") == frozenset()
@@ -144,17 +106,6 @@ def test_without_a_file_no_date_is_doubtful_and_with_a_damaged_one_all_are(tmp_p
     assert time.doubtful("ab") == {"a", "b"}
     recorded(time, "c", 20)
     assert RecordedTime(tmp_path).doubtful("ab") == {"a", "b"}
-
-
-def test_lines_that_mean_nothing_are_passed_by(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b", "c")
-    (tmp_path / ".episodic").mkdir()
-    odd = ['{"recording": "c", "recor', "[1]", '{"recording": 3, "recorded_s": 9}', "[" * 5000]
-    odd += ['{"recording": "b", "recorded_s": 1e999}', '{"recording": "b", "recorded_s": NaN}', "é"]
-    lines = ['{"recording": "a", "recorded_s": 100}', *odd, '{"recording": "b", "recorded_s": 150}']
-    (tmp_path / FILE).write_text(with_checks("\n".join(lines)))
-    time = RecordedTime(tmp_path)
-    assert time.since(["a", "b", "c"]) == {"a": 50 * S, "b": 0, "c": 0}
 
 
 def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: Path) -> None:
@@ -180,14 +131,6 @@ def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: 
             [told] = captured
             assert told["event"] == "recorded_time_damaged"
             assert whole[: bit // 8].count(b"\n") + 1 in told["lines"]
-
-
-def test_a_line_without_a_check_makes_nothing_older(tmp_path: Path) -> None:
-    folders(tmp_path, "a", "b")
-    (tmp_path / ".episodic").mkdir()
-    whole = with_checks('{"recording": "a", "recorded_s": 100}')
-    (tmp_path / FILE).write_text(whole + '{"recording": "b", "recorded_s": 90000}\n')
-    assert RecordedTime(tmp_path).since("ab") == {"a": 0, "b": 0}
 
 
 def test_what_is_gone_is_left_out_and_the_total_stays(tmp_path: Path) -> None:

@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING
 import pytest
 from rosbags.rosbag2 import Reader as RosbagsReader
 
-from ros2_memory.bag_dir.layout import has_own_name, recording_name
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.retention.repair import Repairer, open_files
+from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.base import Closing, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -64,32 +63,6 @@ def test_its_rights_and_its_time_stay_as_they_were(tmp_path: Path) -> None:
     repairer().repair(path)
     status = path.stat()
     assert (status.st_mode & 0o777, status.st_mtime_ns) == (0o640, T0 + 1)
-
-
-def test_a_bag_that_is_closed_is_not_touched(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
-    before = path.stat()
-    assert repairer().repair(path) is None
-    after = path.stat()
-    # Reading may set the time of the last access.
-    for each in ("st_ino", "st_mode", "st_nlink", "st_size", "st_mtime_ns", "st_ctime_ns"):
-        assert getattr(after, each) == getattr(before, each)
-
-
-def test_a_file_that_is_no_bag_is_not_touched(tmp_path: Path) -> None:
-    path = tmp_path / "a_0.mcap"
-    path.write_bytes(b"a letter")
-    assert repairer().repair(path) is None
-    assert path.read_bytes() == b"a letter"
-
-
-def test_an_empty_file_is_removed(tmp_path: Path) -> None:
-    path = tmp_path / "a_0.mcap"
-    path.write_bytes(b"")
-    repaired = repairer().repair(path)
-    assert repaired is not None
-    assert repaired.rewritten is None
-    assert files_in(tmp_path) == []
 
 
 def test_on_a_full_disk_the_original_stays_and_the_next_attempt_repairs_it(tmp_path: Path) -> None:
@@ -147,26 +120,6 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="not a regular file"):
         repairer().repair(tmp_path / "b_0.mcap")
     assert path.read_bytes() == before
-
-
-def test_open_files_are_found(tmp_path: Path) -> None:
-    path = left_open(tmp_path / "a_0.mcap")
-    status = path.stat()
-    key = (status.st_dev, status.st_ino)
-    with path.open("rb"):
-        assert key in open_files()
-    assert key not in open_files()
-
-
-@pytest.mark.parametrize("name", ["rec", "rec_2026", "rec_20261120T043000Z_x", "a/rec_1"])
-def test_a_directory_of_another_is_distinguished_from_one_of_this_program(
-    name: str, tmp_path: Path
-) -> None:
-    own = recording_name(T0, tmp_path)
-    (tmp_path / own).mkdir()
-    assert has_own_name(own)
-    assert has_own_name(recording_name(T0, tmp_path))
-    assert not has_own_name(name)
 
 
 @needs_recorded

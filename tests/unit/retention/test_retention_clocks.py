@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -18,7 +17,6 @@ from ros2_memory.retention.policy import (
     RetentionLimits,
     RetentionStock,
     StoredBag,
-    ages,
     plan_deletions,
 )
 from ros2_memory.retention.recorded_time import RecordedTime
@@ -37,84 +35,8 @@ def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, 
     return plan_deletions(stock, limits).to_delete
 
 
-def hourly(count: int, *, until: int) -> list[StoredBag]:
-    ends = (until - ago * HOUR for ago in reversed(range(count)))
-    return [bag(f"rec_{n}", n, at - 10 * S, at) for n, at in enumerate(ends)]
-
-
 def bag(recording: str, inode: int, start: int, end: int) -> StoredBag:
     return StoredBag(f"{recording}/b", recording, start, end, end, 1, inode, 10)
-
-
-class TestAForwardStep:
-    """80 bags of the last 160 h, and the clock is set 150 h ahead."""
-
-    WEEK = RetentionLimits(PLENTY, 168 * HOUR)
-
-    def stock(self, *, synchronised: bool, recorded_h: int = 0) -> RetentionStock:
-        before = hourly(160, until=T0)[::2]
-        after = bag("new", 999, T0 + 150 * HOUR, T0 + 150 * HOUR + S)
-        since = {each.recording: recorded_h * HOUR for each in before}
-        now = T0 + 150 * HOUR + 2 * S
-        bags = (*before, after)
-        return RetentionStock(bags, now, recorded_since=since, synchronised=synchronised)
-
-    def test_it_deletes_nothing_while_the_clock_is_not_known_to_be_right(self) -> None:
-        held = self.stock(synchronised=False)
-        assert expired(held, self.WEEK) == ()
-        assert len(ages(held, self.WEEK).held(synchronised=False)) == 71
-
-    def test_what_is_too_old_by_a_synchronised_clock_goes(self) -> None:
-        held = self.stock(synchronised=True)
-        assert len(expired(held, self.WEEK)) == 71
-        assert ages(held, self.WEEK).held(synchronised=True) == frozenset()
-
-    def test_what_lies_more_than_the_limit_of_recorded_time_back_goes(self) -> None:
-        assert expired(self.stock(synchronised=False, recorded_h=168), self.WEEK) == ()
-        held = self.stock(synchronised=False, recorded_h=169)
-        assert len(expired(held, self.WEEK)) == 80
-        assert ages(held, self.WEEK).held(synchronised=False) == frozenset()
-
-    def test_the_budget_deletes_all_the_same(self) -> None:
-        held = self.stock(synchronised=False)
-        found = plan_deletions(held, RetentionLimits(500, 168 * HOUR))
-        assert (len(found.to_delete), found.fits) == (31, True)
-
-
-class TestAClockThatWasBehind:
-    """160 h of bags, 3 h of a clock that is behind, and the clock is right again."""
-
-    WEEK = RetentionLimits(PLENTY, 168 * HOUR)
-
-    def stock(self, behind_h: int, *, synchronised: bool = True) -> RetentionStock:
-        begun = T0 - behind_h * HOUR
-        wrong = [bag(f"wrong{n}", 500 + n, begun + n * S, begun + (n + 1) * S) for n in range(18)]
-        after = bag("new", 999, T0 + 3 * HOUR, T0 + 3 * HOUR + S)
-        bags = (*hourly(160, until=T0), *wrong, after)
-        names = [each.recording for each in bags]
-        since = {name: (len(names) - n) * HOUR for n, name in enumerate(names)}
-        return RetentionStock(
-            bags,
-            T0 + 4 * HOUR,
-            recorded_since=since,
-            synchronised=synchronised,
-            places={name: place for place, name in enumerate(names)},
-        )
-
-    @pytest.mark.parametrize("behind_h", [1, 150, 169, 200, 300, 400, 10_000, T0 // HOUR])
-    def test_nothing_young_goes_by_age_or_first_by_the_budget(self, behind_h: int) -> None:
-        held = self.stock(behind_h)
-        assert expired(held, self.WEEK) == ()
-        found = expired(held, RetentionLimits(1000, 168 * HOUR))
-        assert found == held.bags[: len(found)]
-        assert len(found) == 79
-
-    def test_a_recording_whose_count_is_wrong_is_no_older_than_those_before_it(self) -> None:
-        held = self.stock(0, synchronised=False)
-        held = replace(held, recorded_since={**held.recorded_since, "wrong3": 10**6 * HOUR})
-        assert {each.recording for each in expired(held, self.WEEK)} == {
-            f"rec_{n}" for n in range(11)
-        }
 
 
 @given(

@@ -13,29 +13,20 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
-    SavedMoment,
     SaveRequest,
     make_moment_folder,
     stored_moments_in,
-    write_saved_moment,
 )
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.cli.maintenance.recover import recover_files
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.retention import saved_moments
 from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import (
     LONGEST_WAIT_NS,
-    REPAIRED_WITHIN_NS,
-    MomentKeeper,
     Share,
-    needed_bags,
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import (
     NOW,
-    PLENTY,
     T0,
     A,
     B,
@@ -50,14 +41,11 @@ from tests.support.housekeepers import (
     recording_now,
     told_of,
 )
-from tests.support.memories import LAST_WRITTEN, memory_of
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.bag_summary import BagSummary
 
-AT = LAST_WRITTEN
 # A file has one size.
 FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_size=12)
 
@@ -282,19 +270,6 @@ class TestOpenBags:
 
 
 class TestCrashes:
-    def test_a_moment_that_was_begun_without_a_link_is_brought_to_its_end(
-        self, tmp_path: Path
-    ) -> None:
-        recording(tmp_path, A, 0)
-        pending = asked(tmp_path, 15, 25)
-        folder = make_moment_folder(tmp_path, pending.request)
-        write_saved_moment(folder, SavedMoment(pending.request))
-        house_of(tmp_path).keep_moments()
-        outcome = pending.outcome()
-        assert outcome is not None
-        assert (outcome.moment, outcome.bags, outcome.pending) == (folder.name, 2, False)
-        assert len(in_moments(tmp_path)) == 2
-
     @pytest.mark.parametrize("step", ["link", "write_saved_moment"])
     def test_a_recorder_that_is_killed_at_any_step_leaves_what_the_next_one_completes(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
@@ -362,12 +337,6 @@ class TestOthers:
         assert list(tmp_path.rglob("*.mcap")) == []
         assert [path.name for path in (tmp_path / "moments").iterdir()] == [mine.parent.name]
 
-    def test_a_folder_called_moments_elsewhere_is_none(self, tmp_path: Path) -> None:
-        (tmp_path / "mine/moments").mkdir(parents=True)
-        (tmp_path / "mine/moments/metadata.yaml").write_text("of another program")
-        clear_bags(tmp_path)
-        assert (tmp_path / "mine/moments/metadata.yaml").exists()
-
     def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
         """It would be written anew, and be another file than the one that it was linked to."""
         recording(tmp_path, A, 0, splits=1)
@@ -377,99 +346,8 @@ class TestOthers:
         house_of(tmp_path).apply()
         assert left.read_bytes() == before
 
-    def test_recover_leaves_moments_alone(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0, splits=1)
-        kept(house_of(tmp_path), tmp_path, 0, 5)
-        said: list[str] = []
-        assert recover_files(tmp_path, said.append).whole == 1
-
-    def test_nothing_is_looked_for_twice(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        looking = MomentKeeper(tmp_path, PLENTY, SettableClock(NOW), OwnRecordings(tmp_path))
-        assert looking.has_work()
-        looking.keep(memory_of(tmp_path).index.snapshot())
-        assert not looking.has_work()
-        asked(tmp_path, 0, 5)
-        assert looking.has_work()
-
-
-def span_of(
-    start: int, end: int, state: BagState = BagState.CLOSED, name: str = "r/r.mcap"
-) -> BagFile:
-    """A bag from `start` to `end` seconds."""
-    unread: BagSummary = None  # type: ignore[assignment]
-    return BagFile(
-        f"/bags/{name}",
-        1,
-        AT,
-        state,
-        unread,
-        AT + start * S,
-        AT + end * S,
-    )
-
-
-def window(start: int, end: int) -> TimeWindow:
-    return TimeWindow(AT + start * S, AT + end * S + 1)
-
-
-class TestWhatIsNeeded:
-    def test_the_bags_that_have_a_moment_of_it_both_ends_included(self) -> None:
-        bags = [
-            span_of(0, 9),
-            span_of(10, 19),
-            span_of(20, 29),
-            span_of(30, 39),
-            span_of(41, 50),
-        ]
-        found = needed_bags(window(19, 40), AT + 60 * S, bags, [], AT + 60 * S)
-        assert found.bags == (bags[1], bags[2], bags[3])
-        assert not found.waits
-
-    def test_it_waits_for_its_own_end_and_for_open_files_that_may_hold_some_of_it(self) -> None:
-        def waits(now: int, *open_files: TimeWindow | None) -> bool:
-            return needed_bags(window(0, 30), AT + 30 * S, [], open_files, AT + now * S).waits
-
-        assert waits(30)
-        assert not waits(31)
-        assert waits(31, window(30, 40))
-        assert waits(31, None)
-        assert not waits(31, window(31, 40))
-
-    def test_it_does_not_wait_for_ever(self) -> None:
-        asked = AT + 30 * S
-        found = needed_bags(window(0, 30), asked, [], [None], asked + LONGEST_WAIT_NS)
-        assert not found.waits
-        assert not needed_bags(window(0, 30), asked, [], [None], asked - LONGEST_WAIT_NS).waits
-
-    def test_a_bag_that_a_crash_left_open_is_waited_for_as_long_as_repair_may_take(self) -> None:
-        left = [span_of(0, 9, BagState.INCOMPLETE)]
-        young = needed_bags(window(0, 5), AT, left, [], AT + 60 * S)
-        assert (young.bags, young.waits) == ((), True)
-        old = needed_bags(window(0, 5), AT, left, [], AT + REPAIRED_WITHIN_NS)
-        assert (old.bags, old.waits) == (tuple(left), False)
-        other = [span_of(0, 9, BagState.INCOMPLETE, "r/r.db3")]
-        assert needed_bags(window(0, 5), AT, other, [], AT + 60 * S).bags == tuple(other)
-
-    def test_the_bag_of_carried_messages_is_none(self) -> None:
-        carried = span_of(0, 9, name="latched/carried.mcap")
-        assert needed_bags(window(0, 5), AT, [carried], [], AT + 60 * S).bags == ()
-
 
 class TestTheShare:
-    def test_a_file_that_is_stored_already_takes_nothing_more(self) -> None:
-        share = Share(100, stored={1: 60})
-        assert share.refusal([(1, 60), (2, 40)]) is None
-        assert share.refusal([(1, 60), (2, 41)]) is not None
-        assert share.refusal([(2, 40), (2, 40)]) is None
-        assert share.take(1, 60)
-        assert share.take(2, 40)
-        assert not share.take(3, 1)
-
-    def test_what_is_still_being_written_is_expected(self) -> None:
-        assert Share(100).refusal([(2, 40)], expected=60) is None
-        assert Share(100).refusal([(2, 40)], expected=61) is not None
-
     @given(FILES, FILES, st.integers(0, 150))
     def test_what_is_granted_or_fits_never_passes_it(
         self, files: list[tuple[int, int]], before: list[tuple[int, int]], share: int
@@ -484,9 +362,3 @@ class TestTheShare:
             moments.take(*file)
         assert moments.stored.items() >= stored.items()
         assert sum(moments.stored.values()) <= share
-
-    def test_a_refusal_says_what_is_used_and_what_to_do(self) -> None:
-        refused = Share(10**9, stored={1: 900_000_000}).refusal([(2, 200_000_000)])
-        assert refused is not None
-        assert "may take 1 GB, 0.9 GB of that are used, and this one takes 0.2 GB more" in refused
-        assert "retention.max_moments_gb" in refused

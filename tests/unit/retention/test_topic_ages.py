@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import tracemalloc
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from structlog.testing import capture_logs
 
@@ -147,21 +145,6 @@ def test_answers_say_that_it_was_deleted_and_count_it(bag_dir: Path) -> None:
     assert len(found["samples"]) == 10
 
 
-def test_a_moment_of_a_topic_that_was_cut_is_told_as_deleted(bag_dir: Path) -> None:
-    odometry = (TopicAge("/odom", 24 * HOUR),)
-    house(bag_dir, cutter_of(bag_dir, topic_ages=odometry)).apply()
-    at = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 5)
-    assert (at["error"], at["reason"]) == ("no_data", "deleted")
-
-
-def test_losses_of_one_stretch_are_one(bag_dir: Path) -> None:
-    house(bag_dir, cutter_of(bag_dir)).apply()
-    split(bag_dir, 2)
-    house(bag_dir, cutter_of(bag_dir)).apply()
-    found = [(loss.start, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
-    assert found == [(T0 + hour * HOUR, 10, "expired") for hour in range(3)]
-
-
 def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
     bag = split(bag_dir, 2, first=5 * S + 1)
     until = T0 + 2 * HOUR + 5 * S
@@ -172,15 +155,6 @@ def test_messages_that_count_in_another_recording_go_too(bag_dir: Path) -> None:
     house(bag_dir, cutter_of(bag_dir)).apply()
     assert "/speech" not in counts_of(bag)
     assert counts_of(bag)["/odom"] == 100
-
-
-def test_a_bag_may_lose_one_topic_after_another(bag_dir: Path) -> None:
-    (bag_dir / "rec_A" / "rec_A_1.mcap").unlink()
-    for topic_ages in (SPEECH, (*SPEECH, TopicAge("/bumper", 25 * HOUR))):
-        house(bag_dir, cutter_of(bag_dir, topic_ages=topic_ages)).apply()
-    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap") == {"/odom": 100, "/tf_static": 1}
-    found = {loss.topic: loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)}
-    assert found == {"/speech": 10, "/bumper": 10}
 
 
 def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: Path) -> None:
@@ -219,21 +193,6 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
     now_s[0] = PATIENCE_S
     keeper.apply()
     assert "/speech" not in counts_of(bag)
-
-
-def test_each_time_that_something_waits_has_an_hour_of_its_own(bag_dir: Path) -> None:
-    now_s = [0.0]
-    cutter = cutter_of(bag_dir, is_quiet=False, monotonic=lambda: now_s[0])
-    keeper = house(bag_dir, cutter)
-    for now_s[0] in (0.0, PATIENCE_S, PATIENCE_S + 1, PATIENCE_S + 2):
-        keeper.apply()
-    later = split(bag_dir, 3)
-    now_s[0] = 2 * PATIENCE_S
-    keeper.apply()
-    assert counts_of(later)["/speech"] == 10
-    now_s[0] = 3 * PATIENCE_S
-    keeper.apply()
-    assert "/speech" not in counts_of(later)
 
 
 def test_nothing_is_cut_while_messages_are_forgotten(bag_dir: Path) -> None:
@@ -341,40 +300,3 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
     house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert "/speech" not in counts_of(path)
     assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
-
-
-def test_a_damaged_list_of_what_went_is_named_and_replaced(bag_dir: Path) -> None:
-    (bag_dir / EXPIRED_FILE).parent.mkdir(exist_ok=True)
-    (bag_dir / EXPIRED_FILE).write_text("{")
-    with capture_logs() as logs:
-        house(bag_dir, cutter_of(bag_dir)).apply()
-    damaged = [log["path"] for log in logs if log["event"] == "expired_list_damaged"]
-    assert damaged == [str(bag_dir / EXPIRED_FILE)]
-    assert [loss.lost for loss in read_losses(bag_dir, MIN_NS, MAX_NS)] == [10, 10]
-
-
-def test_a_large_bag_of_images_is_cut_in_little_memory(bag_dir: Path) -> None:
-    begin, data = T0 + 2 * HOUR, np.random.default_rng(5).bytes(1_000_000)
-    images = [
-        Msg("/camera", "std_msgs/msg/String", begin + n * S, bytes(8) + data) for n in range(60)
-    ]
-    path = write_mcap(
-        bag_dir / "rec_C" / "rec_C_0.mcap",
-        sorted(
-            [*images, *(odom(begin + n * S // 10, n / 10, 1.0) for n in range(600))],
-            key=lambda message: message.log_time,
-        ),
-    )
-    own_all(bag_dir)
-    size = path.stat().st_size
-    del images
-    cutter = cutter_of(bag_dir, topic_ages=(TopicAge("/camera", 24 * HOUR),))
-    tracemalloc.start()
-    try:
-        house(bag_dir, cutter).apply()
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-    assert counts_of(path) == {"/odom": 600}
-    assert size > 50_000_000
-    assert peak < 15_000_000

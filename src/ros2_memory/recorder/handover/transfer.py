@@ -69,51 +69,6 @@ class Bounds(NamedTuple):
     ended: Ns
 
 
-class HandoverPlan:
-    """A handover under way, since just before the new recorder was started."""
-
-    def __init__(
-        self,
-        began: ClockReading,
-        *,
-        subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S,
-    ) -> None:
-        self.began = began
-        self._timeout_s = subscribe_timeout_s
-        self._both: ClockReading | None = None
-        self._last = began
-
-    def advance(self, now: ClockReading, *, ready: bool, missing: Collection[str]) -> Step:
-        """Returns the step that is due. Must be called several times a second.
-
-        Args:
-            now: the present time.
-            ready: whether the new recorder records, into a directory that exists.
-            missing: the topics that the old one has subscribed to and the new one has not.
-        """
-        before, self._last = self._last, now
-        if set_back(before, now):
-            return Step.ABANDON
-        age_s = now.monotonic_s - self.began.monotonic_s
-        if missing and age_s < self._timeout_s:
-            # Also if a publisher appears while both run: what it sends before the new recorder has
-            # subscribed is in the old recording alone, and must not lie after the cut.
-            self._both = None
-        elif self._both is None and ready:
-            self._both = now
-        if self._both is None:
-            return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
-        over = now.monotonic_s - self._both.monotonic_s >= BOTH_S
-        return Step.COMPLETE if over else Step.WAIT
-
-    def bounds(self, now: ClockReading) -> Bounds | None:
-        """Returns the times of a handover completed now; None while the two do not overlap."""
-        if self._both is None:
-            return None
-        middle = (self._both.wall + now.wall) // 2
-        return Bounds(self.began.wall, self._both.wall, middle, now.wall)
-
-
 def pending(old_name: str) -> Handover:
     """Returns the new sidecar as soon as its directory exists: until the cut it does not count."""
     return Handover(state=Counting.PENDING, previous=old_name)
@@ -178,26 +133,31 @@ class HandoverTransfer:
     Args:
         old: the session that records.
         new: the session that takes over.
-        plan: decides when each step is due.
+        began: the time just before the new recorder was started.
         reader: reads splits that are closed.
         simulated: whether log times come from a simulated clock.
         is_listed: whether the new session is to record a topic.
+        subscribe_timeout_s: how long topics are waited for.
     """
 
     def __init__(
         self,
         old: RecordingSession,
         new: RecordingSession,
-        plan: HandoverPlan,
+        began: ClockReading,
         reader: BagReader,
         *,
         simulated: bool,
         is_listed: Callable[[str], bool],
+        subscribe_timeout_s: float,
     ) -> None:
         self._is_listed = is_listed
         self.old = old
         self.new = new
-        self._plan = plan
+        self._began = self._last = began
+        self._timeout_s = subscribe_timeout_s
+        # Since when both record.
+        self._both: ClockReading | None = None
         self._reader = reader
         self._simulated = simulated
         self._marked = False
@@ -227,7 +187,7 @@ class HandoverTransfer:
         return frozenset(filter(self._is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
-        """Returns the step that is due at this moment.
+        """Returns the step that is due. Must be called several times a second.
 
         Raises:
             RecorderError: a sidecar cannot be written.
@@ -235,8 +195,21 @@ class HandoverTransfer:
         if not self._marked and self.new.splits.exists:
             write_handover(self.new.splits.directory, pending(self.old.name))
             self._marked = True
+        before, self._last = self._last, now
+        if set_back(before, now):
+            return Step.ABANDON
         ready = self._marked and self.new.is_recording
-        return self._plan.advance(now, ready=ready, missing=self.missing)
+        age_s = now.monotonic_s - self._began.monotonic_s
+        if self.missing and age_s < self._timeout_s:
+            # Also if a publisher appears while both run: what it sends before the new recorder has
+            # subscribed is in the old recording alone, and must not lie after the cut.
+            self._both = None
+        elif self._both is None and ready:
+            self._both = now
+        if self._both is None:
+            return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
+        over = now.monotonic_s - self._both.monotonic_s >= BOTH_S
+        return Step.COMPLETE if over else Step.WAIT
 
     def complete(self, now: ClockReading) -> bool:
         """Writes the cut if both recorders receive; returns False while they do not overlap.
@@ -244,10 +217,9 @@ class HandoverTransfer:
         Raises:
             RecorderError: a sidecar cannot be written.
         """
-        bounds = self._plan.bounds(now)
-        if bounds is None:
+        if self._both is None:
             return False
-        clock = self._clock()
+        both, clock = self._both.wall, self._clock()
         if self._simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
@@ -255,7 +227,7 @@ class HandoverTransfer:
             handover_to_change(self.old.splits.directory),
             self.old.name,
             self.new.name,
-            bounds,
+            Bounds(self._began.wall, both, (both + now.wall) // 2, now.wall),
             old_files=self._old_files(),
             new_files=self.new.splits.names(),
             simulated=self._simulated,

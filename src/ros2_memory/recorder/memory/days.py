@@ -43,20 +43,21 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.recorder.memory.shown import beside, shown_by
 from ros2_memory.recorder.memory.thinning import (
     MINUTE_NS,
     TopicThinning,
+    beside,
     has_numbers,
     is_said,
     is_sampled,
     rounded,
+    shown_by,
 )
 from ros2_memory.retention.disk import FailingFiles
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -270,8 +271,15 @@ class MemoryDays:
                 key = (table.channel.topic, table.channel.type)
                 numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
         stays = {key: {*one.times().tolist()} for key, one in numbers.items()}
-        left = (_by_minute(one) for one in self._joined(path, ()) if _stays(one, stays))
-        self._write_beside(path, left).replace(path)
+
+        def left() -> Iterator[Record]:
+            for record in self._joined(path, ()):
+                channel = record.channel
+                if record.log_time in stays.get((channel.topic, channel.type), [record.log_time]):
+                    metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
+                    yield record._replace(channel=replace(channel, metadata=(*metadata,)))
+
+        self._write_beside(path, left()).replace(path)
         flush(self._folder)
 
     def clear(self) -> None:
@@ -297,18 +305,14 @@ class MemoryDays:
             LEAVING.write(bag_dir, Leaving(left_s))
         if since is None:
             _log.warning("memory_leaves", days=len(days), left_s=left_s)
-        if not left_s:
-            self._delete_all(days)
-
-    def _delete_all(self, days: Sequence[Path]) -> None:
-        for left in self._folder.glob(".*.thinned.mcap.tmp"):
-            left.unlink()
-        for path in [*days, self._folder.parent / THINNED_FILE]:
+        if left_s:
+            return
+        for path in [*self._folder.glob(".*.thinned.mcap.tmp"), *days, bag_dir / THINNED_FILE]:
             path.unlink(missing_ok=True)
         _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         with suppress(OSError):
             self._folder.rmdir()
-        LEAVING.remove(self._folder.parent)
+        LEAVING.remove(bag_dir)
 
     def _days(self) -> list[Path]:
         """Returns the files that the recorder wrote, the oldest first; no link is followed."""
@@ -338,7 +342,9 @@ class MemoryDays:
                 chosen.left_out[topic] = "it has long arrays of numbers"
             elif self._is_of_people(f"{topic}/{kind}") and not self._limits.labels:
                 chosen.left_out[topic] = "it is of people, and memory.labels names none"
-            elif is_said(table) and not _is_named(topic, self._limits.texts):
+            elif is_said(table) and not any(
+                match_topics((topic,), glob) for glob in self._limits.texts
+            ):
                 chosen.left_out[topic] = "it has texts, and memory.texts does not name it"
             elif self._is_latched(snapshot, topic):
                 chosen.latched.add(topic)
@@ -520,7 +526,8 @@ class MemoryDays:
             window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
             found = [*self._reader.records(path, topics, window)] if topics else []
             known: set[tuple[str, Ns, Ns, bytes]] = set()
-            for record in sorted([*found, *hours[hour]], key=_by_topic):
+            by_topic = attrgetter("channel.topic", "log_time")
+            for record in sorted([*found, *hours[hour]], key=by_topic):
                 key = (record.channel.topic, *record[1:])
                 if key not in known:
                     known.add(key)
@@ -540,27 +547,6 @@ class _Chosen:
     times: dict[tuple[str, str], set[Ns]] = field(default_factory=lambda: defaultdict(set))
     latched: set[str] = field(default_factory=set)
     left_out: dict[str, str] = field(default_factory=dict)
-
-
-def _is_named(topic: str, globs: Sequence[str]) -> bool:
-    return any(match_topics((topic,), glob) for glob in globs)
-
-
-def _stays(record: Record, stays: Mapping[tuple[str, str], Collection[Ns]]) -> bool:
-    """Returns whether a message is one of those, or of a topic that is not thinned."""
-    key = (record.channel.topic, record.channel.type)
-    return key not in stays or record.log_time in stays[key]
-
-
-def _by_minute(record: Record) -> Record:
-    """Returns a message whose channel states that its day is thinned, once."""
-    channel = record.channel
-    metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
-    return record._replace(channel=replace(channel, metadata=(*metadata,)))
-
-
-def _by_topic(record: Record) -> tuple[str, Ns]:
-    return record.channel.topic, record.log_time
 
 
 def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:

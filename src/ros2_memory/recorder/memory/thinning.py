@@ -1,4 +1,4 @@
-"""Which messages of a topic stay when its bags are deleted: by their columns. Pure.
+"""Which messages of a topic stay when its bags are deleted, by their columns, and what else. Pure.
 
 A message that stays is as it was recorded. Those go that say again what others say:
 
@@ -10,6 +10,9 @@ A message that stays is as it was recorded. Those go that say again what others 
 - Of numbers one of each slot stays, and their least and greatest of five minutes.
 
 No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
+
+Bags also show silences, pauses, steps of the clock and crashes. Those messages are too few to show
+them: `memory/thinned.json` states them.
 """
 
 from __future__ import annotations
@@ -18,26 +21,34 @@ from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from math import ceil, log2
 from operator import itemgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, Final, TypeGuard
 
 import numpy as np
 
+from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS, STAMPS_BESIDE_NS
 from ros2_memory.analysis.intervals import THINNED_NS
+from ros2_memory.bag_dir.layout import utc_day
+from ros2_memory.bag_dir.state_files import Thinned
 from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
+from ros2_memory.core.model import BagState
 from ros2_memory.core.text import NAMES_IN_MESSAGES
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.detections import DetectionColumns, Detections
+    from ros2_memory.columns.detections import DetectionColumns
+    from ros2_memory.core.model import BagFile
+    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import Definition, IntArray
 
     Name = tuple[str, int]
+    _Value = tuple[float, Ns]  # and its log time
     Points = NDArray[np.float64]
 
 _RELATIVE_BITS: Final = 20
@@ -133,13 +144,6 @@ def _columns(
             yield name or path.rpartition(".")[2], column
 
 
-class _Extremes(NamedTuple):
-    """The least and the greatest value of a column in some minutes, and their log times."""
-
-    least: tuple[float, Ns]
-    greatest: tuple[float, Ns]
-
-
 @dataclass(slots=True)
 class _Mover:
     """A frame or a robot, by the last pose of it that stays, and the last that was looked at.
@@ -190,7 +194,8 @@ class TopicThinning:
     _named: set[Name] = field(default_factory=set)
     _values: dict[str, tuple[object, Ns]] = field(default_factory=dict)
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
-    _extremes: dict[tuple[str, int], _Extremes] = field(default_factory=dict)
+    _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
+    """The least and the greatest value of a column in some minutes."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
@@ -239,15 +244,17 @@ class TopicThinning:
         """Returns the labels of the detections in each message, also in JSON, with their number."""
         found = self.detections.of(table)
         labels: list[list[str]] = [[] for _ in range(len(table))]
-        for row, label in () if found is None else _pairs(found.detections):
-            labels[row].append(label)
+        if found is not None:
+            seen = found.detections
+            for row, label in zip(seen.rows.tolist(), seen.labels.values(), strict=True):
+                labels[row].append(label)
         for column in table.columns.values():
             if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
                 for row, text in enumerate(column.values()):
-                    labels[row] += [seen.label for seen in detections_of(text)]
+                    labels[row] += [each.label for each in detections_of(text)]
         return [
-            {(label, nth) for label, count in Counter(seen).items() for nth in range(count)}
-            for seen in labels
+            {(label, nth) for label, count in Counter(those).items() for nth in range(count)}
+            for those in labels
         ]
 
     def times(self) -> IntArray:
@@ -273,11 +280,10 @@ class TopicThinning:
                 continue
             found = [(float(numbers[nth]), int(times[nth])) for nth in inside.tolist()]
             least, greatest = min(found), max(found, key=itemgetter(0))
-            known = self._extremes.get((path, part))
-            if known is not None:
-                least = min(known.least, least)
-                greatest = max(known.greatest, greatest, key=itemgetter(0))
-            self._extremes[path, part] = _Extremes(least, greatest)
+            before = self._extremes.get((path, part), (least, greatest))
+            # Of equal ones the earliest.
+            most = max(before[1], greatest, key=itemgetter(0))
+            self._extremes[path, part] = min(before[0], least), most
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
@@ -324,10 +330,6 @@ def is_sampled(table: Table) -> bool:
     return any(
         not isinstance(column, Texts) and column.size and column.max() > _LONG for column in lengths
     )
-
-
-def _pairs(found: Detections) -> Iterator[tuple[int, str]]:
-    return zip(found.rows.tolist(), found.labels.values(), strict=True)
 
 
 def _covering(named: Sequence[set[Name]], seen: set[Name]) -> list[int]:
@@ -377,3 +379,52 @@ def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
     if len(numbers) < len(columns):
         return {}
     return {path: np.stack([np.asarray(one, np.float64) for one in numbers], axis=1)}
+
+
+_MOST_PAUSES: Final = 32
+"""Of a day; the messages beside each stay."""
+
+
+def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thinned:
+    """Returns what is known, and what some bags of a snapshot show; at least one bag."""
+
+    def is_in(at: Ns) -> bool:
+        return any(bag.start <= at <= bag.end for bag in bags)
+
+    silences = {each[:2]: each for each in known.silences}
+    silences |= {each[:2]: (*each,) for each in snapshot.silences if is_in(each.start)}
+    steps = [
+        (fault.bag.start, fault.by)
+        for fault in snapshot.dating.faults
+        if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
+    ]
+    pauses = [(pause.start, pause.end) for pause in snapshot.suspects]
+    left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
+    since = bags[0].start if known.since is None else known.since
+    if since > snapshot.scanned_at:  # by a clock that was ahead
+        since = min(since, bags[0].start)
+    return Thinned(
+        since,
+        tuple(sorted(silences.values(), key=lambda each: each[1])),
+        (*_few_a_day([*known.pauses, *(pause for pause in pauses if is_in(pause[0]))]),),
+        tuple(sorted({*known.set_back, *(step for step in steps if is_in(step[0]))})),
+        tuple(sorted({*known.left_open, *left_open})),
+    )
+
+
+def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
+    """Yields pauses in order of time, each once: the first `_MOST_PAUSES` of a day."""
+    counts = Counter[str]()
+    for pause in sorted(dict.fromkeys(pauses)):
+        day = utc_day(pause[0])
+        counts[day] += 1
+        if counts[day] <= _MOST_PAUSES:
+            yield pause
+
+
+def beside(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:
+    """Returns those of some log times (ns) that lie so near a pause that they show a step."""
+    near = np.zeros(times.size, bool)
+    for start, end in pauses:
+        near |= (times >= start - STAMPS_BESIDE_NS) & (times <= end + STAMPS_BESIDE_NS)
+    return times[near]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from statistics import fmean, median_low
@@ -420,16 +420,22 @@ class SplitMeasure:
     Attributes:
         flows: of those whose offered QoS the split states.
         progress: of those with one publisher, whose messages show what is missing.
-        unclear: the other topics that have a message.
-        span: first and last log time; None for a split without a message.
         arrivals: of all topics that have a message.
     """
 
     flows: Mapping[str, TopicFlow]
     progress: Mapping[str, Progress]
-    unclear: Collection[str]
-    span: tuple[Ns, Ns] | None
-    arrivals: Mapping[str, Arrival] = field(default_factory=dict)
+    arrivals: Mapping[str, Arrival]
+
+    @property
+    def start(self) -> Ns:
+        """The first log time, where there is a message."""
+        return min(each.first for each in self.arrivals.values())
+
+    @property
+    def end(self) -> Ns:
+        """The last log time, where there is a message."""
+        return max(each.last for each in self.arrivals.values())
 
 
 def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> SplitMeasure:
@@ -479,9 +485,7 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         for topic, found in positions.items()
         if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
-    ends = [(arrival.first, arrival.last) for arrival in arrivals.values()]
-    span = (min(first for first, _ in ends), max(last for _, last in ends)) if ends else None
-    return SplitMeasure(flows, progress, times.keys() - progress.keys(), span, arrivals)
+    return SplitMeasure(flows, progress, arrivals)
 
 
 def burst_of(published: Sequence[Ns]) -> int:
@@ -529,14 +533,14 @@ class Arrivals:
 
     def measured(self, split: SplitMeasure) -> None:
         """Takes the next closed split."""
-        if split.span is None:
+        if not split.arrivals:
             return
-        end = split.span[1]
+        end = split.end
         self._newest = end if end < self._newest - _SET_BACK_NS else max(self._newest, end)
         self._splits = [
             each
             for each in (*self._splits, split)
-            if each.span is not None and self._newest - MEASURED_NS < each.span[1] <= self._newest
+            if self._newest - MEASURED_NS < each.end <= self._newest
         ]
         for topic, arrival in split.arrivals.items():
             known = self._topics.get(topic)
@@ -568,10 +572,10 @@ class Arrivals:
 
     def rates_hz(self, idle: Ns) -> Mapping[str, float]:
         """Returns the messages a second of each topic in the newest data; see `silent`."""
-        starts = [each.span[0] for each in self._splits if each.span is not None]
-        if not starts:
+        if not self._splits:
             return {}
-        duration_s = max(self._newest + idle - min(starts), 1) / NS_PER_S
+        start = min(each.start for each in self._splits)
+        duration_s = max(self._newest + idle - start, 1) / NS_PER_S
         counts: dict[str, int] = {}
         for split in self._splits:
             for name, arrival in split.arrivals.items():

@@ -81,17 +81,6 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     return QueuePlan(depths, short)
 
 
-def too_shallow_topics(
-    flows: Mapping[str, TopicFlow], planned: QueuePlan, active: QueuePlan
-) -> frozenset[str]:
-    """Returns the topics whose queues hold less than `HOLD_S`, and would be deeper as planned."""
-    return frozenset(
-        topic
-        for topic, flow in flows.items()
-        if active.depth(topic) < flow.burst and active.depth(topic) < planned.depth(topic)
-    )
-
-
 def qos_overrides(
     flows: Mapping[str, TopicFlow],
     plan: QueuePlan,
@@ -112,33 +101,30 @@ def qos_overrides(
             publisher: rosbag2 itself asks for more where it knows none of them yet.
         volatile: topics whose earlier messages are not asked for again, though they are latched.
     """
-    profiles: dict[str, dict[str, str | int]] = {
-        topic: {
-            "history": "keep_last",
-            "depth": DEFAULT_DEPTH,
-            "reliability": "best_effort",
-            "durability": "volatile",
-        }
-        for topic in weakest
-    }
+    profiles = {topic: _profile(DEFAULT_DEPTH) for topic in weakest}
     for topic, flow in flows.items():
-        profiles[topic] = {
-            "history": "keep_last",
-            "depth": plan.depth(topic),
-            "reliability": "reliable" if flow.offered.reliable else "best_effort",
-            "durability": (
-                "transient_local" if flow.offered.latched and topic not in volatile else "volatile"
-            ),
-        }
+        profiles[topic] = _profile(
+            plan.depth(topic),
+            reliable=flow.offered.reliable,
+            latched=flow.offered.latched and topic not in volatile,
+        )
     for topic in latched:
-        if topic not in flows or (flows[topic].offered.latched and topic not in volatile):
-            reliable = topic not in flows or flows[topic].offered.reliable
-            profiles[topic] = {
-                "history": "keep_all",
-                "reliability": "reliable" if reliable else "best_effort",
-                "durability": "transient_local",
-            }
+        offered = flows[topic].offered if topic in flows else None
+        if offered is None or (offered.latched and topic not in volatile):
+            reliable = offered is None or offered.reliable
+            profiles[topic] = _profile(None, reliable=reliable, latched=True)
     return yaml.safe_dump(profiles, sort_keys=True)
+
+
+def _profile(
+    depth: int | None, *, reliable: bool = False, latched: bool = False
+) -> dict[str, str | int]:
+    """Returns a QoS profile; with None in place of a depth all messages are kept."""
+    return {
+        **({"history": "keep_all"} if depth is None else {"history": "keep_last", "depth": depth}),
+        "reliability": "reliable" if reliable else "best_effort",
+        "durability": "transient_local" if latched else "volatile",
+    }
 
 
 DEEPEN_EVERY_S: Final = 60.0
@@ -336,7 +322,12 @@ class Reception:
                 return Rotation("asking_again", sentence, again, is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
                 return None
-            shallow = too_shallow_topics(self._planned_for(), self._plan(), known.plan)
+            active, planned = known.plan, self._plan()
+            shallow = frozenset(
+                topic
+                for topic, flow in self._planned_for().items()
+                if active.depth(topic) < min(flow.burst, planned.depth(topic))
+            )
             if not shallow:
                 return None
             sentence = "a new recording starts, to subscribe with deeper queues: "
@@ -380,11 +371,11 @@ class Reception:
                     self._flows[topic] = flow if old is None else old.joined(flow)
                     self._asked_anew.discard(topic)
             short = self._plan().cut_short - before
-            self._losses.unclear(split.unclear)
+            self._losses.unclear(split.arrivals.keys() - split.progress.keys())
             if recording:
                 self._arrivals.measured(split)
-            if known is not None and split.span is not None:
-                known.span = known.span[0] or split.span[0], split.span[1]
+            if known is not None and split.arrivals:
+                known.span = known.span[0] or split.start, split.end
         if recording:
             self._count(lambda: self._losses.measured(recording, split.progress))
         for topic in sorted(short):

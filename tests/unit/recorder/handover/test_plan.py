@@ -12,46 +12,12 @@ from ros2_memory.bag_dir.handover_file import CutClock, Handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder.handover.transfer import (
     Bounds,
-    HandoverPlan,
-    Step,
     complete_sidecars,
 )
 from ros2_memory.recorder.policies import ClockReading, set_back
 
 T0 = 1_795_150_000 * NS_PER_S
 S = NS_PER_S
-
-
-def at(seconds: float, *, stepped_s: float = 0.0) -> ClockReading:
-    return ClockReading(500.0 + seconds, T0 + round((seconds + stepped_s) * S))
-
-
-def waited(plan: HandoverPlan, *seconds: float, ready: bool, missing: tuple[str, ...] = ()) -> Step:
-    steps = [plan.advance(at(each), ready=ready, missing=missing) for each in seconds]
-    assert set(steps[:-1]) <= {Step.WAIT}
-    return steps[-1]
-
-
-class TestSteps:
-    def test_a_publisher_that_appears_while_both_record_is_waited_for_again(self) -> None:
-        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(plan, 1.0, 2.5, ready=True) is Step.WAIT
-        assert waited(plan, 2.7, 3.9, ready=True, missing=("/late",)) is Step.WAIT
-        assert plan.bounds(at(100)) is None
-        assert waited(plan, 4.0, 8.9, ready=True) is Step.WAIT
-        assert waited(plan, 9.0, ready=True) is Step.COMPLETE
-
-    def test_one_that_appears_after_the_timeout_is_not(self) -> None:
-        plan = HandoverPlan(at(0), subscribe_timeout_s=20)
-        assert waited(plan, 19.0, ready=True) is Step.WAIT
-        assert waited(plan, 20.5, ready=True, missing=("/late",)) is Step.WAIT
-        assert waited(plan, 24.0, ready=True, missing=("/late",)) is Step.COMPLETE
-
-    def test_the_cut_lies_in_the_middle_of_the_time_that_both_recorded(self) -> None:
-        plan = HandoverPlan(at(0))
-        assert plan.bounds(at(1)) is None
-        waited(plan, 3.0, 5.0, ready=True)
-        assert plan.bounds(at(5)) == Bounds(T0, T0 + 3 * S, T0 + 4 * S, T0 + 5 * S)
 
 
 @pytest.mark.parametrize(

@@ -82,14 +82,6 @@ def test_whatever_either_holds_counts_exactly_once(
     assert read_handover(old).handover.counts_until is not None
 
 
-def test_a_new_one_that_left_no_sidecar_is_completed_too(tmp_path: Path) -> None:
-    old = recording(tmp_path, "a", 0, 10, delay=5)
-    recording(tmp_path, "b", 8, 12, delay=9)
-    write_handover(old, intended(Handover(), "b"))
-    recover_handovers(tmp_path, READER)
-    assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(120)), 1)
-
-
 def test_a_new_one_that_was_never_begun_is_forgotten(tmp_path: Path) -> None:
     old = recording(tmp_path, "a", 0, 10, delay=5)
     write_handover(old, intended(Handover(previous="z"), "b"))
@@ -120,18 +112,6 @@ def test_a_crash_between_the_two_sidecars_is_brought_to_its_end(tmp_path: Path) 
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(150)), 1)
 
 
-def test_an_old_one_that_holds_nothing_leaves_everything_to_the_new(tmp_path: Path) -> None:
-    old = tmp_path / "a"
-    old.mkdir()
-    (old / "a_0.mcap").touch()
-    new = recording(tmp_path, "b", 0, 5, delay=0)
-    write_handover(old, intended(Handover(), "b"))
-    write_handover(new, pending("a"))
-    recover_handovers(tmp_path, READER)
-    assert not read_handover(new).handover.hides_all
-    assert len(counted(tmp_path)) == 50
-
-
 def test_latched_messages_do_not_say_how_far_a_recording_reaches(tmp_path: Path) -> None:
     directory = tmp_path / "a"
     static = tf(T0 + 99 * S, transform(T0, "a", "b", (0, 0, 0)), topic="/tf_static")
@@ -151,15 +131,6 @@ def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_p
     write_handover(new, pending("a"))
     recover_handovers(tmp_path, READER)
     assert len(counted(tmp_path)) >= 20 + 2400
-
-
-def test_recordings_that_are_completed_are_left_alone(tmp_path: Path) -> None:
-    old = recording(tmp_path, "a", 0, 1, delay=0)
-    write_handover(old, Handover(next="b", counts_until=7, end=Overlap(None, None, ())))
-    recording(tmp_path, "b", 0, 1, delay=0)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
-    recover_handovers(tmp_path, READER)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
 
 
 def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path: Path) -> None:
@@ -185,16 +156,6 @@ def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: 
     write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
     recover_handovers(tmp_path, READER)
     assert counted(tmp_path) == dict.fromkeys((T0 + n * S // 10 for n in range(250)), 1)
-
-
-def test_a_recording_that_still_hands_over_is_left_alone(tmp_path: Path) -> None:
-    old = recording(tmp_path, "a", 0, 10, delay=5)
-    new = recording(tmp_path, "b", 8, 12, delay=9)
-    write_handover(old, intended(Handover(), "b"))
-    write_handover(new, pending("a"))
-    recover_handovers(tmp_path, READER, ["a"])
-    assert read_handover(old).handover == intended(Handover(), "b")
-    assert read_handover(new).handover == pending("a")
 
 
 def test_one_whose_predecessor_was_deleted_is_settled(tmp_path: Path) -> None:

@@ -232,16 +232,6 @@ def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Pa
     assert_union(tmp_path)
 
 
-@pytest.mark.parametrize("empty", ["a", "b"])
-def test_of_one_that_holds_nothing_the_other_has_all(tmp_path: Path, empty: str) -> None:
-    published = publications(13)
-    Recorder(0, 0 if empty == "a" else 7.5).writes(tmp_path / "a", published)
-    Recorder(4, 4 if empty == "b" else 13).writes(tmp_path / "b", published)
-    hand_over(tmp_path, 5)
-    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
-    assert_union(tmp_path)
-
-
 class TestWhenItIsDue:
     def test_not_while_a_file_that_may_hold_the_messages_is_written(self, tmp_path: Path) -> None:
         published = publications(30)

@@ -45,13 +45,20 @@ def saved(keeper: Housekeeping, bag_dir: Path, start: int, end: int, now: int) -
     return outcome
 
 
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
-    """Forty splits of a day, of which a moment has two, and one of the next morning."""
-    folder = tmp_path / "bags"
-    for nth in range(40):
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Splits of half an hour of a day, and one of the next morning."""
+    folder = tmp_path_factory.mktemp("bags")
+    for nth in range(8, 36):
         split(folder, 60 * nth, labels=("mug", f"thing{nth}"))
     write_mcap(folder / "rec_B" / "rec_B_0.mcap", [odom(NEWEST + n * S, n, 1.0) for n in range(9)])
+    return folder
+
+
+@pytest.fixture
+def bag_dir(tmp_path: Path, recorded: Path) -> Path:
+    """Of these a moment has two."""
+    folder = shutil.copytree(recorded, tmp_path / "bags")
     own_all(folder)
     keeper = house(folder, NEWEST, max_age_h=12, memory=days_of(folder))
     assert saved(keeper, folder, 1205, 1315, NEWEST).bags == 2
@@ -117,5 +124,5 @@ def test_nothing_can_be_saved_of_a_time_of_which_a_thinned_day_alone_is_left(
 ) -> None:
     keeper = house(bag_dir, NEWEST, max_age_h=12, memory=days_of(bag_dir))
     keeper.apply()
-    refused = saved(keeper, bag_dir, 60, 90, NEWEST).refused
+    refused = saved(keeper, bag_dir, 600, 630, NEWEST).refused
     assert "deleted" in str(refused)

@@ -128,15 +128,6 @@ def test_a_line_is_classified(raw: str, said: LineKind, topic: str | None) -> No
     assert (line.kind, line.topic) == (said, topic)
 
 
-def test_the_words_are_kept_without_their_frame() -> None:
-    assert parse_line("[WARN] [1.5] [node]: the words ").text == "the words"
-
-
-def test_a_topic_named_like_a_message_is_only_a_topic() -> None:
-    line = parse_line("[INFO] [1.5] [n]: Subscribed to topic '/Recording'")
-    assert (line.kind, line.topic) == (LineKind.SUBSCRIBED, "/Recording")
-
-
 @given(st.text())
 def test_no_line_is_too_odd(raw: str) -> None:
     assert parse_line(raw).kind in LineKind

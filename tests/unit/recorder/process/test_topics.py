@@ -70,11 +70,6 @@ def test_the_pattern_needs_no_escape_that_differs_between_regex_dialects(names: 
     assert "\\" not in TopicSelection(tuple(names)).regex
 
 
-def test_hidden_topics_are_looked_at_only_when_one_is_named() -> None:
-    assert TopicSelection(("/odom", "/robot/_status")).hidden
-    assert not TopicSelection(("/odom", "/vision/*/x_y")).hidden
-
-
 def test_events_of_a_service_are_selected_by_the_name_of_the_service_too() -> None:
     # `ros2 bag record` of Jazzy compares that name with the pattern.
     topics = TopicSelection(("/odom", "/set_mode/_service_event"))

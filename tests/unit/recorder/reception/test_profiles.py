@@ -84,9 +84,3 @@ def test_an_override_names_the_whole_profile_but_no_deadline() -> None:
         "/tf_static": every,
         "/unseen": every,
     }
-
-
-def test_a_topic_counts_as_latched_only_while_its_publishers_may_be() -> None:
-    flows = {"/tf_static": TopicFlow(RELIABLE, 1, 700)}
-    text = qos_overrides(flows, plan_queues(flows, MIB), latched=["/tf_static"])
-    assert yaml.safe_load(text)["/tf_static"]["durability"] == "volatile"
