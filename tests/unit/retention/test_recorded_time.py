@@ -13,6 +13,7 @@ from ros2_memory.bag_dir.state_files import RECORDED
 from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
+from tests.support.examples import LONG
 from tests.support.log_lines import with_checks
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def test_no_flipped_bit_makes_a_recording_older_and_its_line_is_named(tmp_path: 
     path = tmp_path / FILE
     right, whole = RecordedTime(tmp_path).since("abc"), path.read_bytes()
     assert right["a"] > right["b"] > right["c"] == 0
-    for bit in range(8 * len(whole)):
+    for bit in range(0, 8 * len(whole), 1 if LONG else 7):
         flipped = bytearray(whole)
         flipped[bit // 8] ^= 1 << bit % 8
         path.write_bytes(flipped)

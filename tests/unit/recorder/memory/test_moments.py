@@ -47,9 +47,9 @@ def saved(keeper: Housekeeping, bag_dir: Path, start: int, end: int, now: int) -
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Splits of half an hour of a day, and one of the next morning."""
+    """Splits of ten minutes of a day, and one of the next morning."""
     folder = tmp_path_factory.mktemp("bags")
-    for nth in range(8, 36):
+    for nth in range(16, 26):
         split(folder, 60 * nth, labels=("mug", f"thing{nth}"))
     write_mcap(folder / "rec_B" / "rec_B_0.mcap", [odom(NEWEST + n * S, n, 1.0) for n in range(9)])
     return folder
@@ -86,7 +86,7 @@ def test_a_moment_answers_its_time_and_the_day_what_is_around_it(
     before, after = both("get_topic_at_time", topic="/chatter", timestamp=T0 / S + 1208)
     assert after == before
     # Across its edges nothing is counted twice, and nothing is missing.
-    before, after = both("recap", **window(10, 35))
+    before, after = both("recap", **window(17, 26))
     assert after["from"] == "memory"
     assert after["distance_m"] == pytest.approx(before["distance_m"], rel=0.01)
     for label in ("thing19", "thing20", "thing21", "thing22"):
@@ -101,10 +101,10 @@ def test_several_moments_of_a_recording_and_the_day_around_them_are_of_one_robot
     bag_dir: Path,
 ) -> None:
     keeper = house(bag_dir, NEWEST, max_age_h=12, memory=days_of(bag_dir))
-    assert saved(keeper, bag_dir, 1805, 1860, NEWEST).bags == 2
-    whole = reply_over(bag_dir, "recap", **window(10, 35))
+    assert saved(keeper, bag_dir, 1445, 1500, NEWEST).bags == 2
+    whole = reply_over(bag_dir, "recap", **window(17, 26))
     keeper.apply()
-    thinned = reply_over(bag_dir, "recap", **window(10, 35))
+    thinned = reply_over(bag_dir, "recap", **window(17, 26))
     assert thinned["distance_m"] == pytest.approx(whole["distance_m"], rel=0.01)
     assert "several robots" not in str(thinned)
     assert "mixed" not in str(reply_over(bag_dir, "memory_status"))
@@ -124,5 +124,5 @@ def test_nothing_can_be_saved_of_a_time_of_which_a_thinned_day_alone_is_left(
 ) -> None:
     keeper = house(bag_dir, NEWEST, max_age_h=12, memory=days_of(bag_dir))
     keeper.apply()
-    refused = saved(keeper, bag_dir, 600, 630, NEWEST).refused
+    refused = saved(keeper, bag_dir, 1000, 1030, NEWEST).refused
     assert "deleted" in str(refused)
