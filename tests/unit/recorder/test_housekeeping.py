@@ -449,6 +449,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     open_one = left_open(tmp_path / OWN / f"{OWN}_0.mcap")
     empty = tmp_path / OWN / f"{OWN}_1.mcap"
     empty.write_bytes(b"")
+    (tmp_path / OWN / "metadata.yaml").touch()  # as on a disk that was full
     readable = McapReader().summarize(open_one).topics
     with structlog.testing.capture_logs() as captured:
         keeper_of(tmp_path, clock=later(0)).repair()

@@ -4,6 +4,8 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
@@ -14,6 +16,13 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
+from ros2_memory.retention.latched_carry import (
+    RECEIVED_AGAIN_NS,
+    Latched,
+    MessageIdentity,
+    worth_carrying,
+)
+from ros2_memory.storage.base import RELATCHED_NS
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
@@ -407,3 +416,23 @@ class TestAnswers:
         reported = queries.data_time_range(memory_of(bag_dir), Call())
         assert reported.earliest == T0 + 250 * S
         assert (reported.bags, reported.gaps) == (2, ())
+
+
+@given(st.data())
+def test_what_is_carried_is_carried_on_whatever_the_order(data: st.DataObject) -> None:
+    def recorded_in(start: int, stop: int) -> bool:
+        return start <= 7 < stop
+
+    drawn = data.draw(st.lists(st.tuples(st.integers(0, 20), st.sampled_from("ab"))))
+    messages = [
+        Latched(at, MessageIdentity("/tf", at, child.encode()), (("/tf", ""), ("/tf", child)))
+        for at, child in drawn
+    ]
+    once = worth_carrying(messages, recorded_in, {})
+    shuffled = data.draw(st.permutations(messages))
+    assert worth_carrying(shuffled, recorded_in, {}) == once
+    assert worth_carrying(once, recorded_in, {}) == once
+
+
+def test_what_may_have_been_received_before_is_what_questions_take_for_it() -> None:
+    assert RECEIVED_AGAIN_NS <= RELATCHED_NS

@@ -53,7 +53,8 @@ FILES = st.lists(st.integers(0, 8).map(lambda inode: (inode, 7 * inode)), max_si
 class TestKeeping:
     def test_the_bags_of_the_moment_are_linked_under_their_names(self, tmp_path: Path) -> None:
         made = recording(tmp_path, A, 0)
-        outcome = kept(house_of(tmp_path), tmp_path, 15, 25, "Küche")
+        # Both ends are part of it: each of these bags has one.
+        outcome = kept(house_of(tmp_path), tmp_path, 19, 20, "Küche")
         assert (outcome.bags, outcome.pending, outcome.refused) == (2, False, None)
         folder = tmp_path / "moments" / str(outcome.moment)
         assert sorted(path.name for path in (folder / A).iterdir()) == [
@@ -64,7 +65,7 @@ class TestKeeping:
         assert (folder / A / f"{A}_1.mcap").samefile(made[1])
         reported = told_of(tmp_path)
         assert (reported["label"], reported["complete"], reported["missing"]) == ("Küche", True, [])
-        assert (reported["start_ns"], reported["end_ns"]) == (T0 + 15 * S, T0 + 25 * S)
+        assert (reported["start_ns"], reported["end_ns"]) == (T0 + 19 * S, T0 + 20 * S)
         assert not list((tmp_path / REQUESTS_FOLDER).iterdir())
 
     def test_a_bag_that_went_since_the_index_was_made_is_named_as_missing(
