@@ -6,8 +6,7 @@ The docstrings of `Recorder` are the contract; one test suite checks every adapt
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
@@ -82,8 +81,7 @@ class NullRecorder(Recorder):
         return False
 
 
-@dataclass(frozen=True, slots=True)
-class HouseStatus:
+class HouseStatus(NamedTuple):
     """What the heartbeat shows of a housekeeper's work, under the same names.
 
     Attributes:

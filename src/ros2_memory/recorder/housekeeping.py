@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
@@ -299,8 +298,7 @@ class Housekeeping(Housekeeper):
         """Returns what the last pass found, and what is held back at this moment."""
         if self._screening is None:
             return self._status
-        return replace(
-            self._status,
+        return self._status._replace(
             held_back=self._screening.problem(),
             failing_rules=self._screening.failing_rules(),
         )
@@ -328,8 +326,7 @@ class Housekeeping(Housekeeper):
             "They are deleted when it is synchronised with a time server (timedatectl shows that), "
             f"or when {limit} have been recorded after them"
         )
-        self._status = replace(
-            self._status,
+        self._status = self._status._replace(
             age_held=age_held if collected.held else None,
             counted_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
@@ -373,7 +370,7 @@ class Housekeeping(Housekeeper):
                 f"since the recorder started, {bags} deleted unshipped, to make room "
                 f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
             )
-            self._status = replace(self._status, unshipped=sentence)
+            self._status = self._status._replace(unshipped=sentence)
             _log.warning(
                 "unshipped_deleted",
                 bags=len(collected.unshipped),

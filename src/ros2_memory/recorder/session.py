@@ -11,7 +11,7 @@ from collections import deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.core.errors import BagError
@@ -35,8 +35,7 @@ _LAST_LINES: Final = 6
 _REPORTED: Final = frozenset(LineKind) - {LineKind.OTHER, LineKind.FLUSHING}
 
 
-@dataclass(frozen=True, slots=True)
-class SplitChanges:
+class SplitChanges(NamedTuple):
     """What changed since the last observation.
 
     `closed` names splits in the order in which they were recorded, and `empty` all those that are

@@ -8,7 +8,7 @@ from __future__ import annotations
 import signal
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
@@ -41,8 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader
 
 
-@dataclass(frozen=True, slots=True)
-class Required:
+class Required(NamedTuple):
     """An entry of `recording.required`: a name or a glob, and the least messages a second."""
 
     topic: str

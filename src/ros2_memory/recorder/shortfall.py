@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import ns_from_unix
@@ -25,8 +24,7 @@ IDLE_SPLITS: Final = 2
 """Recordings that have not grown for longer than so many splits are idle."""
 
 
-@dataclass(frozen=True, slots=True)
-class Shortfall:
+class Shortfall(NamedTuple):
     """The topics that are not recorded as they should be, as the heartbeat has them."""
 
     unknown_types: tuple[str, ...] = ()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, write_heartbeat
@@ -454,8 +454,8 @@ class Supervisor:
             list_refused=self._orders.topics.refused,
             process=process_of(os.getpid()),
             advice=self._orders.advice() if watch.shortfall.unheard else None,
-            **asdict(self._housekeeper.status()),
-            **asdict(watch.shortfall),
+            **self._housekeeper.status()._asdict(),
+            **watch.shortfall._asdict(),
         )
 
     @property

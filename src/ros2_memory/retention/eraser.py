@@ -27,8 +27,6 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
-    CARRY_FILE,
-    CARRY_FOLDER,
     COMPRESSED,
     HANDOVER_FILE,
     METADATA_FILE,
@@ -144,7 +142,6 @@ class Eraser:
         self._own = own
         self._written = written
         self._recorder = recorder
-        self._carried = bag_dir / CARRY_FOLDER / CARRY_FILE
 
     def topics(self) -> frozenset[str]:
         """Returns the topics of all bags that can be read; of those that do not count too."""

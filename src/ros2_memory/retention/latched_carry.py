@@ -27,7 +27,7 @@ import time
 from bisect import bisect_left
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -63,8 +63,7 @@ _OFTEN: Final = "ros2_memory_often"
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class Origin:
+class Origin(NamedTuple):
     """Where a carried message came from.
 
     Attributes:
@@ -410,7 +409,7 @@ def _merged_origin(
         if recording in remaining
     ]
     first, *others = own.recordings
-    return replace(own, recordings=(first, *sorted({*others, *copies} - {first})))
+    return own._replace(recordings=(first, *sorted({*others, *copies} - {first})))
 
 
 def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:

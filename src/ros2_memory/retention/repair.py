@@ -12,9 +12,8 @@ import os
 import stat
 from collections import Counter
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import bag_kind
@@ -33,8 +32,7 @@ Identity = tuple[int, int]
 _CONTENT: Final = ("st_ino", "st_size", "st_mtime_ns")
 
 
-@dataclass(frozen=True, slots=True)
-class Repaired:
+class Repaired(NamedTuple):
     """The result of repairing one file.
 
     `was_bytes` and `is_bytes` are its sizes before and after. `rewritten` describes what was

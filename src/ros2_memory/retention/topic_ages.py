@@ -15,7 +15,7 @@ import os
 import time
 from collections import Counter, defaultdict
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -48,8 +48,7 @@ PATIENCE_S: Final = 3600.0
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
-class TopicAge:
+class TopicAge(NamedTuple):
     """How old messages may become of the topics that a name or glob matches."""
 
     topics: str
@@ -172,7 +171,7 @@ class TopicCutter:
                     _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
             if bags > before:
                 _correct_metadata(counts)
-                counts = replace(counts, changed=recording.stat().st_mtime_ns)
+                counts = counts._replace(changed=recording.stat().st_mtime_ns)
             self._known = counts
             if self._monotonic() >= until_s:
                 break
@@ -261,8 +260,7 @@ class TopicCutter:
             return Expired()
 
 
-@dataclass(frozen=True, slots=True)
-class _Counts:
+class _Counts(NamedTuple):
     """How many messages of each topic each bag of a recording has, by its bare name.
 
     `changed` is the mtime (ns) of its folder then.

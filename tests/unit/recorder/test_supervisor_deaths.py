@@ -81,6 +81,15 @@ class TestDeath:
         assert len(events(logs, "recorder_not_ready")) == 1
         assert world.heartbeat()["restarts"] == 1
 
+    def test_what_never_held_a_byte_leaves_no_directory(self, tmp_path: Path) -> None:
+        world = World(tmp_path)
+        world.disk_full = True
+        world.supervisor.start()
+        world.run(0.5)
+        world.recorders[0].die()
+        world.run(0.5)
+        assert not world.recorders[0].directory.exists()
+
     def test_a_new_one_that_dies_in_a_handover_counts_for_nothing(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20).started(22.5)
         old, new = world.recorders

@@ -102,6 +102,14 @@ class TestSpace:
         assert world.supervisor.is_recording
         assert events(logs, "recording_paused") == []
 
+    def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
+        world, housekeeping = self.world(tmp_path)
+        world.supervisor.start()
+        world.run(3)
+        world.free = 900
+        world.run(200)
+        assert 3 <= housekeeping.asked.count("room 1200") <= 5
+
     def test_pausing_in_a_handover_loses_and_doubles_nothing(self, tmp_path: Path) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=housekeeping, session_duration_s=20).started(22.25)

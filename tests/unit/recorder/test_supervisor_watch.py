@@ -170,6 +170,19 @@ class TestWaiting:
         assert beat["state"] == "waiting"
         assert "no publisher offers any of the listed topics" in beat["waiting_for"]
 
+    def test_a_recording_of_long_splits_waits_for_one_of_them(self, tmp_path: Path) -> None:
+        world = World(tmp_path, split_duration_s=60)
+        world.silent = True
+        world.supervisor.start()
+        world.run(58)
+        assert world.heartbeat()["state"] == "recording"
+        world.run(10)
+        assert world.heartbeat()["state"] == "waiting"
+
+    @pytest.mark.parametrize(
+        ("simulated", "topics", "expected"),
+        [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],
+    )
     @pytest.mark.parametrize(
         ("simulated", "topics", "expected"),
         [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],

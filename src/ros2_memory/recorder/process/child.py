@@ -18,9 +18,8 @@ import threading
 import time
 from collections import deque
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Final
+from typing import IO, TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.errors import RecorderError
 
@@ -37,8 +36,7 @@ _READER_PATIENCE_S: Final = 1.0
 _POLL_S: Final = 0.02
 
 
-@dataclass(frozen=True, slots=True)
-class Patience:
+class Patience(NamedTuple):
     """How long to wait for an ending child after each signal, in seconds."""
 
     interrupt_s: float = 8.0

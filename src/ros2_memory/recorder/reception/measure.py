@@ -308,8 +308,7 @@ _RELIABLE: Final = frozenset({"reliable", 1})
 _LATCHED: Final = frozenset({"transient_local", 1})
 
 
-@dataclass(frozen=True, slots=True)
-class OfferedQos:
+class OfferedQos(NamedTuple):
     """What all publishers of a topic offer: `reliable`, and `latched` (transient local)."""
 
     reliable: bool
@@ -317,8 +316,7 @@ class OfferedQos:
     publishers: int = 1
 
 
-@dataclass(frozen=True, slots=True)
-class TopicFlow:
+class TopicFlow(NamedTuple):
     """How a topic arrives.
 
     Attributes:
@@ -338,10 +336,9 @@ class TopicFlow:
 
     def joined(self, newer: TopicFlow) -> TopicFlow:
         """Returns the newer flow, with peaks of this one that fade by a tenth with each split."""
-        return TopicFlow(
-            newer.offered,
-            max(newer.burst, self.burst * 9 // 10),
-            max(newer.largest, self.largest * 9 // 10),
+        return newer._replace(
+            burst=max(newer.burst, self.burst * 9 // 10),
+            largest=max(newer.largest, self.largest * 9 // 10),
         )
 
 
@@ -389,8 +386,7 @@ _SET_BACK_NS: Final[Ns] = 60 * NS_PER_S
 """A newer split that ends so much earlier was recorded after the clock was set back."""
 
 
-@dataclass(frozen=True, slots=True)
-class Arrival:
+class Arrival(NamedTuple):
     """The messages of a topic, by log time; `pause` is the longest time between two."""
 
     first: Ns
@@ -413,8 +409,7 @@ class Arrival:
         )
 
 
-@dataclass(frozen=True, slots=True)
-class SplitMeasure:
+class SplitMeasure(NamedTuple):
     """How the topics of one split arrived.
 
     Attributes:

@@ -42,8 +42,7 @@ HEADROOM: Final = 2
 """Queues are made so many times as deep as measured, where memory allows."""
 
 
-@dataclass(frozen=True, slots=True)
-class QueuePlan:
+class QueuePlan(NamedTuple):
     """The depth of each queue. `cut_short` hold less than `HOLD_S`, for want of memory."""
 
     depths: Mapping[str, int]

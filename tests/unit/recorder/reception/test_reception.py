@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -151,8 +150,8 @@ def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> 
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
     layout = McapLayout(latched=frozenset(topics))
     made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
-    made._flows["/shared"] = replace(
-        made._flows["/shared"], offered=OfferedQos(reliable=True, latched=True, publishers=2)
+    made._flows["/shared"] = made._flows["/shared"]._replace(
+        offered=OfferedQos(reliable=True, latched=True, publishers=2)
     )
     made.skip_latched(["/map", "/tf_static", "/shared", "/unknown"])
     asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
