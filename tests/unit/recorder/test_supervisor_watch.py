@@ -183,10 +183,6 @@ class TestWaiting:
         ("simulated", "topics", "expected"),
         [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],
     )
-    @pytest.mark.parametrize(
-        ("simulated", "topics", "expected"),
-        [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],
-    )
     def test_simulated_time_and_a_wrong_domain_are_told_apart(
         self, tmp_path: Path, simulated: bool, topics: tuple[str, ...], expected: str
     ) -> None:
