@@ -4,7 +4,6 @@ import json
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import suppress
 from typing import Annotated, Final
 
 import anyio
@@ -26,6 +25,7 @@ from ros2_memory.cli.options import (
     parse_duration,
     parse_time,
     present,
+    require_no_date,
 )
 from ros2_memory.cli.output import print_line, print_reply, spinner, stdout_console
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -215,13 +215,16 @@ def _in_seconds(value: object, schema: object, now: float) -> object:
     if isinstance(value, str) and kind == "array":
         return _in_seconds(value, items, now)
     if isinstance(value, str) and kind == "number":
-        return parse_duration(value) or value
-    if not isinstance(value, str) or kind != [*TIME_KINDS]:
-        return value
-    with suppress(ValueError):
-        unix_from_text(value)
-        return value  # the tool knows whether all of its last decimal counts
-    return parse_time(value, now)
+        seconds = parse_duration(value)
+        return value if seconds is None else seconds
+    if isinstance(value, int) and kind == [*TIME_KINDS]:
+        require_no_date(str(value))
+    elif isinstance(value, str) and kind == [*TIME_KINDS]:
+        try:
+            unix_from_text(value)  # the tool knows whether all of its last decimal counts
+        except ValueError:
+            return parse_time(value, now)
+    return value
 
 
 def _from_json(text: str, otherwise: str | None) -> JsonValue:

@@ -64,8 +64,8 @@ def cat(
         raise InvalidArgumentsError("give --csv or --json, not both")
     if limit is not None and tail is not None:
         raise InvalidArgumentsError("give --limit or --tail, not both")
-    if min(limit or 0, tail or 0) < 0:
-        raise InvalidArgumentsError("--limit and --tail must not be negative")
+    if any(most is not None and most < 1 for most in (limit, tail)):
+        raise InvalidArgumentsError("--limit and --tail must be more than 0")
     topic, bags = bags.with_topic(topic, "cat")
     memory = bags.memory()
     view = View(memory, Call())

@@ -336,6 +336,17 @@ def parse_duration(text: str) -> float | None:
     return None if found is None else float(found[1]) * _SECONDS_OF[found[2][0]]
 
 
+def require_no_date(words: str) -> None:
+    """Checks that a number, as it was written, is no date without dashes.
+
+    Raises:
+        InvalidArgumentsError: it is; as Unix seconds it is in 1970.
+    """
+    if _DATE_WITHOUT_DASHES.fullmatch(words):
+        dashed = f"{words[:4]}-{words[4:6]}-{words[6:]}"
+        raise InvalidArgumentsError(f"{words} as Unix seconds is in 1970; the date is {dashed}")
+
+
 def parse_time(text: str, now: float) -> float:
     """Returns the Unix seconds of a time as people write it; see `TIMES`.
 
@@ -351,9 +362,7 @@ def parse_time(text: str, now: float) -> float:
         return now
     with suppress(ValueError):
         number = float(words)
-        if _DATE_WITHOUT_DASHES.fullmatch(words):
-            dashed = f"{words[:4]}-{words[4:6]}-{words[6:]}"
-            raise InvalidArgumentsError(f"{text} as Unix seconds is in 1970; the date is {dashed}")
+        require_no_date(words)
         if abs(number) > _LARGEST_UNIX_S:
             seconds = number / (1e9 if abs(number) > _LARGEST_UNIX_S * 1e4 else 1e3)
             raise InvalidArgumentsError(
@@ -368,6 +377,8 @@ def parse_time(text: str, now: float) -> float:
             midnight = datetime.fromtimestamp(now).astimezone().date()
             date = midnight - timedelta(days=clock[1] == "yesterday")
             of_day = clock[2] or "00:00"
+            if of_day in {"24:00", "24:00:00"}:  # the end of a day in ISO 8601
+                date, of_day = date + timedelta(days=1), "00:00"
             whole, dot, fraction = of_day.partition(".")
             of_day = f"{whole}.{fraction:0<6}" if dot else whole
             return datetime.combine(date, time.fromisoformat(of_day)).timestamp()

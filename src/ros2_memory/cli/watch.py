@@ -7,6 +7,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
+import numpy as np
 from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.live import Live
@@ -25,12 +26,14 @@ from ros2_memory.cli.output import (
     stdout_console,
     with_commands,
 )
-from ros2_memory.core.errors import BagError, InvalidArgumentsError
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.counting import count_messages
 from ros2_memory.history.coverage import was_cut
+from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import Status
@@ -180,22 +183,19 @@ def _rates(memory: Memory, snapshot: Snapshot, latest: Ns) -> Iterator[TopicRate
     """
     window = TimeWindow(latest - WINDOW_NS + 1, latest + 1)
     timeline, latching = snapshot.timeline, memory.limits.latching
+    view = View(memory, Call())
     for topic in timeline.topics():
         if latching.is_latched(snapshot, topic):
             continue
-        count = 0
-        for bag in dict.fromkeys(bag for bag, *_ in timeline.extents(topic, window)):
-            # Of a bag that was deleted, or is not complete yet, the next observation sees more.
-            with suppress(BagError):
-                batches = memory.reader.batches(bag.path, [topic], window, bare=[topic])
-                count += sum(batch.log_times.size for batch in batches)
+        # Of a bag that was deleted, or is not complete yet, the next observation sees more.
+        count = count_messages(view, topic, window, np.empty(0, np.int64)).messages.sum()
         last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)
         if timeline.is_log(topic) or was_cut(memory.index.bag_dir, topic, since):
             usual = None
         age_s = max(unix_from_ns(latest - last), 0.0)
-        yield TopicRate(topic, count / unix_from_ns(WINDOW_NS), usual, age_s)
+        yield TopicRate(topic, int(count) / unix_from_ns(WINDOW_NS), usual, age_s)
 
 
 def _as_object(seen: Observation) -> dict[str, JsonValue]:

@@ -63,6 +63,8 @@ LONGEST_REASON_S: Final = 60.0
 _RELATIVE: Final = re.compile(r".*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
 """Times before now, as people write them."""
 _WITHOUT_DATE: Final = re.compile(r"today|yesterday|\d{1,2}:\d\d")
+_END_OF_DAY: Final = re.compile(r"24(?::?00){1,2}")
+"""Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
 _AGO: Final = "for a time before now give seconds_ago, seconds or last_s, where a tool has it"
 _DATE: Final = "give the date, too: now_local of data_time_range has today's"
 # Not today's by this machine: of replayed bags (`data.now=latest`) now is another day.
@@ -177,7 +179,9 @@ def _as_hours(value: object) -> object:
     if isinstance(value, str) and isinstance(parsed := _parse_json(value), list):
         parts = parsed
     try:
-        first, last = (time.fromisoformat(str(each)) for each in parts)  # type: ignore[attr-defined]
+        begin, end = map(str, parts)  # type: ignore[call-overload]
+        ends = "00:00" if _END_OF_DAY.fullmatch(end.strip()) else end
+        first, last = time.fromisoformat(begin), time.fromisoformat(ends)
     except (TypeError, ValueError):
         raise ValueError("is not two times of day") from None
     if first.tzinfo is not None or last.tzinfo is not None:

@@ -58,12 +58,13 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("option", ["--limit", "--tail"])
-def test_cat_refuses_to_print_less_than_no_message(
+@pytest.mark.parametrize("option", ["--limit=-1", "--tail=-1", "--limit=0", "--tail=0"])
+def test_cat_refuses_to_print_less_than_one_message(
     folder: Path, exits: Program, option: str
 ) -> None:
-    refused = exits(2, "cat", "/odom", folder, f"{option}=-1").err
-    assert "--limit and --tail must not be negative" in refused
+    """It once said of a topic with messages that there were none."""
+    refused = exits(2, "cat", "/odom", folder, option).err
+    assert "--limit and --tail must be more than 0" in refused
 
 
 def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Program) -> None:
@@ -421,8 +422,10 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
         "seconds": 7200.0,
         "topic": "3d",
     }
-    with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
-        with_times({"start": "soon"}, known, 1_700_000_000.0)
+    assert with_times({"seconds": "0s", "start": 5}, known, 0.0) == {"seconds": 0.0, "start": 5}
+    for wrong, said in (("soon", "'soon' is not a time"), (20261121, "the date is 2026-11-21")):
+        with pytest.raises(InvalidArgumentsError, match=said):
+            with_times({"start": wrong}, known, 1_700_000_000.0)
 
 
 @pytest.mark.parametrize("words", [["cat"], ["plot", "signal", "-o", "x.svg"]])

@@ -131,6 +131,7 @@ def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path)
         ("visits", {"between": ["19:00"]}, "is not two times of day"),
         ("visits", {"between": ["19:00", 99]}, "is not two times of day"),
         ("visits", {"between": 19}, "is not two times of day"),
+        ("visits", {"between": "24:00-03:00"}, "is not two times of day"),
         ("find_things", {"between": "19:00-22:00"}, 'unknown argument "between"'),
         ("recap", {"between": "19:00-22:00", "around": BEGIN}, "cannot be combined with around"),
     ],
@@ -193,6 +194,8 @@ def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> Non
         ("02:30-03:30", "03:00", "03:30"),
         ("01:30-02:15", "01:30", "03:00"),
         ("02:10-02:50", None, None),
+        ("22:00-24:00", "22:00", "00:00"),
+        ("00:00 - 24:00", "00:00", "00:00"),
         ("03:00-02:30", "03:00", "00:00"),
     ],
 )
