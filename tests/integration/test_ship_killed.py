@@ -20,8 +20,8 @@ from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.bag_dir.state_files import read_receipts
 from ros2_memory.core.errors import LakeError
-from ros2_memory.lake.lease import holder_of
 from ros2_memory.lake.tables import NAMESPACE, TABLES
+from ros2_memory.lake.warehouse import holder_of
 from tests.support.fleets import START_S
 from tests.support.lakes import location, write_bag
 from tests.support.processes import until

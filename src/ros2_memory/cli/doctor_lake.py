@@ -93,8 +93,8 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
 
 
 def _check_writer(location: LakeLocation, *, has_bags: bool) -> Iterator[Finding]:
-    from ros2_memory.lake.lease import holder_of  # noqa: PLC0415 - the extra is there now
-    from ros2_memory.lake.warehouse import WRITTEN_FILE  # noqa: PLC0415
+    # The extra is there now.
+    from ros2_memory.lake.warehouse import WRITTEN_FILE, holder_of  # noqa: PLC0415
 
     if has_bags and not (location.state_dir / WRITTEN_FILE).exists():
         seen = (

@@ -24,8 +24,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.lake.packed_messages import unpacked_messages
-from ros2_memory.lake.tables import ShippedBag, day_of, end_of
+from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
 from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
 from ros2_memory.storage.cache import ByteLru, shared
 

@@ -40,8 +40,7 @@ from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
-from ros2_memory.lake.packed_messages import packed_messages
-from ros2_memory.lake.tables import ROWS_VERSION, TABLES, Row, ShippedBag
+from ros2_memory.lake.tables import ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks

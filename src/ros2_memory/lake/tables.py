@@ -1,35 +1,44 @@
-"""The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which."""
+"""The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which.
+
+In the column `packed` are the messages of one channel of a bag: both times and the payload of each.
+What the bytes are, once decompressed (numbers are little-endian and lie in planes, the lowest byte
+of each first, as they then compress best)::
+
+    1       format
+    1       0: times alone; 1: payloads, too
+    4       n, the number of messages
+    8 n     log times, each since the one before
+    8 n     publish times, each since the log time
+    4 n     the bytes of each payload
+    ...     the payloads, in planes where all have one size, else one after the other
+
+This is no derived data that a later version makes again: it is read for as long as the lake is.
+"""
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import cached_property
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
+import numpy as np
 import pyarrow as pa
 import yaml
+from pyiceberg import expressions as ex
 from pyiceberg.exceptions import NoSuchTableError
-from pyiceberg.expressions import (
-    AlwaysFalse,
-    And,
-    BooleanExpression,
-    EqualTo,
-    GreaterThanOrEqual,
-    In,
-    LessThan,
-    LessThanOrEqual,
-    Or,
-)
 from pyiceberg.io.pyarrow import schema_to_pyarrow
 from pyiceberg.partitioning import PartitionField, PartitionSpec
 from pyiceberg.schema import Schema as IcebergSchema
 from pyiceberg.table.sorting import SortField, SortOrder
 from pyiceberg.transforms import IdentityTransform
 
+from ros2_memory.columns.pack import byte_planes, compressed, decompressed, from_planes
 from ros2_memory.core.text import encodable
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, NS_PER_US, Ns
+from ros2_memory.storage.base import Batch, Channel, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -39,11 +48,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
 
+_FORMAT: Final = 1
+_HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
 ROWS_VERSION: Final = 30
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
-_NS_PER_US: Final = 1_000
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")
 _PROPERTIES: Final = {
     "write.parquet.compression-codec": "zstd",
@@ -120,7 +130,7 @@ class LakeTable:
         whole: list[Row] = []
         for row in rows:
             # `time` repeats the first time, in microseconds.
-            more = {"time": cast("int", row[first]) // _NS_PER_US} if first else {}
+            more = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
             key = str(row.get("topic", "")).strip("/").replace("/", ".")
             whole.append({"topic_key": key, **more, **row})
         try:
@@ -214,51 +224,53 @@ def _encodable(value: object) -> object:
     return value
 
 
-def _is(kind: type[BooleanExpression], column: str, value: object) -> BooleanExpression:
+def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.BooleanExpression:
     # The constructors are not those that Pydantic's plugin for mypy takes them to have.
-    return cast("Callable[[str, object], BooleanExpression]", kind)(column, value)
+    return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def of_robots(robots: Collection[str], day: date) -> BooleanExpression:
+def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
     """Returns the condition on rows of one day of some robots."""
-    return And(_is(In, "robot", robots), _is(EqualTo, "day", day.isoformat()))
+    return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
 
 
-def of_ids(robot: str, ids: Collection[str]) -> BooleanExpression:
+def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
     """Returns the condition on rows of bags of a robot, of any day.
 
     The bounds of the ids let Iceberg pass over the files of other times.
     """
-    return And(
-        _is(EqualTo, "robot", robot),
-        _is(GreaterThanOrEqual, "bag_id", min(ids)),
-        _is(LessThanOrEqual, "bag_id", max(ids)),
-        _is(In, "bag_id", ids),
+    return ex.And(
+        _is(ex.EqualTo, "robot", robot),
+        _is(ex.GreaterThanOrEqual, "bag_id", min(ids)),
+        _is(ex.LessThanOrEqual, "bag_id", max(ids)),
+        _is(ex.In, "bag_id", ids),
     )
 
 
-def of_bags(bags: Iterable[tuple[str, date, str]]) -> BooleanExpression:
+def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     """Returns the condition on rows of bags, given by robot, day and id."""
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    found: BooleanExpression = AlwaysFalse()
+    found: ex.BooleanExpression = ex.AlwaysFalse()
     for (robot, day), some in ids.items():
-        found = Or(found, And(of_robots([robot], day), of_ids(robot, some)))
+        found = ex.Or(found, ex.And(of_robots([robot], day), of_ids(robot, some)))
     return found
 
 
 def overlapping(
     robot: str, columns: tuple[str, str], window: TimeWindow, topics: Collection[str] = ()
-) -> BooleanExpression:
+) -> ex.BooleanExpression:
     """Returns the condition on rows of a robot whose span reaches into a window.
 
     `columns` have its first and last time (inclusive). Where there are `topics`, only their rows.
     """
     first, last = columns
-    span = And(_is(LessThan, first, window.stop), _is(GreaterThanOrEqual, last, window.start))
-    of_robot = And(_is(EqualTo, "robot", robot), span)
-    return And(of_robot, _is(In, "topic", topics)) if topics else of_robot
+    span = ex.And(
+        _is(ex.LessThan, first, window.stop), _is(ex.GreaterThanOrEqual, last, window.start)
+    )
+    of_robot = ex.And(_is(ex.EqualTo, "robot", robot), span)
+    return ex.And(of_robot, _is(ex.In, "topic", topics)) if topics else of_robot
 
 
 def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
@@ -276,3 +288,55 @@ def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, Iceb
                 update.union_by_name(table.schema)
         found[name] = opened
     return found
+
+
+def packed_messages(
+    log_times: IntArray, publish_times: IntArray, payloads: Sequence[bytes] | None
+) -> bytes:
+    """Returns messages in order of their log times as bytes; without payloads where there are none.
+
+    `payloads` are of messages in the same order.
+    """
+    parts = [
+        _HEAD.pack(_FORMAT, payloads is not None, len(log_times)),
+        byte_planes(np.diff(log_times, prepend=np.int64(0)), 8),
+        byte_planes(publish_times - log_times, 8),
+    ]
+    if payloads is not None:
+        sizes = np.array([len(payload) for payload in payloads], np.int64)
+        joined = b"".join(payloads)
+        if len(sizes) and (sizes == sizes[0]).all():
+            rows = np.frombuffer(joined, np.uint8).reshape(len(sizes), -1)
+            joined = rows.T.tobytes()
+        parts += [byte_planes(sizes, 4), joined]
+    return compressed(b"".join(parts))
+
+
+def unpacked_messages(data: bytes, channel: Channel) -> Batch:
+    """Returns the messages that were packed so; all payloads are empty where none were packed.
+
+    Raises:
+        ValueError: the bytes are damaged, or of a later format.
+    """
+    content = decompressed(data)
+    try:
+        form, is_whole, count = _HEAD.unpack_from(content)
+    except struct.error as error:
+        raise ValueError("packed messages are cut short") from error
+    if form != _FORMAT:
+        raise ValueError(f"messages are packed in format {form}, this program reads {_FORMAT}")
+    at = _HEAD.size
+    logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
+    published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
+    at += 16 * count
+    sizes, payloads = np.zeros(count, np.int64), b""
+    if is_whole:
+        sizes = from_planes(content, at, count, 4).astype(np.int64)
+        payloads = content[at + 4 * count :]
+        if len(payloads) != sizes.sum():
+            raise ValueError("packed messages are cut short")
+        if count and (sizes == sizes[0]).all():
+            planes = np.frombuffer(payloads, np.uint8).reshape(-1, count)
+            payloads = planes.T.tobytes()
+    starts = np.cumsum(sizes) - sizes
+    return Batch(channel, logged, published, np.arange(count), payloads, starts, sizes)

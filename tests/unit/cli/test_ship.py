@@ -17,8 +17,8 @@ from ros2_memory import bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
-from ros2_memory.lake.lease import WarehouseLease, writing_alone
 from ros2_memory.lake.upkeep import TOMBSTONES_FILE
+from ros2_memory.lake.warehouse import WarehouseLease, writing_alone
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.lakes import lake_column, write_bag
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import EpisodicError, QueryTimeoutError, RefusedError
-from ros2_memory.fleet.merging import RobotReply, merged
+from ros2_memory.fleet.tools import Page, RobotReply, merged
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -21,7 +21,8 @@ NAMES = st.lists(
 
 def reply_of(tool: str, replies: Sequence[RobotReply], **how: Any) -> dict[str, Any]:
     failures: Mapping[str, EpisodicError] = how.pop("failures", {})
-    found = merged(tool, replies, failures, max_chars=how.pop("max_chars", 10**6), **how)
+    page = Page(how.pop("limit", None), oldest_first=False)
+    found = merged(tool, replies, failures, page, 10**6)
     assert json.loads(json.dumps(found)) == found
     return found
 

@@ -15,9 +15,8 @@ import pytest
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place
-from ros2_memory.fleet.merging import ANSWER_FOR_ALL
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.fleet.tools import fleet_tools
+from ros2_memory.fleet.tools import ANSWER_FOR_ALL, fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.tools.reply_size import to_json_text
 from ros2_memory.tools.spec_tools import build_tools

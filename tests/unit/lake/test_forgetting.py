@@ -17,9 +17,8 @@ from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.packed_messages import unpacked_messages
 from ros2_memory.lake.shipper import Shipped
-from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.tables import TABLES, unpacked_messages
 from ros2_memory.lake.upkeep import (
     TOMBSTONES_FILE,
     Forgotten,

@@ -9,8 +9,7 @@ import pytest
 
 from ros2_memory.core.errors import LakeError
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.lake.lease import TERM_NS, WarehouseLease
-from ros2_memory.lake.warehouse import LakeLocation
+from ros2_memory.lake.warehouse import TERM_NS, LakeLocation, WarehouseLease
 from tests.support.clocks import SettableClock
 
 NOW = 1_795_161_600 * NS_PER_S

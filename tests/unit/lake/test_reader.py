@@ -18,7 +18,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.memory import LakeIndex
-from ros2_memory.lake.packed_messages import packed_messages, unpacked_messages
+from ros2_memory.lake.tables import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.storage.base import BagReader, Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap

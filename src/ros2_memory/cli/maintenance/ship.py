@@ -33,9 +33,8 @@ from ros2_memory.core.timebase import Ns, WallClock, ns_from_unix
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.lake.lease import WarehouseLease
     from ros2_memory.lake.shipper import RobotBags, Shipper
-    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.lake.warehouse import LakeLocation, WarehouseLease
 
 _STEP_S: Final = 5.0
 """How long it waits at a time: the service manager hears from it in between."""
@@ -72,7 +71,7 @@ def ship(
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
-    from ros2_memory.lake.lease import WarehouseLease, writing_alone  # noqa: PLC0415
+    from ros2_memory.lake.warehouse import WarehouseLease, writing_alone  # noqa: PLC0415
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
