@@ -1,21 +1,29 @@
 """`ros2-memory plot`: pictures of what is recorded, by the same queries as the tools.
 
-Times are Unix seconds.
+Times are Unix seconds. No window is opened, and nothing is written but the picture and matplotlib's
+list of fonts.
 """
 
+import logging
 import math
-from collections.abc import Iterator, Sequence
+import os
+import textwrap
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Final, NamedTuple
+from tempfile import mkdtemp
+from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from ros2_memory import PACKAGE
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
 from ros2_memory.cli.output import (
@@ -28,9 +36,9 @@ from ros2_memory.cli.output import (
 )
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Place
+from ros2_memory.core.regions import Circle, Polygon
 from ros2_memory.core.spans import united, without
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import counted, listed, shortened
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.counting import pick
@@ -49,6 +57,11 @@ from ros2_memory.places.local_map import east_north, fixes_in, local_frame
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
 
 FORMATS: Final = (".svg", ".png", ".pdf")
 _MOST_WAYPOINTS: Final = 4000
@@ -74,6 +87,28 @@ _ROWS: Final = {
     "thing": ("things in view", "#7c3aed"),
 }
 """The kinds of events in a recap: the name and the colour of each one's row, in their order."""
+_STYLE: Final = {
+    "axes.axisbelow": True,
+    "axes.grid": True,
+    "axes.spines.right": False,
+    "axes.spines.top": False,
+    "axes.titlelocation": "left",
+    "figure.titlesize": 11,
+    "font.size": 9,
+    "grid.color": "#e5e7eb",
+    "svg.hashsalt": "ros2-memory",
+    "text.parse_math": False,  # or a dollar sign in a name would begin a formula
+}
+_GREY: Final = "#9ca3af"
+_DAY_S: Final = 86_400
+_LEAST_SHARE: Final = 0.002
+"""Of the width of a timeline: what is shorter is drawn as long."""
+_LONGEST_NAME: Final = 34
+
+Seconds: TypeAlias = tuple[float, float]
+Floats: TypeAlias = NDArray[np.float64]
+Row: TypeAlias = tuple[str, Sequence[Seconds], str]
+"""A row of a timeline: its name, stretches (equal ones are a moment), and its colour."""
 
 plot = typer.Typer(
     help="Draw the driven path, a signal, what was recorded when, or a day.",
@@ -90,43 +125,16 @@ Out = Annotated[
 ]
 
 
-class TimelineRow(NamedTuple):
-    """A row of a timeline: stretches from one time to another; equal ones are a moment."""
-
-    name: str
-    stretches: Sequence[tuple[float, float]]
-    color: str
-
-
-class Signal(NamedTuple):
-    """The values of a field, NaN where it has none."""
-
-    name: str
-    times: NDArray[np.float64]
-    values: NDArray[np.float64]
-
-
 class DrawnPath(NamedTuple):
     """A path in a frame: where (m) and when, which points the robot jumped to; a line on it."""
 
     frame: str
-    times: NDArray[np.float64]
-    xs: NDArray[np.float64]
-    ys: NDArray[np.float64]
+    times: Floats
+    xs: Floats
+    ys: Floats
     jumps: NDArray[np.bool_]
     line: str
     notes: Sequence[str]
-
-    def stops(self, found: Recap) -> list[tuple[float, float, float]]:
-        """Returns where the robot stood (x, y in m), by the path at that time; and how long (s)."""
-        stops = [
-            (event.start, event.end)
-            for event in found.events
-            if event.kind == "stop" and event.end is not None
-        ]
-        middles = [unix_from_ns((start + end) // 2) for start, end in stops]
-        xs, ys = (np.interp(middles, self.times, axis).tolist() for axis in (self.xs, self.ys))
-        return [*zip(xs, ys, [unix_from_ns(end - start) for start, end in stops], strict=True)]
 
 
 class Asked(NamedTuple):
@@ -137,7 +145,7 @@ class Asked(NamedTuple):
     window: TimeWindow
 
     @property
-    def span(self) -> tuple[float, float]:
+    def span(self) -> Seconds:
         """The bounds (inclusive) of the window."""
         return _unix((self.window.start, self.window.stop - 1))
 
@@ -151,10 +159,6 @@ class Asked(NamedTuple):
     def recap(self) -> Recap:
         """Returns what happened."""
         return recap(self.memory, Call(), TimeRange.over(self.window))
-
-    def places(self, frame: str) -> list[Place]:
-        """Returns the named places of a frame."""
-        return [place for place in self.memory.limits.places if place.frame_id == frame]
 
 
 @plot.command("path", epilog=epilog("plot"))
@@ -178,13 +182,10 @@ def plot_path(
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
     asked = _asked(out, bags, times)
-    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
-
     with spinner("looking for the path"):
-        path = path_in(asked, topic, frame)
-        stops = path.stops(asked.recap())
-    with drawing.picture(out, f"Path, {asked.title}", path.line, (8.5, 7.0)) as figure:
-        drawing.draw_path(figure.add_subplot(), path, asked.places(path.frame), stops)
+        path, found = path_in(asked, topic, frame), asked.recap()
+    with _picture(out, f"Path, {asked.title}", path.line, (8.5, 7.0)) as figure:
+        _draw_path(figure.add_subplot(), asked, path, found)
     _finish(out, path.notes, as_json=as_json)
 
 
@@ -208,14 +209,18 @@ def plot_signal(
     """Draw numeric fields of a topic over time, one row for each field."""
     topic, bags = bags.with_topic(topic, "plot signal")
     asked = _asked(out, bags, times)
-    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
-
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         total, signals, notes = signals_of(asked, name, field or ())
     title, size = f"{name}, {asked.title}", (10.0, 1.2 + 1.9 * len(signals))
-    with drawing.picture(out, title, counted(total, "message"), size) as figure:
-        drawing.draw_signals(figure, signals, asked.span)
+    with _picture(out, title, counted(total, "message"), size) as figure:
+        rows = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
+        for nth, (field_name, (at, values)) in enumerate(signals.items()):
+            marker = "." if len(at) < 60 else ""
+            rows[nth].plot(at / _DAY_S, values, color=f"C{nth}", linewidth=1.1, marker=marker)
+            rows[nth].set_title(field_name)
+            rows[nth].ticklabel_format(axis="y", useOffset=False)
+        _label_times(rows[-1].xaxis, *asked.span)
     _finish(out, notes, as_json=as_json)
 
 
@@ -224,16 +229,14 @@ def plot_signal(
 def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
     asked = _asked(out, bags, times)
-    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
-
     with spinner("looking what was recorded when"):
         found = asked.recap()
         rows = [*event_rows(asked, found), *topic_rows(asked)]
     left_out = len(asked.view.timeline.topics()) - _MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
     size = (11.0, 1.3 + 0.27 * len(rows))
-    with drawing.picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
-        drawing.draw_rows(figure.add_subplot(), rows, asked.span)
+    with _picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
+        _draw_rows(figure.add_subplot(), rows, asked.span)
     _finish(out, found.notes, as_json=as_json)
 
 
@@ -255,24 +258,133 @@ def plot_recap(
     if day is not None and times != Times():
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
     asked = _asked(out, bags, times if times != Times() else day)
-    from ros2_memory.cli import drawing  # noqa: PLC0415 - an extra that few install
-
     with spinner("recalling the day"):
         found = asked.recap()
         rows = event_rows(asked, found)
-        path: DrawnPath | str
+        path, why = None, ""
         try:
             path = path_in(asked, None, None)
         except (InvalidArgumentsError, NoDataError) as error:
-            path = f"the path is unknown: {error}"
-    with drawing.picture(out, f"Recap, {asked.title}", _totals(found), (12.0, 8.0)) as figure:
-        plane = drawing.draw_recap(figure, rows, asked.span, _event_lines(found))
-        if isinstance(path, str):
-            drawing.write_instead(plane, path)
+            why = f"the path is unknown: {error}"
+    with _picture(out, f"Recap, {asked.title}", _totals(found), (12.0, 8.0)) as figure:
+        height = 0.35 + 0.3 * len(rows)
+        grid = figure.add_gridspec(
+            2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
+        )
+        plane = figure.add_subplot(grid[0, 0])
+        if path is None:
+            _write_lines(plane, [why])
         else:
-            drawing.draw_path(plane, path, asked.places(path.frame), path.stops(found))
-            plane.set_adjustable("datalim")  # it fills its part of the picture
+            _draw_path(plane, asked, path, found)
+        _write_lines(figure.add_subplot(grid[0, 1]), _event_lines(found))
+        _draw_rows(figure.add_subplot(grid[1, :]), rows, asked.span)
     _finish(out, found.notes, as_json=as_json)
+
+
+@contextmanager
+def _picture(out: Path, title: str, subtitle: str, size: Seconds) -> Iterator["Figure"]:
+    """Yields a figure, and writes what the block has drawn in the format that the suffix names.
+
+    `subtitle` has the details of the whole, and `size` is its width and height in inches.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    os.environ.setdefault("MPLCONFIGDIR", _font_folder())
+    # It warns of fonts, and of its own limits.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
+    from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
+    from matplotlib.figure import Figure  # noqa: PLC0415
+
+    with rc_context(_STYLE), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # on letters that no font here has
+        figure = Figure(figsize=size, layout="constrained")
+        figure.suptitle(f"{title}\n{subtitle}".rstrip(), x=0.01, ha="left")
+        yield figure
+        metadata = {"Date": None} if out.suffix.lower() == ".svg" else None
+        figure.savefig(out, dpi=130, metadata=metadata)
+
+
+def _font_folder() -> str:
+    """Returns where matplotlib keeps its list of fonts: the cache folder, or a temporary one."""
+    given = os.environ.get("XDG_CACHE_HOME")
+    with suppress(OSError, RuntimeError):
+        folder = (Path(given) if given else Path.home() / ".cache") / PACKAGE / "matplotlib"
+        folder.mkdir(parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return str(folder)
+    return mkdtemp(prefix="ros2-memory-")
+
+
+def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, found: Recap) -> None:
+    """Draws a path, coloured by time, with named places and standstills of the same frame."""
+    from matplotlib.collections import LineCollection  # noqa: PLC0415 - as above
+
+    for place in asked.memory.limits.places:
+        if place.frame_id == path.frame:
+            left, right, low, high = place.region.bounds
+            corners = [(left, low), (right, low), (right, high), (left, high)]
+            if isinstance(place.region, Polygon):
+                corners = [*place.region.corners]
+            elif isinstance(place.region, Circle):
+                x, y, radius = place.region.x, place.region.y, place.region.radius_m
+                turns = np.linspace(0, math.tau, 60)
+                corners = [
+                    *zip(x + radius * np.cos(turns), y + radius * np.sin(turns), strict=True)
+                ]
+            axes.fill(*np.array(corners).T, facecolor="#f3f4f6", edgecolor=_GREY)
+            middle = ((left + right) / 2, (low + high) / 2)
+            axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
+    points = np.column_stack([path.xs, path.ys])
+    pieces, jumps = np.stack([points[:-1], points[1:]], axis=1), path.jumps[1:]
+    days = path.times[:-1][~jumps] / _DAY_S
+    lines = LineCollection([*pieces[~jumps]], array=days, cmap="viridis", linewidths=2.0)
+    axes.add_collection(lines)
+    axes.add_collection(LineCollection([*pieces[jumps]], colors=_GREY, linestyles="dotted"))
+    axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
+    axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
+    if stops := stops_on(path, found):
+        xs, ys, lengths = np.array(stops).T
+        sizes = 30 + np.minimum(lengths, 3600) / 12
+        axes.scatter(xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, label="stood")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xlabel(f"x (m, {path.frame})")
+    axes.set_ylabel("y (m)")
+    axes.legend(loc="best", framealpha=0.85, fontsize=8)
+    if path.times[-1] > path.times[0] and axes.figure is not None:
+        bar = axes.figure.colorbar(lines, ax=axes, shrink=0.8, pad=0.02, label="time of day")
+        _label_times(bar.ax.yaxis, path.times[0], path.times[-1])
+
+
+def _draw_rows(axes: "Axes", rows: Sequence[Row], span: Seconds) -> None:
+    """Draws the rows of a timeline, the first one on top."""
+    start, end = span
+    least = max((end - start) * _LEAST_SHARE, 1e-6)
+    for at, (_, stretches, color) in enumerate(reversed(rows)):
+        bars = [(first / _DAY_S, max(last - first, least) / _DAY_S) for first, last in stretches]
+        axes.broken_barh(bars, (at - 0.34, 0.68), facecolors=color, linewidth=0)
+    names = [shortened(name, _LONGEST_NAME) for name, *_ in reversed(rows)]
+    axes.set_yticks(range(len(rows)), names)
+    axes.set_xlim(start / _DAY_S, (end + least) / _DAY_S)
+    axes.grid(visible=False, axis="y")
+    _label_times(axes.xaxis, start, end + least)
+
+
+def _write_lines(axes: "Axes", lines: Iterable[str]) -> None:
+    """Writes lines of text in place of a drawing."""
+    axes.set_axis_off()
+    wrapped = (textwrap.fill(each, 62, subsequent_indent=" " * 12) for each in lines)
+    axes.text(0, 1, "\n".join(wrapped), ha="left", va="top", fontsize=8.5, linespacing=1.5)
+
+
+def _label_times(axis: "Axis", start: float, end: float) -> None:
+    """Labels an axis of time in this machine's zone, as it is in the middle."""
+    from matplotlib.dates import AutoDateLocator, DateFormatter  # noqa: PLC0415 - as above
+
+    zone = datetime.fromtimestamp((start + end) / 2).astimezone().tzinfo
+    axis.set_major_locator(AutoDateLocator(tz=zone, maxticks=8))
+    form = "%H:%M:%S" if end - start < _DAY_S else "%d %b %H:%M"
+    axis.set_major_formatter(DateFormatter(form, tz=zone))
 
 
 def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
@@ -338,7 +450,8 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         topic = next(iter(receivers), None)
     if topic in receivers:
         return _path_by_fixes(asked, topic)
-    for wanted in (frame,) if frame is not None else (asked.memory.limits.map_frame, None):
+    frames = [asked.memory.limits.map_frame, None] if frame is None else [frame]
+    for wanted in frames:
         try:
             found = trajectory_summary(
                 asked.memory,
@@ -355,12 +468,11 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
             )
             raise NoDataError(error.reason, detail, error.notes) from error
         except InvalidArgumentsError:
-            if wanted is None or wanted == frame:
+            if wanted == frames[-1]:
                 raise
     fastest = found.trajectory.max_speed
     line = (
-        f"{found.trajectory.totals.distance_m:.1f} m in "
-        f"{format_duration(unix_from_ns(found.end - found.start))}"
+        f"{found.trajectory.totals.distance_m:.1f} m in {_lasted(found.start, found.end)}"
         f"{'' if fastest is None else f', at most {fastest:.2f} m/s'}; by {found.topic}"
     )
     vertices = found.trajectory.waypoints
@@ -380,6 +492,18 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
     return DrawnPath(found.frame_id, times / NS_PER_S, xs, ys, jumped, line, found.notes)
 
 
+def stops_on(path: DrawnPath, found: Recap) -> list[tuple[float, float, float]]:
+    """Returns where the robot stood (x, y in m), by the path at that time; and how long (s)."""
+    stops = [
+        _unix((event.start, event.end))
+        for event in found.events
+        if event.kind == "stop" and event.end is not None
+    ]
+    middles = [(start + end) / 2 for start, end in stops]
+    xs, ys = (np.interp(middles, path.times, axis).tolist() for axis in (path.xs, path.ys))
+    return [*zip(xs, ys, [end - start for start, end in stops], strict=True)]
+
+
 def _path_by_fixes(asked: Asked, topic: str) -> DrawnPath:
     """Returns the path of a satellite receiver, in metres east and north of its first fix."""
     total, fixes = fixes_in(asked.view, topic, asked.window)
@@ -396,8 +520,10 @@ def _path_by_fixes(asked: Asked, topic: str) -> DrawnPath:
 
 def signals_of(
     asked: Asked, topic: str, fields: Sequence[str]
-) -> tuple[int, list[Signal], list[str]]:
-    """Returns how many messages there are, numeric fields of them, and notes.
+) -> tuple[int, dict[str, tuple[Floats, Floats]], list[str]]:
+    """Returns how many messages there are, times and values of numeric fields, and notes.
+
+    A value is NaN where there is none.
 
     Raises:
         InvalidArgumentsError: there is no such field, or it holds no number.
@@ -424,13 +550,13 @@ def signals_of(
     if total > len(messages):
         notes.append(f"{len(messages)} of {total} messages are drawn, evenly spaced")
     times = np.array([stored.time for stored, _ in readable])
-    signals: list[Signal] = []
+    signals: dict[str, tuple[Floats, Floats]] = {}
     for name in fields:
         found = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
         values = [float(one) if isinstance(one, bool | int | float) else math.nan for one in found]
         if all(map(math.isnan, values)):
             raise InvalidArgumentsError(f"{name} of {topic} holds no number")
-        signals.append(Signal(name, *_with_breaks(times, values)))
+        signals[name] = _with_breaks(times, values)
     return total, signals, notes
 
 
@@ -438,22 +564,14 @@ def _varying(values: Sequence[JsonValue]) -> list[str]:
     """Returns the numeric fields that change; all of the first value where none does."""
     first: dict[str, float] = {}
     changing: set[str] = set()
-    for name, number in chain.from_iterable(map(_numbers, values)):
+    for name, inner in chain.from_iterable(map(leaves, values)):
+        number = float(inner) if isinstance(inner, bool | int | float) else math.nan
         if not math.isnan(number) and first.setdefault(name, number) != number:
             changing.add(name)
     return [name for name in first if name in changing] or [*first]
 
 
-def _numbers(value: JsonValue) -> Iterator[tuple[str, float]]:
-    """Yields the numeric fields of a value, with dot-paths."""
-    for name, inner in leaves(value):
-        if isinstance(inner, bool | int | float):
-            yield name, float(inner)
-
-
-def _with_breaks(
-    times: NDArray[np.int64], values: Sequence[float]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _with_breaks(times: NDArray[np.int64], values: Sequence[float]) -> tuple[Floats, Floats]:
     """Returns points in seconds, and NaN where there was none for much longer than usual."""
     steps = np.diff(times)
     usual = np.sort(steps)[len(steps) // 2] if len(steps) else 0
@@ -462,22 +580,26 @@ def _with_breaks(
     return shown, np.insert(np.array(values), broken, math.nan)
 
 
-def event_rows(asked: Asked, found: Recap) -> list[TimelineRow]:
+def event_rows(asked: Asked, found: Recap) -> list[Row]:
     """Returns a row of what was recorded, and one for each kind of event that occurs."""
     span = asked.window.start, asked.window.stop - 1
     recorded = without([span], [*recording_gaps(asked.view, asked.window)])
-    rows = [TimelineRow("recorded", [*map(_unix, recorded)], _RECORDED)]
+    rows: list[Row] = [("recorded", [*map(_unix, recorded)], _RECORDED)]
     for kind, (name, color) in _ROWS.items():
         stretches = [
             _unix((event.start, _until(event))) for event in found.events if event.kind == kind
         ]
         if stretches:
-            rows.append(TimelineRow(name, stretches, color))
+            rows.append((name, stretches, color))
     return rows
 
 
-def _unix(span: tuple[Ns, Ns]) -> tuple[float, float]:
+def _unix(span: tuple[Ns, Ns]) -> Seconds:
     return unix_from_ns(span[0]), unix_from_ns(span[1])
+
+
+def _lasted(start: Ns, end: Ns) -> str:
+    return format_duration(unix_from_ns(end - start))
 
 
 def _until(event: Event) -> Ns:
@@ -485,7 +607,7 @@ def _until(event: Event) -> Ns:
     return event.start if event.end is None or event.kind == "flip" else event.end
 
 
-def topic_rows(asked: Asked) -> Iterator[TimelineRow]:
+def topic_rows(asked: Asked) -> Iterator[Row]:
     """Yields when each topic was recorded, of the topics with the most messages, by name."""
     timeline = asked.view.timeline
     messages = {
@@ -495,7 +617,7 @@ def topic_rows(asked: Asked) -> Iterator[TimelineRow]:
     joined = ns_from_unix(2 * asked.memory.limits.split_duration_s)
     for topic in sorted(sorted(messages, key=lambda topic: -messages[topic])[:_MOST_TOPICS]):
         extents = ((first, last) for _, first, last in timeline.extents(topic, asked.window))
-        yield TimelineRow(topic, [*map(_unix, united(extents, joined))], _TOPIC)
+        yield topic, [*map(_unix, united(extents, joined))], _TOPIC
 
 
 def _totals(found: Recap) -> str:
@@ -504,7 +626,7 @@ def _totals(found: Recap) -> str:
     if found.distance_m is not None and found.max_speed is not None:
         parts = [f"{found.distance_m:.1f} m driven", f"at most {found.max_speed:.2f} m/s"]
     if found.stood is not None:
-        parts.append(f"stood {format_duration(unix_from_ns(found.stood))}")
+        parts.append(f"stood {_lasted(0, found.stood)}")
     return ", ".join([*parts, *(f"{count} {name}" for name, count in found.counts)])
 
 
@@ -514,7 +636,7 @@ def _event_lines(found: Recap) -> Iterator[str]:
         yield "no events"
     for event in found.events:
         at = datetime.fromtimestamp(unix_from_ns(event.start)).astimezone()
-        length = unix_from_ns(_until(event) - event.start)
-        took = f" ({format_duration(length)})" if length >= 1 else ""
+        until = _until(event)
+        took = f" ({_lasted(event.start, until)})" if until - event.start >= NS_PER_S else ""
         where = f", in {event.places[0]}" if event.places else ""
         yield f"{at:%H:%M:%S}  {event.text}{where}{took}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -176,22 +175,6 @@ def test_a_store_that_cannot_be_written_is_named(
 def test_a_refused_configuration_is_an_error(examined: Examined) -> None:
     wrong = examined(2, "server.prot=1")
     assert "server.prot" in wrong["config"][0]["seen"]
-
-
-def test_a_missing_directory_of_bags_is_an_error_where_nothing_is_recorded(
-    tmp_path: Path, examined: Examined
-) -> None:
-    gone = f"recording.bag_dir={tmp_path / 'gone'}"
-    wrong = examined(2, gone, "deployment=query_only", "server.transport=stdio")
-    assert "MEMORY_BAG_DIR" in wrong["bag_dir"][0]["do"]
-
-
-def test_of_bags_that_are_not_there_nothing_is_used(tmp_path: Path, capsys: Capture) -> None:
-    with (tmp_path / "other.bin").open("wb") as other:
-        other.truncate(10**8)
-    cli.main(["doctor", "--json", f"recording.bag_dir={tmp_path / 'gone'}"])
-    seen = {each["about"]: each["seen"] for each in json.loads(capsys.readouterr().out)["findings"]}
-    assert "; 0.0 of 5 GB used: bags 0 GB, what is stored beside them 0 GB" in seen["disk"]
 
 
 def test_a_budget_of_which_what_is_beside_the_bags_takes_much_is_reported(
@@ -403,26 +386,6 @@ def test_msg_folders_are_advised_for_what_they_would_mend_alone(
     assert ".msg" not in by_topic["1 topic cannot be decoded: /keelson "]
 
 
-def test_an_empty_directory_is_not_in_order(robot: Path, examined: Examined) -> None:
-    (robot / "rec" / "rec_0.mcap").unlink()
-    wrong = examined(1)
-    assert wrong["bags"][0]["seen"].startswith("no bag is here")
-
-
-def test_files_that_metadata_lists_and_are_not_there_are_counted(
-    robot: Path, examined: Examined
-) -> None:
-    names = "".join(f"  - rec_{n}.mcap\n" for n in range(13))
-    text = f"rosbag2_bagfile_information:\n  version: 4\n  relative_file_paths:\n{names}"
-    metadata = robot / "rec" / "metadata.yaml"
-    metadata.write_text(f"{text}  message_count: 300\n")
-    left(metadata)
-    wrong = examined(1)
-    assert wrong["bags"][0]["seen"] == (
-        "metadata.yaml of rec lists 12 missing files and 250 messages that no file here contains"
-    )
-
-
 def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_newest_receipt(
     robot: Path, examined: Examined
 ) -> None:
@@ -440,14 +403,6 @@ def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_n
     append_receipts(robot, [replace(other, bag="old/old_0.mcap", size=path.stat().st_size)])
     # The other one has just been closed.
     assert examined(0, required) == {}
-
-
-def test_where_no_recorder_ever_wrote_it_says_how_to_start_one(
-    robot: Path, examined: Examined
-) -> None:
-    (robot / "recorder.json").unlink()
-    wrong = examined(2)
-    assert "systemctl start" in wrong["recorder"][0]["do"]
 
 
 def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
@@ -488,11 +443,6 @@ class TestTheServer:
         monkeypatch.setenv("MEMORY_API_TOKEN", "s" * 32)
         assert examined(0) == {}
 
-    def test_its_problems_are_reported(self, robot: Path, examined: Examined) -> None:
-        Answering.reply = b'{"status": "degraded", "problems": ["the bag directory is gone"]}'
-        wrong = examined(1)
-        assert "the bag directory is gone" in wrong["server"][0]["seen"]
-
 
 def test_runs_that_are_answered_together_are_reported(robot: Path, examined: Examined) -> None:
     write_mcap(
@@ -501,16 +451,6 @@ def test_runs_that_are_answered_together_are_reported(robot: Path, examined: Exa
     )
     [finding] = examined(1)["bags"]
     assert "recordings other and rec overlap from 20" in finding["seen"]
-
-
-def test_a_fresh_file_without_an_end_is_reported_until_when_it_counts_as_being_written(
-    robot: Path, examined: Examined
-) -> None:
-    (robot / "recorder.json").unlink()
-    path = write_mcap(robot / "copy" / "copy_0.mcap", [odom(time.time_ns(), 0.0, 0.0)])
-    path.write_bytes(path.read_bytes()[:-20])
-    [finding] = examined(1, "recorder=none")["bags"]
-    assert "copy/copy_0.mcap has no end and was written lately: until 20" in finding["seen"]
 
 
 @pytest.mark.parametrize(("recorder", "is_active"), [("none", False), ("ros2bag", True)])
@@ -555,12 +495,6 @@ class TestExtras:
         assert examined(0, "server.metrics=true") == {}
         wrong = examined(2, "server.metrics=true", "server.transport=stdio")
         assert "has no /metrics" in wrong["extras"][0]["seen"]
-
-    def test_parquet_is_asked_for_by_nobody(
-        self, robot: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-    ) -> None:
-        monkeypatch.setitem(sys.modules, "pyarrow", None)
-        assert "pip install '.[parquet]'" in exits(0, "doctor").out
 
 
 def test_what_the_recorder_receives_by_now_is_not_missed_in_closed_bags(

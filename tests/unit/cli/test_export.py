@@ -25,17 +25,14 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import View
-from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
     McapLayout,
     Msg,
-    boolean,
     odom,
     text,
     tf,
     transform,
-    typestore,
     write_db3,
     write_mcap,
 )
@@ -101,16 +98,6 @@ def profile_of(path: Path) -> str:
     return profile
 
 
-def names_of(path: Path) -> dict[str, str]:
-    """The types of topics, by plain mcap."""
-    with path.open("rb") as stream:
-        return {
-            channel.topic: schema.name
-            for schema, channel, _ in make_reader(stream).iter_messages()
-            if schema is not None
-        }
-
-
 def things(writer: McapFile) -> None:
     schema = writer.register_schema("Thing", "jsonschema", b'{"type": "object"}')
     channel = writer.register_channel("/thing", "json", schema)
@@ -129,26 +116,6 @@ class TestMcap:
         assert read(out) == wanted
         assert len(wanted) == 35
         assert "35 messages" in capsys.readouterr().out
-
-    def test_publish_times_definitions_and_what_publishers_offer_are_kept(
-        self, tmp_path: Path
-    ) -> None:
-        published = T0 - 5 * NS_PER_S
-        message = Msg("/word", "std_msgs/msg/String", T0, text(T0, "x").body, published)
-        folder = tmp_path / "bags"
-        write_mcap(
-            folder / "rec" / "rec_0.mcap", [message], McapLayout(latched=frozenset({"/word"}))
-        )
-        out = tmp_path / "out.mcap"
-        words = ["export", "--mcap", str(out), "--bag-dir", str(folder), "deployment=replay"]
-        assert cli.main(words) == 0
-        with Reader(out) as reader:
-            connection = reader.connections[0]
-            assert connection.msgtype == "std_msgs/msg/String"
-            assert "string data" in connection.msgdef.data
-            assert "transient_local" in str(connection.ext).lower()
-        (record,) = McapReader().records(out, ["/word"], TimeWindow.everything())
-        assert (record.log_time, record.publish_time) == (T0, published)
 
     def test_what_two_recordings_hold_is_there_once(
         self, bag_dir: Path, tmp_path: Path, exits: Program
@@ -199,13 +166,6 @@ class TestMcap:
         assert {row[0] for row in read(tmp_path / "out.mcap")} == {"/tf_static"}
         assert "no message is in the window" in capsys.readouterr().err
 
-    def test_only_the_topics_that_were_asked_for(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        out = tmp_path / "out.mcap"
-        exits(0, "export", "--mcap", out, "--topic", "/chat*", "--last", "20")
-        assert {row[0] for row in read(out)} == {"/chatter"}
-
     @pytest.mark.parametrize("profile", ["", "px4", "ros2"])
     def test_the_profile_is_kept(self, tmp_path: Path, profile: str) -> None:
         folder = tmp_path / "bags"
@@ -220,36 +180,6 @@ class TestMcap:
         ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/odom")
         assert profile_of(ours) == "ros2"
         assert len(read(ours)) == 100
-
-    def test_types_are_named_as_other_readers_know_them(self, tmp_path: Path) -> None:
-        folder = tmp_path / "bags"
-
-        def fill(writer: McapFile) -> None:
-            old = writer.register_schema("std_msgs/String", "ros2msg", b"string data\n")
-            bare = writer.register_schema("std_msgs/Bool", "", b"")
-            json_schema = writer.register_schema("shop/Thing", "jsonschema", b"{}")
-            for topic, encoding, number, payload in (
-                ("/word", "cdr", old, text(T0, "x").payload),
-                ("/on", "cdr", bare, boolean(T0, data=True).payload),
-                ("/thing", "json", json_schema, b"{}"),
-            ):
-                writer.add_message(
-                    writer.register_channel(topic, encoding, number), T0, payload, T0
-                )
-
-        raw_mcap(folder / "rec_0.mcap", fill, profile="ros2")
-        out = exported(folder, tmp_path / "out.mcap")
-        assert names_of(out) == {
-            "/word": "std_msgs/msg/String",
-            "/on": "std_msgs/msg/Bool",
-            "/thing": "shop/Thing",
-        }
-        ours = exported(folder, tmp_path / "ours.mcap", "--topic", "/word")
-        with Reader(ours) as reader:
-            [(connection, _, raw)] = reader.messages()
-            assert connection.msgtype == "std_msgs/msg/String"
-            message = typestore().deserialize_cdr(raw, connection.msgtype)
-            assert getattr(message, "data", None) == "x"
 
     @needs_real
     @pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")))
@@ -350,20 +280,6 @@ class TestMcap:
             export_mcap(folder / "out.mcap", interrupted())
         assert [*folder.iterdir()] == []
 
-    def test_of_a_window_without_messages_no_file_is_made(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        out = tmp_path / "out.mcap"
-        assert "no message" in exits(2, "export", "--mcap", out, "--end", "1000").err
-        assert not out.exists()
-
-    def test_what_could_not_be_read_is_reported_and_the_exit_code_is_1(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        source = bag_dir / "rec_0" / "rec_0_0.mcap"
-        left(write_mcap(source, driven(T0, 0), McapLayout(finish=False, chunk_size=500)))
-        assert "rec_0_0.mcap" in exits(1, "export", "--mcap", tmp_path / "out.mcap").err
-
     def test_a_file_of_the_window_that_is_not_read_at_all_is_reported_and_the_exit_code_is_1(
         self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
@@ -407,16 +323,6 @@ class TestParquet:
         )
         stamps = [("/odom", T0), ("/chatter", None), ("/odom", T0 + 1), ("/odom", T0 + 2)]
         assert [*found] == stamps
-
-    def test_there_is_a_row_for_each_message_by_recording_and_date(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        assert "220 messages in 2 files" in exits(0, "export", "--parquet", tmp_path / "rows").out
-        rows = queried(
-            tmp_path / "rows",
-            "SELECT recording, CAST(date AS VARCHAR), count(*) FROM memory GROUP BY ALL ORDER BY 1",
-        )
-        assert rows == [("rec_0", "2023-11-14", 110), ("rec_1", "2023-11-15", 110)]
 
     def test_times_are_exact_and_values_are_json(
         self, bag_dir: Path, tmp_path: Path, exits: Program

@@ -69,22 +69,10 @@ def bags(bag_dir: Path) -> list[str]:
     return sorted(path.name for path in bag_dir.glob("rec_*/*.mcap"))
 
 
-def known(bag_dir: Path) -> int:
-    """How many bags are stored as columns."""
-    with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as base:
-        return int(base.execute("SELECT count(*) FROM bag").fetchone()[0])
-
-
 def test_bags_that_lie_wholly_inside_go(bag_dir: Path, forget: Forget) -> None:
     shown = forget(0, 20, 55, "--yes").out
     assert bags(bag_dir) == ["rec_0.mcap", "rec_3.mcap"]
     assert "deleted: 2 bags" in shown
-
-
-def test_what_reaches_beyond_the_window_is_kept_and_named(bag_dir: Path, forget: Forget) -> None:
-    shown = forget(1, 25, 55, "--yes").out
-    assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_3.mcap"]
-    assert "stays: rec_0/rec_1.mcap: it reaches beyond the window" in shown
 
 
 def test_a_dry_run_only_reports(bag_dir: Path, forget: Forget) -> None:
@@ -133,12 +121,6 @@ def test_latched_messages_that_later_answers_need_are_carried_on(
     exits(0, "ask", "get_transform_at", asked, "--json")
 
 
-def test_what_was_carried_on_from_the_window_is_reported(bag_dir: Path, forget: Forget) -> None:
-    forget(0, 0, 15, "--yes")
-    assert "latched messages that later answers need" in forget(1, 0, 15, "--yes").out
-    assert (bag_dir / "latched" / "carried.mcap").is_file()
-
-
 def test_beside_a_recorder_bags_with_latched_messages_are_kept(
     bag_dir: Path, forget: Forget
 ) -> None:
@@ -171,20 +153,6 @@ def test_a_bag_with_another_name_is_reported(bag_dir: Path, forget: Forget) -> N
     shown = forget(1, 20, 35, "--yes").out
     assert kept.is_file()
     assert "delete the moment's folder" in shown
-
-
-def test_the_store_forgets_with_them(bag_dir: Path, exits: Program, forget: Forget) -> None:
-    exits(0, "index")
-    assert known(bag_dir) == 4
-    forget(0, 20, 35, "--yes")
-    exits(0, "index")
-    assert known(bag_dir) == 3
-    asked = json.dumps({"topic": "/chatter", "condition_type": "contains", "value": "secret1"})
-    reply = json.loads(exits(0, "ask", "find_last_match", asked, "--json").out)
-    assert reply["timestamp"] is None
-    # "Never" would be said of what was not looked at.
-    assert "recorded, and deleted since" in reply["notes"][0]
-    assert "secret1" not in str(reply)
 
 
 def test_of_whole_bags_no_byte_is_left_nor_of_those_that_retention_deleted(
@@ -221,14 +189,6 @@ def test_a_catalogue_of_an_earlier_version_goes_and_no_other_database(
     assert beside.is_file()
 
 
-def test_a_dry_run_leaves_the_columns(bag_dir: Path, forget: Forget) -> None:
-    assert cli.main(["index"]) == 0
-    store = bag_dir / OWN_FOLDER / FILE
-    (bag_dir / "rec_1" / "rec_2.mcap").unlink()
-    forget(0, 40, 55, "--dry-run")
-    assert b"secret2" in unpacked(store)
-
-
 def unpacked(store: Path) -> bytes:
     return b"".join(columns_in(store))
 
@@ -251,17 +211,6 @@ def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) ->
     assert len(bags(bag_dir)) == 4
 
 
-def test_of_an_empty_window_it_says_so(bag_dir: Path, forget: Forget) -> None:
-    assert "no closed bag" in forget(0, -100, -50, "--yes").out
-
-
-def test_of_a_recording_that_has_gone_no_metadata_is_reported(
-    bag_dir: Path, forget: Forget
-) -> None:
-    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    assert "metadata.yaml" not in forget(0, 40, 75, "--yes").out
-
-
 class TestForeignBags:
     """Bags that this deployment's recorder did not make."""
 
@@ -281,21 +230,6 @@ class TestForeignBags:
         assert "stays: session/rec_2.mcap: this recorder did not make it; to forget it, " in output
         assert "`ros2-memory adopt session` first" in output
         assert "stays: loose.mcap: this recorder did not make it; to forget it, move it" in output
-
-    def test_one_that_reaches_beyond_the_window_is_not_sent_to_be_adopted(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        (bag_dir / "rec_1").rename(bag_dir / "session")
-        output = forget(1, 39, 65, "--dry-run").out
-        assert "stays: session/rec_2.mcap: this recorder did not make it" in output
-        assert "stays: session/rec_3.mcap: it reaches beyond the window" in output
-        assert "each bag with messages in the window stays, for the reason above" in output
-
-    def test_one_that_was_adopted_goes(self, bag_dir: Path, forget: Forget) -> None:
-        (bag_dir / "rec_1").rename(bag_dir / "session")
-        assert cli.main(["adopt", "session"]) == 0
-        forget(0, 40, 100, "--yes")
-        assert not (bag_dir / "session").exists()
 
     def test_with_delete_they_go_too(self, bag_dir: Path, forget: Forget) -> None:
         (bag_dir / "rec_1").rename(bag_dir / "session")
@@ -451,11 +385,6 @@ class TestCopies:
         assert bags(recordings) == ["rec_a_1.mcap", "rec_b_1.mcap"]
         output = shown
         assert "stays: rec_a/rec_a_1.mcap: it reaches beyond the window" in output
-
-    def test_a_bag_of_which_only_copies_reach_into_the_window_is_named(
-        self, recordings: Path, forget: Forget
-    ) -> None:
-        assert "stays: rec_a/rec_a_1.mcap" in forget(1, 9.5, 20, "--yes").out
 
 
 class TestMetadata:

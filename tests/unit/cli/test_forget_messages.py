@@ -197,18 +197,6 @@ def test_nothing_of_it_is_left_anywhere(
     assert not [*bag_dir.rglob("*.repair"), *bag_dir.rglob("*.tmp")]
 
 
-def test_hard_links_in_moments_follow(tmp_path: Path, bag_dir: Path) -> None:
-    source = bag_dir / "rec_a" / "rec_a_1.mcap"
-    moment = made_moment(bag_dir / "moments" / "20260101T000000Z-dance")
-    link = moment / "rec_a" / source.name
-    link.parent.mkdir()
-    os.link(source, link)
-    OwnRecordings(bag_dir).hold(link.parent, [link.name])
-    assert forget(0, 100, "--topic", CAMERA) == 0
-    assert traces(tmp_path, SAID) == []
-    assert link.samefile(source)
-
-
 def test_a_moment_that_is_kept_meanwhile_follows(
     tmp_path: Path, bag_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -332,25 +320,11 @@ def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> N
     assert traces(bag_dir, "laser") == []
 
 
-def test_what_has_gone_can_be_forgotten_again(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(0, 100, "--topic", CAMERA) == 0
-    assert forget(0, 100, "--topic", CAMERA) == 0
-    assert "no such message is in the window" in capsys.readouterr().out
-
-
 def test_a_dry_run_changes_nothing(bag_dir: Path, capsys: Capture) -> None:
     before = {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")}
     assert forget(0, 100, "--topic", CAMERA, "--dry-run") == 0
     assert "would be deleted: 30 messages of 1 topic" in capsys.readouterr().out
     assert {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")} == before
-
-
-def test_foreign_bags_stay_and_are_named(bag_dir: Path, capsys: Capture) -> None:
-    foreign = left(write_mcap(bag_dir / "theirs" / "theirs_0.mcap", messages(0)))
-    before = foreign.read_bytes()
-    assert forget(0, 100, "--topic", CAMERA) == 1
-    assert "stays: theirs/theirs_0.mcap: this recorder did not make it" in capsys.readouterr().out
-    assert foreign.read_bytes() == before
 
 
 @pytest.mark.parametrize("size", [None, 0])
@@ -361,11 +335,6 @@ def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: in
         os.truncate(active, size)
     assert forget(0, 100, "--topic", CAMERA) == 1
     assert "stays: rec_a/rec_a_3.mcap: it is being written" in capsys.readouterr().out
-
-
-def test_a_topic_that_nobody_recorded_is_an_error(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(0, 100, "--topic", "/camra/*") == 2
-    assert "no recorded topic is named /camra/*" in capsys.readouterr().err
 
 
 def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Capture) -> None:
@@ -460,16 +429,6 @@ class TestPlaces:
         assert times["/tf_static"] == {0}
         assert traces(home, f"{SAID} 40") == []
         assert traces(home, f"{SAID} 70")
-
-    def test_a_topic_alone(self, home: Path) -> None:
-        assert forget(0, 100, "--where", "Bathroom", "--topic", CAMERA, self.places) == 0
-        topics = [each[3] for each in whole(home / "rec_h" / "rec_h_0.mcap")]
-        assert topics.count("/odom") == 100
-        assert topics.count(CAMERA) < 65
-
-    def test_a_place_that_is_not_named_is_an_error(self, home: Path, capsys: Capture) -> None:
-        assert forget(0, 100, "--where", "cellar", self.places) == 2
-        assert "cellar" in capsys.readouterr().err
 
 
 class TestInterruption:

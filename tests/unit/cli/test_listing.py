@@ -16,7 +16,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory import cli
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_end, parse_time
 from ros2_memory.cli.output import format_time
@@ -92,12 +91,6 @@ class TestPaths:
         }
         # The two loose files hold the same messages, and lie in one folder.
         assert counted["/odom"] == poses
-
-    def test_a_metadata_file_is_its_folder(self, folder: Path, exits: Program) -> None:
-        (folder / "b" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-        assert (
-            exits(0, "info", folder / "b" / "metadata.yaml", "--json").json["held"]["messages"] == 4
-        )
 
     @pytest.mark.parametrize(
         ("name", "words"),
@@ -178,13 +171,6 @@ class TestPaths:
             exits(0, "info", folder / "a", "--json").json["memory_status"]["budget"]["max_gb"]
             is None
         )
-
-    def test_nothing_is_written_beside_them(self, folder: Path, capsys: Capture) -> None:
-        before = sorted(folder.rglob("*"))
-        for words in (["info"], ["topics"], ["recordings"], ["cat", "/odom"], ["doctor"]):
-            cli.main([*words, str(folder)])
-        capsys.readouterr()
-        assert sorted(folder.rglob("*")) == before
 
     @needs_real
     @pytest.mark.parametrize(
@@ -303,24 +289,8 @@ class TestRecordings:
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
-    def test_what_deletes_looks_at_all_of_them(self, folder: Path, exits: Program) -> None:
-        words = ["forget", "--last", "9000", "--yes", "deployment=robot", "data.recording=a"]
-        assert "data.recording=null" in exits(2, *words, f"recording.bag_dir={folder}").err
-        assert (folder / "a" / "a_0.mcap").exists()
-
 
 class TestCat:
-    def test_lines_for_people_have_a_time_that_can_be_pasted_back(
-        self, folder: Path, exits: Program
-    ) -> None:
-        lines = exits(0, "cat", "/odom", folder / "a").out.splitlines()
-        assert len(lines) == 10
-        third = lines[2].split()[0]
-        assert (
-            exits(0, "cat", "odom", folder / "a", "--start", third, "--end", third).out.splitlines()
-            == lines[2:3]
-        )
-
     def test_json_lines_are_whole_and_strict(self, tmp_path: Path, exits: Program) -> None:
         messages = [odom(T0 + 1, math.nan, 0.123456789), odom(T0 + 2, 1.0, 2.0)]
         write_mcap(tmp_path / "r" / "r_0.mcap", messages)
@@ -372,22 +342,6 @@ class TestCat:
             for line in exits(0, "cat", "/odom", folder / "a", "--json", *words).out.splitlines()
         ]
         assert times == [T0 + n * NS_PER_S for n in expected]
-
-    def test_a_topic_or_a_field_that_there_is_not_is_named_with_those_there_are(
-        self, folder: Path, exits: Program
-    ) -> None:
-        assert "/odom" in exits(2, "cat", "/odon", folder).err
-        assert (
-            "position" in exits(2, "cat", "/odom", folder, "--csv", "--field", "pose.nothing").err
-        )
-
-    def test_where_nothing_lies_in_the_time_the_exit_code_is_1(
-        self, folder: Path, exits: Program
-    ) -> None:
-        assert (
-            "no message of /odom"
-            in exits(1, "cat", "/odom", folder / "a", "--end", "2001-01-01").err
-        )
 
     def test_a_reader_that_ends_early_is_no_error(self, folder: Path) -> None:
         program = [sys.executable, "-m", "ros2_memory.cli", "cat", "/odom", str(folder / "a")]

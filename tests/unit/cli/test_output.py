@@ -50,10 +50,6 @@ def test_a_moment_has_its_local_time_and_its_age() -> None:
     assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
 
 
-def test_ages_count_from_the_now_that_a_reply_states() -> None:
-    assert "(10.0 s ago)" in shown({"now": T0, "latest": T0 - 10.0}, now=T0 + 500.0)
-
-
 def test_moments_in_notes_are_local_times() -> None:
     output = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
     assert f"the memory ends at {format_time(T0)}" in output

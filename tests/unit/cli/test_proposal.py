@@ -122,12 +122,6 @@ def test_a_map_is_proposed_where_it_is_latched_and_came_once() -> None:
         assert judge([offered])[offered].choice is choice
 
 
-def test_the_inside_of_actions_and_services_is_left_to_a_person() -> None:
-    for topic in ("/drive/_action/feedback", "/set_mode/_service_event"):
-        offered = Offered(topic, "a/msg/B")
-        assert judge([offered])[offered].choice is Choice.ASK
-
-
 def test_a_message_takes_its_payload_and_what_mcap_adds() -> None:
     one = Offered("/a", "a/msg/A", messages=5, hz=1.0, payload_bytes=69.0)
     # (69 + 31) / 2 compressed, and 16 of an index, in each of 86,400 s.
@@ -142,11 +136,6 @@ def test_files_take_their_definitions_and_a_list_of_those_before() -> None:
     assert replace(DISK, split_s=20).files_per_day < DISK.files_per_day / 2
 
 
-def test_a_latched_message_is_in_each_recording_once() -> None:
-    latched = Offered("/map", "a/msg/A", latched=True, messages=1, hz=0.2, payload_bytes=69.0)
-    assert DISK.bytes_per_day([latched]) == pytest.approx(144 * 66)
-
-
 def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> None:
     large = replace(DISK, budget_bytes=100e9)
     assert propose([ODOM, SCAN], large)[SCAN].choice is Choice.RECORD
@@ -154,11 +143,6 @@ def test_scans_are_left_out_where_the_list_does_not_fit_because_of_them() -> Non
     assert chosen(left, Choice.RECORD) == [ODOM]
     assert left[SCAN].choice is Choice.LEAVE
     assert left[SCAN].reason == "70% of a list of which the budget would hold 0.9 days"
-
-
-def test_a_small_scan_stays_though_the_list_does_not_fit() -> None:
-    small = replace(SCAN, hz=0.3)
-    assert propose([ODOM, small], replace(DISK, budget_bytes=1e9))[small].choice is Choice.RECORD
 
 
 def test_the_file_lists_what_is_proposed_and_has_the_rest_to_tick(tmp_path: Path) -> None:

@@ -75,22 +75,6 @@ def test_the_file_alone_gives_the_answer(
     assert exits(code, "ask", *words, proof, "--json").json == asked
 
 
-def test_it_has_what_was_read_and_what_says_when_now_is(
-    bags: Path, tmp_path: Path, exits: Program
-) -> None:
-    proof = tmp_path / "proof.mcap"
-    exits(0, "prove", "get_position_seconds_ago seconds_ago=60", "-o", proof, bags)
-    every = [row for path in sorted(bags.rglob("*.mcap")) for row in messages(path)]
-    found = messages(proof)
-    assert {*found} < {*every}
-    last = max(at for _, at, _ in every)
-    within = {(topic, at) for topic, at, _ in found}
-    poses = [at for topic, at, _ in every if topic == "/odom" and at <= last - 60 * S]
-    assert ("/odom", max(poses)) in within
-    assert {min(at for _, at, _ in every), last} <= {at for _, at in within}
-    assert len(found) < 10
-
-
 def test_types_without_a_definition_are_named_and_exit_1_where_the_answer_rests_on_them(
     tmp_path: Path, exits: Program
 ) -> None:
@@ -143,15 +127,6 @@ def test_a_key_on_files_is_named_and_is_no_other_answer(
 ) -> None:
     proved = exits(0, "prove", "data_time_range", "-o", tmp_path / "proof.mcap", bags)
     assert "note: only the bags themselves give the same bags\n" in proved.err
-
-
-def test_nothing_is_left_beside_the_proof_and_the_bags_stay(
-    bags: Path, tmp_path: Path, exits: Program
-) -> None:
-    before = sorted(bags.rglob("*"))
-    exits(0, "prove", "list_frames", "-o", tmp_path / "proof.mcap", bags)
-    assert sorted(bags.rglob("*")) == before
-    assert {each.name for each in tmp_path.iterdir()} == {"bags", "proof.mcap"}
 
 
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:

@@ -11,11 +11,10 @@ from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
-from ros2_memory.core.errors import RecorderError
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
 from tests.support.fakes import files_limited_to
-from tests.support.housekeepers import copied, files_in, later, own_all, recording_now
+from tests.support.housekeepers import copied, files_in, later, recording_now
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
@@ -93,16 +92,6 @@ class TestMetadata:
         with Reader(tmp_path / "rec") as reader:
             assert (reader.start_time, reader.end_time) == (held.start, held.end + 1)
 
-    def test_is_left_and_that_is_reported_while_a_file_is_not_whole(self, tmp_path: Path) -> None:
-        left_open(tmp_path / "rec/rec_0.mcap")
-        (tmp_path / "rec/rec_1.mcap").write_bytes(b"a letter")
-        (tmp_path / "rec/metadata.yaml").write_text("as it was\n")
-        _, printed = recovered(tmp_path)
-        assert any(
-            "metadata.yaml NOT CORRECTED: " in line and "rec_1.mcap" in line for line in printed
-        )
-        assert (tmp_path / "rec/metadata.yaml").read_text() == "as it was\n"
-
     @pytest.mark.parametrize(
         ("text", "reason"),
         [
@@ -121,12 +110,6 @@ class TestMetadata:
         _, printed = recovered(tmp_path)
         assert any("NOT CORRECTED" in line and reason in line for line in printed)
         assert (tmp_path / "rec/metadata.yaml").read_text() == text
-
-    def test_of_files_with_other_names_is_not_made(self, tmp_path: Path) -> None:
-        left_open(tmp_path / "rec/field trip.mcap")
-        _, printed = recovered(tmp_path)
-        assert any("ros2 bag reindex" in line for line in printed)
-        assert files_in(tmp_path) == ["rec", "rec/field trip.mcap"]
 
     @needs_recorded
     @pytest.mark.parametrize("name", ["session_killed", "session_killed_chunk64k", "session_mcap"])
@@ -161,13 +144,6 @@ def counted(recording: Path) -> dict[str, int]:
     return stated
 
 
-def test_a_whole_file_is_reported_to_be(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a_0.mcap", MESSAGES)
-    outcome, printed = recovered(path)
-    assert outcome == RecoveryOutcome(whole=1)
-    assert printed[0].endswith("whole already: there is nothing to repair")
-
-
 def test_what_is_no_mcap_file_is_reported_to_be_none_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "a_0.mcap"
     path.write_bytes(b"a letter")
@@ -175,15 +151,6 @@ def test_what_is_no_mcap_file_is_reported_to_be_none_and_kept(tmp_path: Path) ->
     assert outcome == RecoveryOutcome(failed=1)
     assert printed[0] == "a_0.mcap: NOT REPAIRED: not an MCAP file: it does not begin as one"
     assert path.read_bytes() == b"a letter"
-
-
-def test_an_empty_file_that_may_be_anything_is_kept(tmp_path: Path) -> None:
-    path = tmp_path / "notes.txt"
-    path.write_bytes(b"")
-    outcome, printed = recovered(path)
-    assert outcome.failed == 1
-    assert "its name does not end in .mcap" in printed[0]
-    assert path.exists()
 
 
 def test_what_a_recorder_is_writing_is_left_alone(tmp_path: Path) -> None:
@@ -220,11 +187,6 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     assert printed[0].startswith("1 bag file of another kind was left alone")
 
 
-def test_what_is_not_there_cannot_be_repaired(tmp_path: Path) -> None:
-    with pytest.raises(RecorderError, match="no such file or directory"):
-        recovered(tmp_path / "gone")
-
-
 def test_on_a_full_disk_the_original_is_kept(tmp_path: Path) -> None:
     path = left_open(tmp_path / "a_0.mcap")
     before = path.read_bytes()
@@ -245,13 +207,6 @@ def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(tmp_path: Path) -> 
     assert " 50% a/a_0.mcap" in shown
     assert "100% a/a_1.mcap" in shown
     assert "\x1b[2K" in shown.rpartition("%")[2]
-
-
-def test_nothing_but_a_terminal_sees_it(tmp_path: Path) -> None:
-    left_open(tmp_path / "a_0.mcap")
-    stream = io.StringIO()
-    recover_files(tmp_path, lambda _: None, console=Console(file=stream), clock=later(60))
-    assert stream.getvalue() == ""
 
 
 def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path) -> None:
@@ -282,24 +237,6 @@ class TestTheProgram:
         assert empty.exists()
         exits(0, "recover", tmp_path, "--force", "--yes")
         assert not empty.exists()
-
-    def test_does_not_ask_where_this_recorder_made_the_recording(
-        self, tmp_path: Path, exits: Program
-    ) -> None:
-        left_open(tmp_path / "rec/rec_0.mcap")
-        own_all(tmp_path)
-        exits(0, "recover", tmp_path, "--force")
-
-    @pytest.mark.parametrize(
-        ("name", "code", "said"),
-        [("a_0.mcap", 1, ""), ("gone", 2, "ros2-memory recover: "), ("whole.mcap", 0, "")],
-    )
-    def test_exit_codes_say_whether_all_is_whole(
-        self, tmp_path: Path, exits: Program, name: str, code: int, said: str
-    ) -> None:
-        write_mcap(tmp_path / "whole.mcap", MESSAGES)
-        (tmp_path / "a_0.mcap").write_bytes(b"a letter")
-        assert said in exits(code, "recover", tmp_path / name).err
 
 
 @needs_recorded

@@ -227,19 +227,6 @@ def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.Mo
     assert "pip install '.[lake]'" in ship(2).err
 
 
-def test_without_a_warehouse_it_says_how_to_name_one(ship: Ship) -> None:
-    assert "lake.warehouse=/srv/lake" in ship(2, "lake.warehouse=null").err
-
-
-def test_a_robot_whose_folder_is_gone_is_named_and_the_others_are_shipped(
-    ship: Ship, fleet: Path, tmp_path: Path
-) -> None:
-    robots = f"fleet.robots={{hall: {fleet}/hall, attic: {tmp_path}/attic}}"
-    done = ship(1, robots).json
-    assert done["bags"] == 2
-    assert "attic" in done["problems"][0]
-
-
 def test_no_secret_is_in_an_error_or_in_the_configuration(
     ship: Ship, tmp_path: Path, exits: Program
 ) -> None:
@@ -255,8 +242,3 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
     assert "hunter2" not in exits(0, "config", "show", "fleet.robots={r1: /r1}", given).out
     secrets.write_text("[hunter2hunter2]")
     assert "hunter2" not in ship(2, given).err
-
-
-def test_a_lake_that_cannot_be_opened_is_reported(ship: Ship, tmp_path: Path) -> None:
-    (tmp_path / "lake").write_text("a file in its place")
-    assert str(tmp_path / "lake") in ship(2).err

@@ -38,12 +38,6 @@ def test_a_deployment_that_does_not_record_is_refused(exits: Program, tmp_path: 
     assert not (tmp_path / "bags").exists()
 
 
-def test_a_folder_that_cannot_be_made_is_named(exits: Program, tmp_path: Path) -> None:
-    (tmp_path / "bags").touch()
-    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
-    assert f"{tmp_path / 'bags'} is a file, or lies below one, and not a directory" in said
-
-
 def test_a_folder_that_cannot_be_written_is_named(
     exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -52,14 +46,6 @@ def test_a_folder_that_cannot_be_written_is_named(
     monkeypatch.setattr(os, "access", lambda path, mode: path != bags and access(path, mode))
     said = exits(2, "up", "--yes", "--bag-dir", bags).err
     assert f"{bags} cannot be written by this user; name another folder" in said
-
-
-def test_a_domain_that_does_not_exist_is_named(
-    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
-    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
-    assert "ROS_DOMAIN_ID: '233' is not allowed" in said
 
 
 def test_a_domain_of_a_setup_file_is_checked_too(exits: Program, tmp_path: Path) -> None:
@@ -139,12 +125,6 @@ def test_what_is_to_outlive_the_bags_is_asked_once(
         monkeypatch.setattr(sys, "stdin", Terminal(typed))
         exits(0, "up", "--bag-dir", tmp_path / "bags")
     assert ["memory.keep=true" in words for words in started] == [True, True]
-
-
-def test_a_list_that_cannot_be_written_is_named(exits: Program, tmp_path: Path) -> None:
-    file = tmp_path / "nowhere" / "topics.yaml"
-    words = ["--bag-dir", tmp_path / "bags", f"recording.topics_file={file}"]
-    assert f"{file} cannot be written: No such file" in exits(2, "up", "--yes", *words).err
 
 
 def test_install_hands_the_list_over_to_the_script(

@@ -96,11 +96,6 @@ def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     assert "no data" in exits(0, "watch", "--count", "1", "--bag-dir", tmp_path / "none").out
 
 
-@pytest.mark.parametrize("words", [["--every", "0"], ["--count", "0"]])
-def test_what_makes_no_sense_is_refused(exits: Program, words: list[str]) -> None:
-    assert "more than 0" in exits(2, "watch", *words).err
-
-
 def test_a_terminal_gets_a_table() -> None:
     ours, theirs = pty.openpty()
     program = [sys.executable, "-m", "ros2_memory.cli", "watch", "--count", "1"]

@@ -114,10 +114,6 @@ def test_an_answer_that_differs_in_a_place_that_counts_is_wrong(
     assert not judge_reply(BY_WORDS[words], falsified, replied.asked).right
 
 
-def test_each_question_has_places_that_count() -> None:
-    assert set(PATHS_THAT_COUNT) == set(BY_WORDS)
-
-
 @pytest.mark.parametrize("words", ["How far back do you remember?"])
 @pytest.mark.parametrize("kind", ["gaps", "damaged", "incomplete", "unread"])
 def test_a_memory_with_faults_is_wrong(replied: Replied, words: str, kind: str) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -12,8 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.demo import run
-from ros2_memory.demo.run import free_port, run_demo, running_server, server_environment
+from ros2_memory.demo.run import run_demo, running_server, server_environment
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,13 +26,6 @@ def serving(server: HTTPServer) -> Iterator[None]:
     finally:
         server.shutdown()
         thread.join()
-
-
-def test_a_port_in_use_is_refused_with_its_number_and_the_way_out() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"):
-            free_port(port)
 
 
 def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_path: Path) -> None:
@@ -54,23 +45,6 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
             running_server(tmp_path, port, print, split_duration_s=5.0),
         ):
             pass
-
-
-def test_on_a_busy_machine_it_says_what_it_waits_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "_SAID_AFTER_S", 0.0)
-    said: list[str] = []
-    port = free_port(0)
-    with running_server(tmp_path, port, said.append, split_duration_s=5.0) as server:
-        assert server.poll() is None
-    assert said == [f"waiting up to 300 s for the server to answer on port {port}"]
-
-
-@pytest.mark.parametrize("port", [-1, 65536])
-def test_a_number_that_is_no_port_is_refused(port: int) -> None:
-    with pytest.raises(ConfigError, match=f"port {port} "):
-        free_port(port)
 
 
 def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:

@@ -138,8 +138,3 @@ def test_a_robot_is_told_when_its_time_is_up() -> None:
     assert not call.deadline.expired()
     assert isinstance(error, QueryTimeoutError)
     assert error.searched_back_to == 7
-
-
-def test_nobody_is_asked_when_the_call_is_over() -> None:
-    found = FanOut().ask(robots(3), lambda *_: "fine", Call(Deadline.after(-1)))
-    assert all(isinstance(each, QueryTimeoutError) for each in found.values())

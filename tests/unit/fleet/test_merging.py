@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import EpisodicError, QueryTimeoutError, RefusedError
+from ros2_memory.core.errors import EpisodicError
 from ros2_memory.fleet.tools import Page, RobotReply, merged
 
 if TYPE_CHECKING:
@@ -88,11 +88,3 @@ def test_a_stay_that_goes_on_is_the_newest() -> None:
     ]
     found = reply_of("visits", replies)["visits"]
     assert [row["robot_name"] for row in found] == ["r2", "r1"]
-
-
-def test_who_has_no_answer_is_named_with_the_reason_once() -> None:
-    gone = RefusedError("the disk is gone")
-    failures = {"r1": gone, "r2": QueryTimeoutError("too slow"), "r3": gone}
-    found = reply_of("find_things", [RobotReply("r4", {"things": []})], failures=failures)
-    assert found["notes"] == ["no answer of r1, r3: the disk is gone", "no answer of r2: too slow"]
-    assert found["robots_failed"] == {"r1": "refused", "r2": "timeout", "r3": "refused"}

@@ -6,7 +6,6 @@ The oracle is a server of each robot alone.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,22 +104,6 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
     for tool, given in (("recap", last), ("memory_status", {})):
         for value in (reply_of(short[tool], given), reply(fleet, tool, given)):
             assert {row["robot_name"]: row["now"] for row in value["robots"]} == nows, tool
-
-
-def test_a_robot_that_recorded_nothing_then_is_named_and_the_others_answer(
-    tmp_path: Path,
-) -> None:
-    for name, shift_s in (("early", 0), ("late", 300)):
-        write_robot(replace(seeded(name), start_s=START_S + shift_s), tmp_path / name)
-    fleet = fleet_over(tmp_path, ("early", "late"), shared_map=True)
-    span = {"start": START_S, "end": START_S + LENGTH_S}
-    for tool in ("find_matches", "find_things", "visits"):
-        given = CALLS.get(tool, {})
-        found = reply(fleet, tool, {**given, **span})
-        [note] = [note for note in found["notes"] if note.startswith("no answer of")]
-        assert note.startswith("no answer of late: nothing was recorded between")
-        nobody = reply(fleet, tool, {**given, "start": START_S + 200, "end": START_S + 250})
-        assert (nobody["error"], nobody["reason"]) == ("no_data", "outside_range")
 
 
 def test_which_robot_last_saw_it_is_the_newest_of_the_answers_of_each(folder: Path) -> None:
@@ -298,13 +281,6 @@ def test_coordinates_are_asked_of_one_robot_unless_all_share_a_map(
         one = {} if asked_of.shared_map else {"robot": "r1"}
         assert "error" not in reply(asked_of, name, {**given, **one})
     assert "error" not in reply(fleet, "find_things", {"near": {"label": "table"}})
-
-
-def test_the_same_hours_of_each_day_are_asked_of_one_robot(folder: Path) -> None:
-    fleet = fleet_over(folder, NAMES)
-    given: dict[str, object] = {"x": 1, "y": 0, "between": "00:00-23:59"}
-    assert "robot" in reply(fleet, "visits", given)["detail"]
-    assert reply(fleet, "visits", {**given, "robot": "r1"})["windows"]
 
 
 def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:

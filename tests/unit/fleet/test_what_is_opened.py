@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
-from ros2_memory.bootstrap_fleet import build_fleet, robot_settings
+from ros2_memory.bootstrap_fleet import robot_settings
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import WallClock
@@ -62,19 +62,3 @@ def test_only_the_bag_of_the_newest_sight_is_opened(
             expected.add(f"{robot.name}/rec/rec_{times[-1] // (LENGTH_S // 2)}.mcap")
     assert len(found["matches"]) == len(expected)
     assert {"/".join(path.parts[-3:]) for path, _ in reader.asked} == expected
-
-
-def test_what_was_read_of_many_robots_takes_no_more_memory_than_of_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    robots = ", ".join(f"{name}: {tmp_path}/{name}" for name in NAMES)
-    given = [f"fleet.robots={{{robots}}}", "store.cache_mb=3"]
-    fleet = build_fleet(load_settings(given, {"MEMORY_DEPLOYMENT": "fleet"}))
-    assert fleet is not None
-    one, other, _ = (robot.memory().columns.caches.read for robot in fleet.robots.values())
-    most = 3 << 20
-    one.put("column", "one's", most)
-    assert (one.get("column"), other.get("column")) == ("one's", None)
-    other.put("column", "other's", most)
-    assert (one.get("column"), other.get("column")) == (None, "other's")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from datetime import date, timedelta
 from pathlib import Path
@@ -95,13 +94,3 @@ def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
     with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
         engine.select(sql, "things", files, {})
     assert str(tmp_path) not in str(raised.value)
-
-
-def test_threads_ask_at_once(select: Select) -> None:
-    sql = "SELECT count(*) AS n FROM sightings WHERE label = $label"
-
-    def count(label: str) -> object:
-        return select(sql, {"label": label})["n"].to_pylist()
-
-    with ThreadPoolExecutor(4) as pool:
-        assert [*pool.map(count, ODD * 2)] == [[6]] * len(ODD) * 2

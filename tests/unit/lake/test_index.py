@@ -90,20 +90,6 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
         assert shipping.engine.days() == looked_at
 
 
-def test_segments_without_a_new_bag_stay(
-    shipping: Shipping, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What was computed of them is kept by segment."""
-    monkeypatch.setattr("ros2_memory.index.timeline.SEGMENT_BAGS", 4)
-    shipping.ship(range(START_S, START_S + 6))
-    robot = shipping.robot()
-    before = robot.index.refresh().timeline.segments
-    shipping.ship([START_S + 8])
-    after = robot.index.refresh().timeline.segments
-    assert len(before) > 1
-    assert [*map(id, after[: len(before) - 1])] == [*map(id, before[:-1])]
-
-
 def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shipping) -> None:
     """A question that is under way reads the bag that it found."""
     shipping.ship([START_S])

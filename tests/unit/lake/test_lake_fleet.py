@@ -13,9 +13,7 @@ from typing import Any
 
 import anyio
 import pytest
-import structlog
 
-from ros2_memory import cli
 from ros2_memory.bootstrap_fleet import build_fleet, engine_of
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
@@ -194,35 +192,6 @@ def test_an_emptied_folder_does_not_hide_that_the_lake_has_times_alone(tmp_path:
         ("find_last_match", CUP),
     ):
         assert reply(fleet, tool, {**given, **of_camera})["error"] == "not_in_lake"
-
-
-def test_a_lake_without_a_bag_is_reported(tmp_path: Path) -> None:
-    """As one is that was given by a wrong path."""
-    write_bag(tmp_path / "hall", 0)
-    with structlog.testing.capture_logs() as logs:
-        served(tmp_path)
-    assert [each["warehouse"] for each in logs if each["event"] == "lake_empty"] == [
-        str(tmp_path / "lake")
-    ]
-    ship_from(tmp_path)
-    with structlog.testing.capture_logs() as logs:
-        build_fleet(load_settings(overrides(tmp_path), {}))
-    assert "lake_empty" not in {each["event"] for each in logs}
-
-
-def test_the_command_line_asks_a_lake(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    write_bag(tmp_path / "hall", 0)
-    ship_from(tmp_path)
-    shutil.rmtree(tmp_path / "hall")
-    settings = [*overrides(tmp_path), "+lake.properties={x.y: z}"]
-    question = [f"{key}={value}" for key, value in CUP.items()]
-    capsys.readouterr()
-    assert cli.main(["ask", "--json", "find_last_match", *settings, *question]) == 0
-    [match] = json.loads(capsys.readouterr().out)["matches"]
-    assert match["robot_name"] == "hall"
 
 
 def _with_a_later_robot(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Fleet:

@@ -13,7 +13,7 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.queries import find_last_match, value_when
+from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
@@ -80,13 +80,6 @@ def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) ->
         for name in ({}, {"robot": "hall"}):
             found = asked(robot, "find_matches", "cup", **span, **name)
             assert ("not looked at" in str(found)) is is_noted, span
-
-
-def test_a_value_at_a_match_of_old_days_is_found(memory: Memory) -> None:
-    ask = partial(value_when, memory, Call(), "/chatter", SEEN, condition_type="contains")
-    found = ask(value="fork")
-    assert found.matched is not None
-    assert found.matched.sample.time == (START_S - 6 * DAY_S) * NS_PER_S
 
 
 def test_where_the_time_is_short_it_says_how_far_it_looked(

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from random import Random
-from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
@@ -85,31 +83,6 @@ def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memo
 def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> list[int]:
     batches = reader.batches(path, [topic], window, bare=[topic])
     return sorted(time for batch in batches for time in batch.log_times.tolist())
-
-
-@pytest.mark.parametrize("bags_near", [0, 2, 100])
-def test_bags_are_read_together_as_far_as_they_fit_into_memory(
-    engine: LakeEngine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bags_near: int
-) -> None:
-    for number in range(12):
-        write_bag(tmp_path / "hall", number)
-    ship_from(tmp_path)
-    memory, read = lake_robot(tmp_path / "lake", engine), list[pa.Table]()
-    select_from = engine.select
-
-    def select(sql: str, *given: Any) -> pa.Table:
-        found = select_from(sql, *given)
-        read.extend([found] if "packed" in found.column_names else [])
-        return found
-
-    monkeypatch.setattr(engine, "select", select)
-    monkeypatch.setattr("ros2_memory.lake.memory._NEAR_BYTES", 100 * bags_near)
-    for bag in memory.index.snapshot().bags:
-        assert [*memory.reader.batches(Path(bag.file), ["/chatter"], EVERYTHING)]
-    sizes = [len(data) for table in read for data in table["packed"].to_pylist()]
-    assert all(50 < size <= 100 for size in sizes)
-    assert max(table.num_rows for table in read) <= 2 * (2 * bags_near) + 1
-    assert len(sizes) <= 12 * 2.5
 
 
 def test_recordings_that_a_handover_joins_are_one_run_of_odometry(

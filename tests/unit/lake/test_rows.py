@@ -10,7 +10,6 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
-from ros2_memory.lake.rows import taken_apart
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
@@ -92,22 +91,3 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     # Of more than may be in memory the largest goes.
     monkeypatch.setattr("ros2_memory.lake.rows._MOST_BYTES", 8_000)
     assert whole("short") == set()
-
-
-def test_scalars_have_columns_by_their_kind_and_their_paths() -> None:
-    apart = taken_apart(
-        {"header": {"frame_id": "map", "stamp": {"sec": 5}}, "on": True, "x": 0.5, "data": [1, 2]}
-    )
-    assert apart == {
-        "value": (
-            '{"header":{"frame_id":null,"stamp":{"sec":null}},"on":null,"x":null,"data":[1,2]}'
-        ),
-        "flags": [("on", True)],
-        "integers": [("header.stamp.sec", 5)],
-        "numbers": [("x", 0.5)],
-        "texts": [("header.frame_id", "map")],
-    }
-    # What no column can have stays JSON.
-    apart = {**taken_apart({"a.b": 1, "large": 2**63, "none": None, "": {"x": 1}})}
-    assert apart.pop("value") == '{"a.b":1,"large":9223372036854775808,"none":null,"":{"x":1}}'
-    assert not any(apart.values())

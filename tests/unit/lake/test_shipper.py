@@ -79,17 +79,6 @@ def _snapshots(folder: Path) -> dict[str, int]:
         return {name: len(lake.current(name).snapshots()) for name in TABLES}
 
 
-def test_a_batch_has_as_many_bytes_of_rows_as_memory_may_hold(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with shipping(tmp_path, [robot_bags("hall", fleet / "hall")], most_bags=100) as shipper:
-        monkeypatch.setattr("ros2_memory.lake.shipper.MOST_BYTES", 1)
-        commits: list[bool] = []
-        shipper.before_commit = commits.append
-        assert shipper.run().bags == len(commits) == BAGS
-        assert all(commits)
-
-
 def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
     fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -152,14 +141,6 @@ def test_a_bag_that_retention_cut_keeps_its_rows(tmp_path: Path, first: int) -> 
     append_receipts(tmp_path / "hall", [replace(receipt, size=bag.stat().st_size)])
     assert ship_from(tmp_path).bags == 0
     assert values(tmp_path / "lake") == ["n0", "n1", "n2"]
-
-
-def test_another_bag_under_the_name_of_a_deleted_one_leaves_its_rows(tmp_path: Path) -> None:
-    write_bag(tmp_path / "hall", 0)
-    ship_from(tmp_path)
-    write_bag(tmp_path / "hall", 0, at_s=START_S + 5_000)
-    ship_from(tmp_path)
-    assert len(values(tmp_path / "lake")) == 6
 
 
 def test_a_saved_copy_of_a_bag_is_shipped_only_where_the_bag_is_not(tmp_path: Path) -> None:

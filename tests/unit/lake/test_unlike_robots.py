@@ -128,15 +128,6 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     assert reply(world.both(), "memory_status", {}) == status
 
 
-def test_of_which_topics_a_lake_has_the_times_alone_is_a_doubt(world: World) -> None:
-    doubts = {
-        name: reply(world.lake, "memory_status", {"robot": name})["doubts"]
-        for name in ("twin", "lost")
-    }
-    assert "of 2 topics there are only the times here: /left/image, /right/image" in doubts["twin"]
-    assert "times" not in doubts["lost"]
-
-
 def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
     page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
     view, *statements = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
