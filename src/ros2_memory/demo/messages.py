@@ -7,20 +7,22 @@ from __future__ import annotations
 
 import math
 from functools import cache
-from typing import TYPE_CHECKING, Final, Protocol, cast
+from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 import numpy as np
+from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.demo import published_topics, robot
+from ros2_memory.demo import published_topics as topics
+from ros2_memory.demo import robot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from rosbags.interfaces.typing import FieldDesc
     from rosbags.typesys.store import Typestore
 
-    from ros2_memory.core.model import Vector3
     from ros2_memory.demo.published_topics import Message
     from ros2_memory.demo.robot import Planar, SimulatedThing
 
@@ -33,25 +35,19 @@ VISION_DEFINITIONS: Final = {
     ),
     "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
-
-
-class _Build(Protocol):
-    """A message class, called with its fields by name."""
-
-    def __call__(self, **fields: object) -> object: ...
-
-
 _FOCAL_PX: Final = 320.0
 _PICTURE_PX: Final = (640, 480)
 _CENTRE_PX: Final = (320.0, 240.0)
 _THING_M: Final = 0.15
-_UNKNOWN: Final = math.nan
+
+Body: TypeAlias = "dict[str, object]"
+"""Fields of a message by name; others are zero or empty."""
 
 
 def payload(message: Message) -> bytes:
     """Returns the message in CDR, as it is published."""
-    body = _BODIES[message.stream.topic](message)
-    return bytes(_typestore().serialize_cdr(body, message.stream.type))
+    name = message.stream.type
+    return bytes(_typestore().serialize_cdr(_made(name, _body(message)), name))
 
 
 @cache
@@ -81,117 +77,107 @@ def _typestore() -> Typestore:
     return store
 
 
-def _make(type_name: str, **fields: object) -> object:
-    return cast("_Build", _typestore().types[type_name])(**fields)
+def _made(type_name: str, body: Mapping[str, object]) -> object:
+    store = _typestore()
+    fields = store.fielddefs[type_name][1]
+    build = cast("Callable[[*tuple[object, ...]], object]", store.types[type_name])
+    return build(*(_field(form, body.get(name)) for name, form in fields))
 
 
-def _header(message: Message, frame_id: str) -> object:
+def _field(form: FieldDesc, value: object) -> object:
+    """Returns a field of a message; zero or empty where there is no value."""
+    kind, of = form
+    if kind is Nodetype.NAME:
+        return _made(str(of), cast("Body", value or {}))
+    if kind is Nodetype.BASE:
+        return value or ("" if of[0] == "string" else 0)
+    inner, size = cast("tuple[FieldDesc, int]", of)
+    if inner[0] is Nodetype.NAME:
+        return [_field(inner, each) for each in cast("list[Body]", value)]
+    return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
+
+
+def _body(message: Message) -> Body:  # noqa: C901 - a case for each topic
+    """Returns what the robot publishes in a message."""
+    t = message.t
+    body: Body = {}
+    match message.stream.topic:
+        case topics.CMD_VEL:
+            body = _twist(t)
+        case topics.PATH_CLEAR:
+            body = {"data": robot.path_clear(t)}
+        case topics.TF:
+            body = {"transforms": [_transform(message, "odom", "base_link", robot.pose(t))]}
+        case topics.TF_STATIC:
+            fixed = [_transform(message, "map", "odom", robot.MAP_TO_ODOM)]
+            for child, (x, y, z) in (("camera", robot.CAMERA), ("laser", robot.LASER)):
+                fixed.append(_transform(message, "base_link", child, robot.Planar(x, y, 0.0), z))
+            body = {"transforms": fixed}
+        case topics.ODOM:
+            at = robot.pose(t)
+            pose = {"position": _xyz(at.x, at.y), "orientation": _rotation(at.yaw)}
+            moving = {"pose": {"pose": pose}, "twist": {"twist": _twist(t)}}
+            body = {**_headed(message, "odom"), "child_frame_id": "base_link", **moving}
+        case topics.SCAN:
+            body = {
+                **_headed(message, "laser"),
+                "angle_min": robot.SCAN_START,
+                "angle_max": robot.SCAN_START + (robot.SCAN_BEAMS - 1) * robot.SCAN_STEP,
+                "angle_increment": robot.SCAN_STEP,
+                "scan_time": 0.2,
+                "range_min": 0.05,
+                "range_max": 20.0,
+                "ranges": robot.scan(t),
+            }
+        case topics.BATTERY:
+            unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
+            known = {"voltage": 25.2, "percentage": robot.battery(t), "present": True}
+            body = {**_headed(message, "base_link"), **dict.fromkeys(unknown, math.nan), **known}
+        case topics.SCENE_DESCRIPTION:
+            body = {**_headed(message, "camera"), "data": description(t)}
+        case topics.SCENE_OBJECTS:
+            body = _detections(message, "scene", robot.seen(t))
+        case topics.FOUND:
+            wanted = [thing for thing in robot.seen(t) if thing.label == "scissors"]
+            body = _detections(message, "find_object", wanted)
+    return body
+
+
+def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> Body:
+    found = [
+        {
+            "label": thing.label,
+            "score": thing.score,
+            "point": _xyz(*thing.point),
+            "bbox": _bounding_box(thing),
+        }
+        for thing in things
+    ]
+    return {**_headed(message, "base_link"), "skill": skill, "detections": found}
+
+
+def _headed(message: Message, frame_id: str) -> Body:
     seconds, nanoseconds = divmod(message.publish_time, NS_PER_S)
-    stamp = _make("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
-    return _make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+    stamp = {"sec": seconds, "nanosec": nanoseconds}
+    return {"header": {"stamp": stamp, "frame_id": frame_id}}
 
 
-def _point(xyz: Vector3) -> object:
-    return _make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
+def _xyz(x: float, y: float, z: float = 0.0) -> Body:
+    return {"x": x, "y": y, "z": z}
 
 
-def _vector(x: float, y: float = 0.0, z: float = 0.0) -> object:
-    return _make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+def _rotation(yaw: float) -> Body:
+    return {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def _quaternion(yaw: float) -> object:
-    return _make(
-        "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(yaw / 2), w=math.cos(yaw / 2)
-    )
-
-
-def _twist(t: float) -> object:
+def _twist(t: float) -> Body:
     forward, turning = robot.twist(t)
-    return _make(
-        "geometry_msgs/msg/Twist", linear=_vector(forward), angular=_vector(0.0, 0.0, turning)
-    )
+    return {"linear": {"x": forward}, "angular": {"z": turning}}
 
 
-def _odometry(message: Message) -> object:
-    at = robot.pose(message.t)
-    pose = _make(
-        "geometry_msgs/msg/Pose",
-        position=_point((at.x, at.y, 0.0)),
-        orientation=_quaternion(at.yaw),
-    )
-    covariance = np.zeros(36)
-    return _make(
-        "nav_msgs/msg/Odometry",
-        header=_header(message, "odom"),
-        child_frame_id="base_link",
-        pose=_make("geometry_msgs/msg/PoseWithCovariance", pose=pose, covariance=covariance),
-        twist=_make(
-            "geometry_msgs/msg/TwistWithCovariance", twist=_twist(message.t), covariance=covariance
-        ),
-    )
-
-
-def _transform(message: Message, parent: str, child: str, at: Planar, z: float = 0.0) -> object:
-    return _make(
-        "geometry_msgs/msg/TransformStamped",
-        header=_header(message, parent),
-        child_frame_id=child,
-        transform=_make(
-            "geometry_msgs/msg/Transform",
-            translation=_vector(at.x, at.y, z),
-            rotation=_quaternion(at.yaw),
-        ),
-    )
-
-
-def _moving_frames(message: Message) -> object:
-    moving = _transform(message, "odom", "base_link", robot.pose(message.t))
-    return _make("tf2_msgs/msg/TFMessage", transforms=[moving])
-
-
-def _fixed_frames(message: Message) -> object:
-    fixed = [_transform(message, "map", "odom", robot.MAP_TO_ODOM)]
-    for child, (x, y, z) in (("camera", robot.CAMERA), ("laser", robot.LASER)):
-        fixed.append(_transform(message, "base_link", child, robot.Planar(x, y, 0.0), z))
-    return _make("tf2_msgs/msg/TFMessage", transforms=fixed)
-
-
-def _scan(message: Message) -> object:
-    return _make(
-        "sensor_msgs/msg/LaserScan",
-        header=_header(message, "laser"),
-        angle_min=robot.SCAN_START,
-        angle_max=robot.SCAN_START + (robot.SCAN_BEAMS - 1) * robot.SCAN_STEP,
-        angle_increment=robot.SCAN_STEP,
-        time_increment=0.0,
-        scan_time=0.2,
-        range_min=0.05,
-        range_max=20.0,
-        ranges=robot.scan(message.t).astype(np.float32),
-        intensities=np.zeros(0, dtype=np.float32),
-    )
-
-
-def _battery(message: Message) -> object:
-    return _make(
-        "sensor_msgs/msg/BatteryState",
-        header=_header(message, "base_link"),
-        voltage=25.2,
-        temperature=_UNKNOWN,
-        current=_UNKNOWN,
-        charge=_UNKNOWN,
-        capacity=_UNKNOWN,
-        design_capacity=_UNKNOWN,
-        percentage=robot.battery(message.t),
-        power_supply_status=0,
-        power_supply_health=0,
-        power_supply_technology=0,
-        present=True,
-        cell_voltage=np.zeros(0, dtype=np.float32),
-        cell_temperature=np.zeros(0, dtype=np.float32),
-        location="",
-        serial_number="",
-    )
+def _transform(message: Message, parent: str, child: str, at: Planar, z: float = 0.0) -> Body:
+    moved = {"translation": _xyz(at.x, at.y, z), "rotation": _rotation(at.yaw)}
+    return {**_headed(message, parent), "child_frame_id": child, "transform": moved}
 
 
 def _bounding_box(thing: SimulatedThing) -> list[int]:
@@ -206,53 +192,3 @@ def _bounding_box(thing: SimulatedThing) -> list[int]:
         for corner in corners
         for edge, size in zip(corner, _PICTURE_PX, strict=True)
     ]
-
-
-def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> object:
-    detections = [
-        _make(
-            "ros2_vision_interfaces/msg/VisionDetection",
-            label=thing.label,
-            score=thing.score,
-            point=_point(thing.point),
-            bbox=np.array(_bounding_box(thing), dtype=np.int32),
-        )
-        for thing in things
-    ]
-    return _make(
-        "ros2_vision_interfaces/msg/VisionDetectionArray",
-        header=_header(message, "base_link"),
-        skill=skill,
-        detections=detections,
-    )
-
-
-def _found(message: Message) -> object:
-    wanted = [thing for thing in robot.seen(message.t) if thing.label == "scissors"]
-    return _detections(message, "find_object", wanted)
-
-
-def _described(message: Message) -> object:
-    return _make(
-        "ros2_vision_interfaces/msg/StampedString",
-        header=_header(message, "camera"),
-        data=description(message.t),
-    )
-
-
-_BODIES: Final[Mapping[str, Callable[[Message], object]]] = {
-    published_topics.ODOM: _odometry,
-    published_topics.TF: _moving_frames,
-    published_topics.TF_STATIC: _fixed_frames,
-    published_topics.CMD_VEL: lambda message: _twist(message.t),
-    published_topics.SCAN: _scan,
-    published_topics.PATH_CLEAR: lambda message: _make(
-        "std_msgs/msg/Bool", data=robot.path_clear(message.t)
-    ),
-    published_topics.BATTERY: _battery,
-    published_topics.SCENE_OBJECTS: lambda message: _detections(
-        message, "scene", robot.seen(message.t)
-    ),
-    published_topics.FOUND: _found,
-    published_topics.SCENE_DESCRIPTION: _described,
-}
