@@ -267,16 +267,8 @@ def demo(
     once: Annotated[bool, "Exit after the answers; code 1 if one was wrong."] = False,
     *,
     port: Annotated[int, "Port on 127.0.0.1; 0 picks a free one."] = 9203,
-    bag_dir: Annotated[
-        Path | None,
-        "DIR",
-        "Keep the bags in this new or empty folder.",
-    ] = None,
-    duration: Annotated[
-        float,
-        "S",
-        "Seconds to record before the questions.",
-    ] = 120.0,
+    bag_dir: Annotated[Path | None, "DIR", "Keep the bags in this new or empty folder."] = None,
+    duration: Annotated[float, "S", "Seconds to record before the questions."] = 120.0,
     verbose: Annotated[bool, "Show the server's log on stderr."] = False,
     as_json: Annotated[bool, "--json", "Print a line of JSON for each question."] = False,
 ) -> int:

@@ -14,7 +14,7 @@ import typer
 from ros2_memory.cli.options import Bags, Times
 from ros2_memory.cli.output import format_time, format_value, leaves, print_notes
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
@@ -34,23 +34,13 @@ def cat(
     ],
     *,
     field: Annotated[
-        list[str] | None,
-        "PATH",
-        "Print only this field, such as pose.covariance; repeatable.",
+        list[str] | None, "PATH", "Print only this field, such as pose.covariance; repeatable."
     ] = None,
     times: Times,
-    limit: Annotated[
-        int | None,
-        "--limit",
-        "-n",
-        "N",
-        "Print only the first N messages.",
-    ] = None,
+    limit: Annotated[int | None, "--limit", "-n", "N", "Print only the first N messages."] = None,
     tail: Annotated[int | None, "N", "Print only the newest N messages."] = None,
     as_csv: Annotated[
-        bool,
-        "--csv",
-        "Print CSV: time in Unix seconds, a column for each field.",
+        bool, "--csv", "Print CSV: time in Unix seconds, a column for each field."
     ] = False,
     as_json: Annotated[bool, "--json", "Print JSON lines: time (Unix s), time_ns, value."] = False,
     bags: Bags,
@@ -80,28 +70,22 @@ def cat(
     chosen = islice(messages, limit if tail is None else tail)
     exact = as_csv or as_json
     rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
+    lines = _csv(rows) if as_csv else (_line(*row, as_json=as_json) for row in rows)
     count = 0
-    for line in (_csv if as_csv else _json_lines if as_json else _lines)(rows):
+    for line in lines:
         count += 1
         print(line)
     sys.stdout.flush()
     note_unread(view, window)
     print_notes(view.notes.sentences())
     if not count:
-        print(
-            f"no message of {name} to show {_described(window)}; "
-            "`ros2-memory topics` says when there are some",
-            file=sys.stderr,
-        )
+        first, last = (format_time(unix_from_ns(at)) for at in window.asked())
+        since = f" from {first}" if window.start > MIN_NS else ""
+        until = f" until {last}" if window.stop < MAX_NS else ""
+        when = f"{since}{until}" or " at any time"
+        advice = "`ros2-memory topics` says when there are some"
+        print(f"no message of {name} to show{when}; {advice}", file=sys.stderr)
     return not count or not view.notes.complete
-
-
-def _described(window: TimeWindow) -> str:
-    """Returns a window in this machine's time, as far as it is bounded."""
-    first, last = window.asked()
-    since = f"from {format_time(unix_from_ns(first))} " if window.start > MIN_NS else ""
-    until = f"until {format_time(unix_from_ns(last))}" if window.stop < MAX_NS else ""
-    return f"{since}{until}".strip() or "at any time"
 
 
 def _extracted(
@@ -134,17 +118,11 @@ def _extracted(
         view.notes.add(f"{what} left out that cannot be decoded: `ros2-memory info` shows why")
 
 
-def _lines(rows: Iterable[Row]) -> Iterator[str]:
-    for time, value in rows:
-        yield f"{format_time(unix_from_ns(time))}  {format_value(value)}"
-
-
-def _json_lines(rows: Iterable[Row]) -> Iterator[str]:
-    for time, value in rows:
-        yield json.dumps(
-            {"time": unix_from_ns(time), "time_ns": time, "value": _finite(value)},
-            ensure_ascii=False,
-        )
+def _line(time: Ns, value: JsonValue, *, as_json: bool) -> str:
+    if not as_json:
+        return f"{format_time(unix_from_ns(time))}  {format_value(value)}"
+    row = {"time": unix_from_ns(time), "time_ns": time, "value": _finite(value)}
+    return json.dumps(row, ensure_ascii=False)
 
 
 def _finite(value: JsonValue) -> JsonValue:
@@ -159,32 +137,30 @@ def _finite(value: JsonValue) -> JsonValue:
 
 
 def _csv(rows: Iterable[Row]) -> Iterator[str]:
-    """Yields a header and a line for each row; the columns are those of the first row."""
+    """Yields a header and a line for each row; the columns are those of the first row.
+
+    An object's are under names with dots, a list is JSON.
+    """
     columns: list[str] | None = None
     beside: set[str] = set()
     for time, value in rows:
-        cells = dict(_cells(value))
+        cells: dict[str, object] = {}
+        for name, inner in leaves(value):
+            is_list = isinstance(inner, list)
+            text = json.dumps(_finite(inner) if is_list else inner, ensure_ascii=not is_list)
+            cells[name or "value"] = inner if isinstance(inner, str | None) else text
         if columns is None:
             columns = [*cells]
             yield _csv_line(["time", *columns])
         beside.update(cells.keys() - columns)
         seconds, rest = divmod(time, NS_PER_S)
-        yield _csv_line([f"{seconds}.{rest:09d}", *(cells.get(name, "") for name in columns)])
+        yield _csv_line([f"{seconds}.{rest:09d}", *map(cells.get, columns)])
     if beside:
         names = listed(sorted(beside))
         print_notes([f"no column, as the first message has no such field: {names}"])
 
 
-def _cells(value: JsonValue) -> Iterator[tuple[str, str]]:
-    """Yields the columns of a value: an object's under names with dots, a list as JSON."""
-    for name, inner in leaves(value):
-        cell = inner if isinstance(inner, str) else json.dumps(inner)
-        if isinstance(inner, list):
-            cell = json.dumps(_finite(inner), ensure_ascii=False)
-        yield name or "value", "" if inner is None else cell
-
-
-def _csv_line(cells: Sequence[str]) -> str:
+def _csv_line(cells: Sequence[object]) -> str:
     line = StringIO()
     csv.writer(line, lineterminator="").writerow(cells)
     return line.getvalue()

@@ -24,18 +24,20 @@ from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
-from ros2_memory.cli.doctor_lake import check_lake, check_shipping
-from ros2_memory.cli.findings import Examined, Finding, Level, error, ok, warning
+from ros2_memory.cli.findings import (
+    Examined,
+    Finding,
+    Level,
+    check_lake,
+    check_shipping,
+    error,
+    ok,
+    warning,
+)
 from ros2_memory.cli.info import assumed_active
 from ros2_memory.cli.options import AsJson, Bags, open_memory
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
-from ros2_memory.config import (
-    NullRecorderNode,
-    Settings,
-    config_dir,
-    files_in_use,
-    unused_config,
-)
+from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
@@ -260,10 +262,11 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         yield warning(nothing_here(snapshot), do)
     if broken := (*covered.damaged, *covered.incomplete):
         names = listed([f"{bag.path.name} ({bag.reason})" for bag in broken])
-        yield warning(
-            f"{len(covered.damaged)} damaged and {len(covered.incomplete)} unfinished: {names}",
-            _how_to_repair(broken, memory.reader, settings),
-        )
+        seen = f"{len(covered.damaged)} damaged and {len(covered.incomplete)} unfinished: {names}"
+        others = sum(not _is_repairable(bag, memory.reader) for bag in broken)
+        rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
+        repaired = f"ros2-memory recover {settings.recording.bag_dir}{rest}"
+        yield warning(seen, _NOT_REPAIRED if others == len(broken) else repaired)
     if covered.unread:
         names = listed([bag.path.name for bag in covered.unread])
         files = counted(len(covered.unread), "file is", "files are")
@@ -297,14 +300,6 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
             names = listed([f"{one.topic} ({one.reason})" for one in topics])
             yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
     yield from _check_recordings(memory, snapshot)
-
-
-def _how_to_repair(broken: Collection[SetAside], reader: BagReader, settings: Settings) -> str:
-    others = sum(not _is_repairable(bag, reader) for bag in broken)
-    if others == len(broken):
-        return _NOT_REPAIRED
-    rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
-    return f"ros2-memory recover {settings.recording.bag_dir}{rest}"
 
 
 def _is_repairable(bag: SetAside, reader: BagReader) -> bool:

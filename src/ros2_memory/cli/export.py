@@ -34,9 +34,7 @@ _REPORT_EVERY: Final = 512
 def export(
     *,
     mcap: Annotated[
-        Path | None,
-        "FILE",
-        "Write this MCAP file, for Foxglove, ros2 bag and rosbags.",
+        Path | None, "FILE", "Write this MCAP file, for Foxglove, ros2 bag and rosbags."
     ] = None,
     parquet: Annotated[
         Path | None,
@@ -44,9 +42,7 @@ def export(
         "Write Parquet to this folder, by recording and date, for DuckDB or Spark.",
     ] = None,
     topic: Annotated[
-        list[str] | None,
-        "GLOB",
-        "Copy only these topics, such as /vision/*; repeatable.",
+        list[str] | None, "GLOB", "Copy only these topics, such as /vision/*; repeatable."
     ] = None,
     times: Times,
     latched: Annotated[
@@ -56,9 +52,7 @@ def export(
         "(default: for --mcap).",
     ] = None,
     robot: Annotated[
-        str | None,
-        "NAME",
-        "Partition Parquet by robot, too: one dataset for a fleet.",
+        str | None, "NAME", "Partition Parquet by robot, too: one dataset for a fleet."
     ] = None,
     as_json: AsJson = False,
     bags: Bags,

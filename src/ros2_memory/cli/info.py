@@ -22,10 +22,8 @@ from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
-from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
-from ros2_memory.history.view import View
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import nothing_here
@@ -37,8 +35,8 @@ from ros2_memory.tools.replies import Replies
 _TOLD_TWICE: Final = frozenset(
     {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics"}
 )
-_MOST_ROWS: Final = 5
-"""Faults of clocks that are printed one by one; more are summed up."""
+_MOST_ROWS: Final = 10
+"""Of a list that are printed."""
 _MOST_SILENT: Final = 30
 _OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
@@ -58,7 +56,13 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     rows: list[JsonObject] = []
     try:
         known = list_recorded_topics(memory, Call())
-        rows = [_topic_row(memory, topic) for topic in known]
+        snapshot, latching = memory.index.snapshot(), memory.limits.latching
+        for each in known:
+            # Planners read the rate in `data_time_range` instead.
+            more: JsonObject = {"undecodable": each.undecodable, "notes": [*each.notes]}
+            rate = usual_rate(snapshot, each.topic, latching)
+            own = {key: value for key, value in more.items() if value}
+            rows.append({**shown(each, Scope()), **own, "rate_hz": rate})
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
@@ -77,17 +81,6 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         for aside in (*snapshot.damaged, *snapshot.unread):
             print_line(f"  {aside.path.name}: {aside.reason}")
     return not rows
-
-
-def _topic_row(memory: Memory, known: TopicRow) -> JsonObject:
-    """Returns a row of the tool's reply, with what planners read in `data_time_range` instead."""
-    row = shown(known, Scope())
-    if known.undecodable is not None:
-        row["undecodable"] = known.undecodable
-    if known.notes:
-        row["notes"] = [*known.notes]
-    row["rate_hz"] = usual_rate(memory.index.snapshot(), known.topic, memory.limits.latching)
-    return row
 
 
 def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
@@ -184,47 +177,21 @@ def _show(memory: Memory, report: JsonObject) -> None:
         return
     status, ranged, held, *lists = report.values()
     found = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
+    left_out: list[str] = []
     silent = found.get("topics_without_messages")
     if isinstance(silent, list):
         found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    console = stdout_console()
-    print_reply(console, found | _summed_faults(memory, snapshot))
-    for name, rows in zip([*report][-len(lists) :], lists, strict=True):
-        if rows:
-            print_reply(console, {name: rows})
+    found |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
+    for name, rows in found.items():
+        if isinstance(rows, list) and len(rows) > _MOST_ROWS:
+            found[name] = rows[:_MOST_ROWS]
+            left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
+    notes: JsonObject = {"notes": [*left_out]} if left_out else {}
+    print_reply(stdout_console(), found | notes)
 
 
 def _object(value: JsonValue) -> JsonObject:
     return value if isinstance(value, dict) else {}
-
-
-def _summed_faults(memory: Memory, snapshot: Snapshot) -> JsonObject:
-    """Returns one row for the steps of a clock, and one for the bags it misdated, if many."""
-    summed: JsonObject = {}
-    steps = clock_steps(View(memory, Call())) if snapshot.bags else ()
-    if len(steps) > _MOST_ROWS:
-        largest = max(steps, key=lambda step: abs(step.by))
-        summed["clock_steps"] = [
-            {
-                "steps": len(steps),
-                "first": unix_from_ns(steps[0].at),
-                "last": unix_from_ns(steps[-1].at),
-                "largest_s": round(unix_from_ns(largest.by), 3),
-                "largest_at": unix_from_ns(largest.at),
-            }
-        ]
-    faults = sorted(snapshot.dating.faults, key=lambda fault: fault.bag.start)
-    if len(faults) > _MOST_ROWS:
-        worst = max(snapshot.dating.faults, key=lambda fault: fault.by)
-        summed["clock_faults"] = [
-            {
-                "bags": len(faults),
-                "first": faults[0].bag.path.name,
-                "last": faults[-1].bag.path.name,
-                "largest": f"{worst.bag.path.name}: {worst.reason}",
-            }
-        ]
-    return summed
 
 
 def _held(snapshot: Snapshot) -> JsonObject:
@@ -341,19 +308,17 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif not rows:
         print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
     else:
-        console = stdout_console()
         read = [row for row in rows if "start" in row]
-        is_foreign = all(row["whose"] == _OTHERS for row in read)
-        left_out = {"end", "whose"} if is_foreign else {"end"}  # there is the length
-        print_reply(
-            console, [{key: row[key] for key in row if key not in left_out} for row in read]
-        )
-        if read and is_foreign:
+        left_out = {"end"}  # there is the length
+        if all(row["whose"] == _OTHERS for row in read):
+            left_out.add("whose")
             print_line(f"whose: {_OTHERS} made all of them")
-        others = [row for row in rows if "start" not in row]
-        for title, some in (("not_read", others), ("empty", empty)):
-            if some:
-                print_reply(console, {title: [*some]})
+        lists: JsonObject = {
+            "recordings": [{key: row[key] for key in row if key not in left_out} for row in read],
+            "not_read": [row for row in rows if "start" not in row],
+            "empty": [*empty],
+        }
+        print_reply(stdout_console(), {title: some for title, some in lists.items() if some})
     return not rows
 
 
@@ -367,6 +332,11 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
         for file in inside:
             del left[file]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
+        whose = None if own is None else _OTHERS
+        if Path(path).is_relative_to(root / MOMENTS_FOLDER):
+            whose = "saved moment"
+        elif own is not None and own.owns_bag(bags[0].path):
+            whose = "this recorder"
         is_open = any(bag.state is BagState.ACTIVE for bag in bags)
         yield {
             "recording": name_of(path, bags, str(root)),
@@ -378,7 +348,7 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
             "messages": sum(bag.summary.count for bag in bags),
             "topics": len({topic for bag in bags for topic in bag.summary.schema.positions}),
             "storage": storage_of(bags),
-            "whose": _maker(Path(path), bags, root, own),
+            "whose": whose,
             **({"not_read": len(inside)} if inside else {}),
         }
     for file, reason in sorted(left.items()):
@@ -396,11 +366,3 @@ def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]
             "messages": 0,
             "reason": "no message was recorded",
         }
-
-
-def _maker(path: Path, bags: Sequence[BagFile], root: Path, own: OwnRecordings | None) -> JsonValue:
-    if path.is_relative_to(root / MOMENTS_FOLDER):
-        return "saved moment"
-    if own is None:
-        return None
-    return "this recorder" if own.owns_bag(bags[0].path) else _OTHERS

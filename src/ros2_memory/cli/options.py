@@ -24,12 +24,7 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
 from ros2_memory.cli.output import print_json, spinner, with_local_times
-from ros2_memory.config import (
-    NullRecorderNode,
-    Settings,
-    is_deployment_chosen,
-    load_explained,
-)
+from ros2_memory.config import NullRecorderNode, Settings, is_deployment_chosen, load_explained
 from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
@@ -72,11 +67,7 @@ _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
 
-BagDir = Annotated[
-    Path | None,
-    "DIR",
-    "Use the bags in this folder instead of recording.bag_dir.",
-]
+BagDir = Annotated[Path | None, "DIR", "Use the bags in this folder instead of recording.bag_dir."]
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="key=value", help="Settings, the same as for ros2-memory-server."),
@@ -90,32 +81,18 @@ Words = Annotated[
     ),
 ]
 Recording = Annotated[
-    str | None,
-    "NAME",
-    "Use this recording only, by a name that `ros2-memory recordings` lists.",
+    str | None, "NAME", "Use this recording only, by a name that `ros2-memory recordings` lists."
 ]
 Sets = Annotated[
-    list[str] | None,
-    "--set",
-    "key=value",
-    "A setting, the same as for ros2-memory-server.",
+    list[str] | None, "--set", "key=value", "A setting, the same as for ros2-memory-server."
 ]
-Verbose = Annotated[
-    bool,
-    "--verbose",
-    "-v",
-    "Show the log on stderr, at logging.level.",
-]
+Verbose = Annotated[bool, "--verbose", "-v", "Show the log on stderr, at logging.level."]
 Command: TypeAlias = Callable[..., int | None]  # type: ignore[explicit-any]  # each its own options
 LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
 AsJson = Annotated[bool, "--json", "Print JSON."]
-Start = Annotated[
-    str | None,
-    "TIME",
-    f"Start time: {TIMES}; local time.",
-]
+Start = Annotated[str | None, "TIME", f"Start time: {TIMES}; local time."]
 End = Annotated[str | None, "TIME", "End time, inclusive, in the same formats."]
 
 

@@ -117,11 +117,7 @@ plot = typer.Typer(
 )
 
 Out = Annotated[
-    Path,
-    "--out",
-    "-o",
-    "FILE",
-    "Write the picture here: .svg, .png or .pdf; overwrites the file.",
+    Path, "--out", "-o", "FILE", "Write the picture here: .svg, .png or .pdf; overwrites the file."
 ]
 
 
@@ -168,9 +164,7 @@ def plot_path(
     out: Out,
     times: Times,
     topic: Annotated[
-        str | None,
-        "TOPIC",
-        "The topic of the poses (default: data.pose_topic).",
+        str | None, "TOPIC", "The topic of the poses (default: data.pose_topic)."
     ] = None,
     frame: Annotated[
         str | None,
@@ -198,9 +192,7 @@ def plot_signal(
     *,
     out: Out,
     field: Annotated[
-        list[str] | None,
-        "PATH",
-        "A numeric field; repeatable (default: all that change).",
+        list[str] | None, "PATH", "A numeric field; repeatable (default: all that change)."
     ] = None,
     times: Times,
     as_json: AsJson = False,
@@ -246,9 +238,7 @@ def plot_recap(
     *,
     out: Out,
     day: Annotated[
-        str | None,
-        "TIME",
-        "today, yesterday or a date, 2026-11-20 (default: the newest day).",
+        str | None, "TIME", "today, yesterday or a date, 2026-11-20 (default: the newest day)."
     ] = None,
     times: Times,
     as_json: AsJson = False,

@@ -5,12 +5,13 @@ import re
 import shlex
 import sys
 from bisect import bisect_right
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Final, NamedTuple, cast
+from typing import Annotated, Final, NamedTuple, TypeAlias, cast
 
 import typer
 
@@ -109,6 +110,10 @@ def prove(
     return bool(differing or not rests_on.isdisjoint(proof.undefined))
 
 
+# What a reader has of one message, or of several.
+_Read: TypeAlias = Callable[..., Record | Iterable[Record | Batch] | None]  # type: ignore[explicit-any]
+
+
 class _Proof(NamedTuple):
     """A file or folder that was written.
 
@@ -131,7 +136,8 @@ class _Reads:
         self._calls: list[dict[str, tuple[Ns, Ns]]] = []
 
     def __getattr__(self, name: str) -> object:
-        return getattr(self._reader, name)
+        read = getattr(self._reader, name)
+        return partial(self._noting, read) if name in {"records", "newest", "batches"} else read
 
     def spans(self) -> dict[str, Spans]:
         """Returns from when to when messages were read, by topic."""
@@ -140,46 +146,23 @@ class _Reads:
             topic: united(call[topic] for call in self._calls if topic in call) for topic in topics
         }
 
-    def records(
-        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
-    ) -> Iterator[Record]:
-        """Returns what the reader returns; so do the others."""
-        call = self._call()
+    def _noting(self, read: _Read, *given: object, **more: object) -> object:
+        """Returns what the reader returns, a message or several, noted when it is their turn."""
+        call: dict[str, tuple[Ns, Ns]] = {}
+        self._calls.append(call)
 
-        def noted(record: Record) -> Record:
-            _widen(call, record.channel.topic, [record.log_time])
-            return record
+        def noted(found: Record | Batch) -> Record | Batch:
+            times = [found.log_time] if isinstance(found, Record) else found.log_times.tolist()
+            if times:
+                start, stop = call.get(found.channel.topic, (MAX_NS, MIN_NS))
+                call[found.channel.topic] = min(start, *times), max(stop, max(times) + 1)
+            return found
 
+        found = read(*given, **more)
+        if found is None or isinstance(found, Record):
+            return found and noted(found)
         # Mapped: it goes on behind what cannot be read.
-        return map(noted, self._reader.records(path, topics, window, newest_first=newest_first))
-
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """As above."""
-        record = self._reader.newest(path, topic, window)
-        _widen(self._call(), topic, [] if record is None else [record.log_time])
-        return record
-
-    def batches(
-        self, path: Path, topics: Collection[str], window: TimeWindow, **more: Collection[str]
-    ) -> Iterator[Batch]:
-        """As above."""
-        call = self._call()
-
-        def noted(batch: Batch) -> Batch:
-            _widen(call, batch.channel.topic, batch.log_times.tolist())
-            return batch
-
-        return map(noted, self._reader.batches(path, topics, window, **more))
-
-    def _call(self) -> dict[str, tuple[Ns, Ns]]:
-        self._calls.append({})
-        return self._calls[-1]
-
-
-def _widen(call: dict[str, tuple[Ns, Ns]], topic: str, times: Sequence[Ns]) -> None:
-    if len(times):
-        start, stop = call.get(topic, (MAX_NS, MIN_NS))
-        call[topic] = min(start, *times), max(stop, max(times) + 1)
+        return map(noted, found)
 
 
 def _parts(view: View) -> list[tuple[Path, TimeWindow]]:

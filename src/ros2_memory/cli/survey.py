@@ -13,14 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.cli.proposal import (
-    INDEX_BYTES,
-    MESSAGE_BYTES,
-    Choice,
-    Offered,
-    chosen,
-    judge,
-)
+from ros2_memory.cli.proposal import INDEX_BYTES, MESSAGE_BYTES, Choice, Offered, chosen, judge
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import Ns, unix_from_ns

@@ -66,12 +66,7 @@ QUESTIONS: Final = (
         {"seconds_ago": 10},
         judges.position(10),
     ),
-    Question(
-        "And how fast?",
-        "get_velocity_seconds_ago",
-        {"seconds_ago": 10},
-        judges.velocity(10),
-    ),
+    Question("And how fast?", "get_velocity_seconds_ago", {"seconds_ago": 10}, judges.velocity(10)),
     Question(
         "What objects did you see at the front door?",
         "get_value_when",
@@ -98,11 +93,7 @@ QUESTIONS: Final = (
     Question(
         "When did you last see scissors?",
         "find_last_match",
-        {
-            "topic": "/vision/*/scene_objects",
-            "condition_type": "contains",
-            "value": "scissors",
-        },
+        {"topic": "/vision/*/scene_objects", "condition_type": "contains", "value": "scissors"},
         judges.last_seen("scissors"),
     ),
     Question(

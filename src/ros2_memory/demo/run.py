@@ -148,11 +148,7 @@ def free_port(wanted: int) -> int:
 
 
 def server_environment(
-    environment: Mapping[str, str],
-    bag_dir: Path,
-    port: int,
-    split_duration_s: float,
-    cache: str,
+    environment: Mapping[str, str], bag_dir: Path, port: int, split_duration_s: float, cache: str
 ) -> dict[str, str]:
     """Returns the environment of a server of `bag_dir`, without the caller's settings."""
     kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}

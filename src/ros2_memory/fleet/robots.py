@@ -385,9 +385,6 @@ def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future
 
     # A daemon: one that hangs must not keep the program from ending.
     threading.Thread(
-        target=contextvars.copy_context().run,
-        args=(run,),
-        name=f"robot-{robot.name}",
-        daemon=True,
+        target=contextvars.copy_context().run, args=(run,), name=f"robot-{robot.name}", daemon=True
     ).start()
     return answer

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final, cast
 from ros2_memory import results
 from ros2_memory.core import errors
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import PLAIN, JsonObject, Key, Merging, with_notes
 from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import (
@@ -44,7 +44,6 @@ from ros2_memory.tools.reply_size import to_json_text
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.tools.declaration import Question, Tool
 

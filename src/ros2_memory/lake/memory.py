@@ -17,7 +17,7 @@ from zlib import crc32
 
 from ros2_memory.bag_dir.layout import COMPRESSED
 from ros2_memory.columns.pack import is_large
-from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.columns.scanner import Caches
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
@@ -327,12 +326,7 @@ class LakeReader(BagReader):
         return self.index.bag(path).file.summary
 
     def records(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool = False,
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool = False
     ) -> Iterator[Record]:
         """Yields the messages.
 
@@ -345,12 +339,7 @@ class LakeReader(BagReader):
         yield from heapq.merge(*found, key=attrgetter("log_time"), reverse=newest_first)
 
     def batches(
-        self,
-        path: Path,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        bare: Collection[str] = (),
+        self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
     ) -> Iterator[Batch]:
         """Yields the messages of a channel at once.
 

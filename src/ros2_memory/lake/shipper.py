@@ -120,8 +120,13 @@ class Shipper:
     patience_s: float = PATIENCE_S
 
     def __post_init__(self) -> None:
-        """Has everything looked at, in the bag directories and in the lake."""
-        self._look_again()
+        """Forgets what an earlier shipper knew."""
+        self.look_again()
+
+    def look_again(self) -> None:
+        """Has everything looked at again, in the bag directories and in the lake."""
+        for robot in self.robots:
+            robot.look_again()
 
     def run(self) -> Shipped:
         """Ships what is new: one pass over all robots.
@@ -186,13 +191,8 @@ class Shipper:
             ]
             self.tombstones.add(tombstone)
         if new:
-            self._look_again()
+            self.look_again()
         return True
-
-    def _look_again(self) -> None:
-        """Has everything looked at again, in the bag directories and in the lake."""
-        for robot in self.robots:
-            robot.look_again()
 
     def _commit(self, batch: Sequence[_Ready], done: Shipped, *, is_full: bool) -> None:
         """Commits a batch.
@@ -211,20 +211,23 @@ class Shipper:
                 rows += whole.num_rows
                 self.lake.replace(name, condition, whole)
         except LakeError:
-            self._look_again()
+            self.look_again()
             raise
         done.bags += len(batch)
         done.rows += rows
         log.info("bags_shipped", bags=len(batch), rows=rows)
         for robot in self.robots:
-            robot.shipped([ready for ready in batch if ready.of is robot], self, done)
+            own = [ready for ready in batch if ready.of is robot]
+            for bag in (bag for ready in own for bag in ready.replaced):
+                robot.known.pop(bag.bag_id, None)
+            robot.confirm([ready.bag for ready in own], self, done)
 
 
 @dataclass(eq=False, repr=False)
 class RobotBags:
     """One robot whose bags are shipped, and what is known of those that it has.
 
-    `_seen` has the newest state of each by its file, `_known` what the lake has of them by their
+    `_seen` has the newest state of each by its file, `known` what the lake has of them by their
     ids; neither those that it had: a hub runs for years.
 
     Attributes:
@@ -261,14 +264,10 @@ class RobotBags:
         """Returns the path of a bag below the bag directory."""
         return relative(bag.file, str(self.bag_dir))
 
-    def is_moment(self, bag: BagFile) -> bool:
-        """Returns whether a bag is a copy in a saved moment."""
-        return self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")
-
     def look_again(self) -> None:
         """Has everything looked at again."""
         self._seen: dict[str, _Seen] = {}
-        self._known: dict[str, ShippedBag] = {}
+        self.known: dict[str, ShippedBag] = {}
         self._receipts: dict[str, Receipt] | None = None
 
     def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_Ready]:
@@ -279,17 +278,16 @@ class RobotBags:
             return
         bags = self._settled(snapshot, done)
         self._look_up(bags, shipper.lake)
-        by_file = {shipped.file: shipped for shipped in self._known.values()}
-        ids: set[str] = set()
-        confirmed: list[ShippedBag] = []
+        by_file = {shipped.file: shipped for shipped in self.known.values()}
+        ids, confirmed = set[str](), list[ShippedBag]()
+        copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
         # A saved moment's copy of a bag counts where the bag itself is gone.
-        for bag in sorted(bags, key=lambda bag: (self.is_moment(bag), bag.start)):
+        for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
             shipper.alive()
             try:
                 seen = self._look(bag)
-                before = self._known.get(seen.bag_id)
-                is_again = before is not None and self.is_moment(bag)
-                if seen.bag_id in ids or is_again:
+                before = self.known.get(seen.bag_id)
+                if seen.bag_id in ids or (before is not None and bag.file in copies):
                     continue
                 if self._is_forgotten(bag, seen, shipper.tombstones):
                     done.problems.append(
@@ -300,7 +298,6 @@ class RobotBags:
                 ids.add(seen.bag_id)
                 shipped = self._described(bag, seen.bag_id, before, shipper.messages)
                 if before is not None and _is_same(before, shipped):
-                    self._known[shipped.bag_id] = shipped
                     confirmed.append(shipped)
                     continue
                 of_file = by_file.get(shipped.file)
@@ -318,26 +315,14 @@ class RobotBags:
             if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
                 replaced.add(of_file)
             yield _Ready(self, shipped, rows, [*replaced])
-        self._confirm(confirmed, shipper, done)
+        self.confirm(confirmed, shipper, done)
         self._drop_gone(bags)
-
-    def shipped(self, batch: Sequence[_Ready], shipper: Shipper, done: Shipped) -> None:
-        """Notes that bags were committed."""
-        for ready in batch:
-            for old in ready.replaced:
-                self._known.pop(old.bag_id, None)
-            self._known[ready.bag.bag_id] = ready.bag
-        self._confirm([ready.bag for ready in batch], shipper, done)
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
         """Returns the bags that change no more; reports the others."""
         now = self.memory.clock.now()
-        closed = [
-            bag
-            for bag in snapshot.bags
-            if bag.state is BagState.CLOSED
-            if not is_carried(bag.path) and not is_thinned(bag.path)
-        ]
+        every = [bag for bag in snapshot.bags if bag.state is BagState.CLOSED]
+        closed = [bag for bag in every if not (is_carried(bag.path) or is_thinned(bag.path))]
         bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         done.waiting += len(closed) - len(bags) + len(open_bags)
@@ -360,20 +345,16 @@ class RobotBags:
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
             of_time = overlapping(self.name, ("start_ns", "end_ns"), TimeWindow(begin, stop))
             for row in lake.rows("bags", of_time, ShippedBag._fields).to_pylist():
-                self._known.setdefault(row["bag_id"], ShippedBag(**row))
+                self.known.setdefault(row["bag_id"], ShippedBag(**row))
 
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer."""
         names = {bag.file: self.name_of(bag) for bag in bags}
         self._seen = {file: seen for file, seen in self._seen.items() if file in names}
         ids, own = {seen.bag_id for seen in self._seen.values()}, {*names.values()}
-        self._known = {
-            bag_id: shipped
-            for bag_id, shipped in self._known.items()
-            if bag_id in ids or shipped.file in own
-        }
+        known, receipts = self.known.items(), (self._receipts or {}).items()
+        self.known = {key: one for key, one in known if key in ids or one.file in own}
         if self._receipts is not None:
-            receipts = self._receipts.items()
             self._receipts = {name: receipt for name, receipt in receipts if name in own}
 
     def _look(self, bag: BagFile) -> _Seen:
@@ -384,10 +365,8 @@ class RobotBags:
             summary = self.reader.summarize(bag.path)
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
-            seen = _Seen(
-                state, bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
-            )
-            self._seen[bag.file] = seen
+            bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
+            seen = self._seen[bag.file] = _Seen(state, bag_id)
         return seen
 
     def _is_forgotten(self, bag: BagFile, seen: _Seen, tombstones: Collection[Tombstone]) -> bool:
@@ -405,18 +384,10 @@ class RobotBags:
     ) -> ShippedBag:
         """Returns what a bag would be known as."""
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
-        return ShippedBag(
-            robot=self.name,
-            bag_id=bag_id,
-            day=day_of(bag.start),
-            file=self.name_of(bag),
-            size=bag.size,
-            sha256=before.sha256 if before is not None and is_read else sha256_of(bag.path),
-            mtime_ns=bag.mtime_ns,
-            made_of=made_of(self.memory, bag, self.config, messages),
-            start_ns=bag.start,
-            end_ns=bag.end,
-        )
+        sha256 = before.sha256 if before is not None and is_read else sha256_of(bag.path)
+        of_file = self.name_of(bag), bag.size, sha256, bag.mtime_ns
+        made = made_of(self.memory, bag, self.config, messages)
+        return ShippedBag(self.name, bag_id, day_of(bag.start), *of_file, made, bag.start, bag.end)
 
     def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
         """Returns whether only retention took messages out of a bag after it was shipped.
@@ -428,8 +399,9 @@ class RobotBags:
         receipt = read_receipts(self.bag_dir).get(before.file)
         return receipt is not None and (receipt.sha256, receipt.size) == (before.sha256, bag.size)
 
-    def _confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
-        """Writes receipts into the robot's bag directory, for its recorder, if it has one."""
+    def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
+        """Notes that bags are in the lake; writes receipts for the robot's recorder, if any."""
+        self.known |= {bag.bag_id: bag for bag in bags}
         lake = shipper.lake.lake_id
         if not has_recorded(self.bag_dir):
             return

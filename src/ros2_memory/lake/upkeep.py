@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.core.errors import LakeError
@@ -234,13 +234,12 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class Forgotten:
+class Forgotten(NamedTuple):
     """What is gone: how many bags, and files; `kept_by` names tags and branches that keep some."""
 
     bags: int
     files: int
-    kept_by: tuple[str, ...] = ()
+    kept_by: tuple[str, ...]
 
 
 def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
@@ -276,8 +275,7 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
 
 def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
     """Returns robot, day and id of the bags that have some rows."""
-    columns = ("robot", "day", "bag_id")
-    rows = lake.rows(name, condition, columns).to_pylist()
+    rows = lake.rows(name, condition, ("robot", "day", "bag_id")).to_pylist()
     return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
 
 

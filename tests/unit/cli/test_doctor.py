@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import re
 import sys
 import threading
@@ -16,14 +15,11 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from mcap.writer import Writer
 
-from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts
-from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
-from tests.support.column_worlds import World
 from tests.unit.cli.conftest import left
 
 if TYPE_CHECKING:
@@ -138,56 +134,9 @@ def test_the_files_in_use_are_named_and_a_configuration_that_is_not(
     assert f"MEMORY_CONFIG_DIR={beside}" in output
 
 
-def test_what_an_rmw_needs_is_said_where_it_is_used(
-    robot: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert "RMW_IMPLEMENTATION" not in exits(0, "doctor").out
-    for rmw, needs in (("rmw_zenoh_cpp", "rmw_zenohd"), ("rmw_cyclonedds_cpp", "CYCLONEDDS_URI")):
-        monkeypatch.setenv("RMW_IMPLEMENTATION", rmw)
-        shown = exits(0, "doctor").out
-        assert f"RMW_IMPLEMENTATION={rmw}\n" in shown
-        assert needs in shown
-
-
-def test_topics_of_which_columns_were_dropped_are_named(robot: Path, exits: Program) -> None:
-    draw, begin = random.Random(3), time.time_ns() - 3000 * NS_PER_S
-    messages = [
-        odom(begin + n * NS_PER_S // 100, draw.uniform(-9, 9), draw.uniform(-9, 9))
-        for n in range(2000)
-    ]
-    path = write_mcap(robot / "before" / "before_0.mcap", messages)
-    os.utime(path, ns=(begin, begin + 30 * NS_PER_S))
-    World.of(robot, limits=StoreLimits(max_share=0.0)).fill()
-    [line] = [each for each in exits(0, "doctor").out.splitlines() if " columns " in each]
-    assert "store.max_share" in line
-    assert line.endswith("/odom")
-
-
-def test_a_store_that_cannot_be_written_is_named(
-    robot: Path, examined: Examined, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (robot / ".episodic").write_text("no folder")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(robot / ".episodic"))
-    wrong = examined(1)
-    assert "is kept in memory" in wrong["columns"][0]["seen"]
-
-
 def test_a_refused_configuration_is_an_error(examined: Examined) -> None:
     wrong = examined(2, "server.prot=1")
     assert "server.prot" in wrong["config"][0]["seen"]
-
-
-def test_a_budget_of_which_what_is_beside_the_bags_takes_much_is_reported(
-    robot: Path, capsys: Capture, examined: Examined
-) -> None:
-    (robot / ".episodic").mkdir()
-    (robot / ".episodic" / "columns.sqlite").write_bytes(bytes(20_000_000))
-    assert cli.main(["doctor"]) == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    assert "0.0 of 0.1 GB used: bags " in shown
-    assert "what is stored beside them 0.02 GB" in shown
-    wrong = examined(1, "retention.max_total_gb=0.05")
-    assert "retention.max_total_gb=0.05 is less than 0.1" in wrong["disk"][-1]["seen"]
 
 
 def test_data_from_the_future_means_that_the_clock_is_wrong(
@@ -466,14 +415,6 @@ def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
     seen = " ".join(each["seen"] for each in examined(code, f"recorder={recorder}")["bags"])
     assert ("counts as still being written" in seen) is is_active
     assert ("0 damaged and 1 unfinished" in seen) is not is_active
-
-
-def test_an_error_that_is_past_is_shown_with_its_time(robot: Path, exits: Program) -> None:
-    beat(robot, last_error="it died", last_error_at=time.time_ns(), recovered=True, restarts=1)
-    said = " ".join(exits(0, "doctor").out.split())
-    assert (
-        "recording goes on since; it restarted ros2 bag record 1 time; its last error (20" in said
-    )
 
 
 class TestExtras:

@@ -259,15 +259,6 @@ class TestMcap:
         assert err.count(f"{named} have no definition") == 1
         assert "reader.custom_msg_paths" in err
 
-    def test_a_file_is_never_overwritten(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
-    ) -> None:
-        out = tmp_path / "out.mcap"
-        out.write_text("a letter")
-        assert cli.main(["export", "--mcap", str(out)]) == 2
-        assert out.read_text() == "a letter"
-        assert str(out) in capsys.readouterr().err
-
     def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
         def interrupted() -> Iterator[StoredMessage]:
             view = View(memory_of(bag_dir), Call())
@@ -335,15 +326,6 @@ class TestParquet:
             "FROM memory",
         )
         assert rows == [("r2", "std_msgs/msg/String", T0, T0, "word 0 0 ü", None)]
-
-    def test_nothing_can_stand_there_twice(
-        self, bag_dir: Path, tmp_path: Path, capsys: Capture
-    ) -> None:
-        words = ["export", "--parquet", str(tmp_path / "rows")]
-        assert cli.main(words) == 0
-        assert cli.main(words) == 2
-        assert "twice" in capsys.readouterr().err
-        assert len([*tmp_path.glob("rows/*/*/*")]) == 2
 
     def test_what_cannot_be_decoded_has_a_row_that_says_why(
         self, tmp_path: Path, exits: Program

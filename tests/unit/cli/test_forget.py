@@ -14,7 +14,6 @@ import yaml
 
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.columns.store import CATALOGUE, FILE
@@ -22,7 +21,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.housekeepers import OURS, embedding, made_moment, own_all, recording_now
+from tests.support.housekeepers import OURS, embedding, made_moment, own_all
 from tests.unit.cli.conftest import columns_in, left
 
 if TYPE_CHECKING:
@@ -281,25 +280,6 @@ class TestForeignBags:
         forget(0, 64, 66, "--yes", "--topic", "/odom")
         assert McapReader().summarize(path).count == 0
 
-    def test_a_copy_without_its_list_of_which_one_file_is_damaged_is_kept(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        shutil.rmtree(bag_dir / ".episodic")
-        name = "rec_20231114T221320Z"
-        for number in range(2):
-            path = bag_dir / name / f"{name}_{number}.mcap"
-            start = T0 + (200 + 20 * number) * NS_PER_S
-            embedding(path, {**OURS, "bag_dir_id": "1" * 32}, start=start)
-        first = bag_dir / name / f"{name}_0.mcap"
-        first.write_bytes(first.read_bytes()[:20])
-        left(first), left(path)
-        write_heartbeat(
-            bag_dir, Heartbeat(1, T0, RecorderState.STOPPED, (name,), T0, 0, (), (), None, 2.0)
-        )
-        shown = forget(1, 190, 300, "--yes").out
-        assert path.exists()
-        assert f"stays: {name}/{path.name}: this recorder did not make it" in shown
-
     def test_one_that_took_the_place_of_another_while_it_was_asked_is_kept(
         self, bag_dir: Path, monkeypatch: pytest.MonkeyPatch, forget: Forget
     ) -> None:
@@ -373,10 +353,6 @@ class TestCopies:
         own_all(tmp_path)
         return tmp_path
 
-    def test_bags_of_copies_alone_go_too(self, recordings: Path, forget: Forget) -> None:
-        forget(0, -1, 100, "--yes")
-        assert bags(recordings) == []
-
     def test_a_bag_with_copies_outside_the_window_stays_and_is_named(
         self, recordings: Path, forget: Forget
     ) -> None:
@@ -433,9 +409,3 @@ class TestMetadata:
         assert "rec_0/metadata.yaml still lists deleted bags (its numbers" in output
         assert f"ros2 bag reindex {metadata.parent}" in output
         assert metadata.read_text() == before
-
-    def test_that_of_a_recording_that_is_being_written_is_its_recorders(
-        self, bag_dir: Path, forget: Forget
-    ) -> None:
-        recording_now(bag_dir, "rec_0")
-        assert "rec_0/metadata.yaml will list deleted bags" in forget(0, 20, 35, "--yes").out

@@ -320,13 +320,6 @@ def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> N
     assert traces(bag_dir, "laser") == []
 
 
-def test_a_dry_run_changes_nothing(bag_dir: Path, capsys: Capture) -> None:
-    before = {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")}
-    assert forget(0, 100, "--topic", CAMERA, "--dry-run") == 0
-    assert "would be deleted: 30 messages of 1 topic" in capsys.readouterr().out
-    assert {each: each.read_bytes() for each in bag_dir.rglob("*.mcap")} == before
-
-
 @pytest.mark.parametrize("size", [None, 0])
 def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: int | None) -> None:
     active = bag_dir / "rec_a" / "rec_a_3.mcap"

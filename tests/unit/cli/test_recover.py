@@ -13,7 +13,6 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
-from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import copied, files_in, later, recording_now
 from tests.support.shared_bags import RECORDED, needs_recorded
 
@@ -187,16 +186,6 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     assert printed[0].startswith("1 bag file of another kind was left alone")
 
 
-def test_on_a_full_disk_the_original_is_kept(tmp_path: Path) -> None:
-    path = left_open(tmp_path / "a_0.mcap")
-    before = path.read_bytes()
-    with files_limited_to(1000):
-        outcome, printed = recovered(path)
-    assert outcome.failed == 1
-    assert "cannot be written" in printed[0]
-    assert path.read_bytes() == before
-
-
 def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(tmp_path: Path) -> None:
     for name in ("a/a_0.mcap", "a/a_1.mcap"):
         left_open(tmp_path / name)
@@ -237,11 +226,3 @@ class TestTheProgram:
         assert empty.exists()
         exits(0, "recover", tmp_path, "--force", "--yes")
         assert not empty.exists()
-
-
-@needs_recorded
-def test_what_killed_recorders_left(tmp_path: Path) -> None:
-    for name in ("session_killed", "session_killed_chunk64k", "extra/full_truncated"):
-        copied(RECORDED / name, tmp_path / name.rpartition("/")[2])
-    outcome, _ = recovered(tmp_path, force=True)
-    assert outcome == RecoveryOutcome(whole=4, repaired=2, removed=1, messages=251 + 94)

@@ -152,28 +152,6 @@ def test_full_batches_do_not_wait_for_each_other(
     assert waited == []
 
 
-def test_a_service_ships_robots_that_come_while_it_runs(
-    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    shutil.copytree(fleet / "hall", tmp_path / "robots" / "hall")
-    waited: list[float] = []
-
-    def wait(seconds: float) -> None:
-        if seconds > 0:  # not before a commit
-            waited.append(seconds)
-            shutil.copytree(fleet / "kitchen", tmp_path / "robots" / "kitchen", dirs_exist_ok=True)
-        if len(waited) == 2:
-            raise KeyboardInterrupt
-
-    monkeypatch.setattr(ship_module, "_wait", wait)
-    monkeypatch.setattr(ship_module, "_UPKEEP_S", 0.0)
-    settings = [f"fleet.robots={tmp_path}/robots/*", f"lake.warehouse={tmp_path}/lake"]
-    assert cli.main(["ship", "lake.commit_interval_s=0", *settings]) == 130
-    assert {*lake_column(tmp_path / "lake", "bags", "robot")} == {"hall", "kitchen"}
-
-
 def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     ship: Ship,
     fleet: Path,

@@ -22,7 +22,6 @@ T0 = 1_800_000_000 * NS_PER_S + 123 * NS_PER_MS
 START = T0 + 22 * NS_PER_S + 7 * NS_PER_MS
 TIMELINE = MessageSchedule(T0, START)
 BY_TOPIC = {stream.topic: stream for stream in STREAMS}
-MAGIC = b"\x89MCAP0\r\n"
 SECONDS = 13
 
 
@@ -36,10 +35,6 @@ def record(folder: Path, *, until: int, close: bool = True) -> DemoRecorder:
 
 def in_order(folder: Path) -> list[Path]:
     return sorted(folder.glob("demo/*.mcap"), key=lambda path: int(path.stem.split("_")[-1]))
-
-
-def closed(path: Path) -> bool:
-    return path.read_bytes().endswith(MAGIC)
 
 
 @pytest.fixture(scope="module")
@@ -95,16 +90,6 @@ def test_a_split_ends_only_when_a_message_arrives_more_than_the_duration_after_i
         spans.append((statistics.message_start_time, statistics.message_end_time))
     for (start, end), (following, _) in pairwise(spans):
         assert end - start <= 5 * NS_PER_S < following - start
-
-
-def test_while_recording_the_last_split_has_no_footer_and_the_others_have(tmp_path: Path) -> None:
-    recorder = record(tmp_path, until=START + 12 * NS_PER_S, close=False)
-    files = in_order(tmp_path)
-    assert [closed(path) for path in files] == [True, True, False]
-    assert not (tmp_path / "demo" / "metadata.yaml").exists()
-    recorder.stop()
-    assert all(map(closed, files))
-    assert (tmp_path / "demo" / "metadata.yaml").exists()
 
 
 def test_live_recording_writes_what_is_due_and_stops_cleanly(tmp_path: Path) -> None:

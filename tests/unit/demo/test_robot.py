@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.demo import robot
-from ros2_memory.demo.robot import LAP_M, LAP_S, THINGS, Planar, wall_distances
+from ros2_memory.demo.robot import LAP_M, LAP_S, THINGS, Planar
 
 MOMENTS = st.floats(min_value=-200.0, max_value=10_000.0)
 PLANAR = st.builds(
@@ -52,17 +52,6 @@ def test_the_way_driven_is_the_integral_of_the_speed(start: float, duration: flo
     assert robot.driven(start + duration) - robot.driven(start) == pytest.approx(length, abs=1e-3)
 
 
-@pytest.mark.parametrize("stop", [robot.FRONT_DOOR, robot.KITCHEN_COUNTER])
-def test_it_rests_at_the_places_that_have_a_name(stop: Planar) -> None:
-    resting = [
-        t
-        for t in np.arange(0.0, LAP_S, 0.5)
-        if robot.twist(float(t)) == pytest.approx((0.0, 0.0), abs=1e-9)
-        and math.dist(robot.pose_in_map(float(t))[:2], stop[:2]) < 1e-9
-    ]
-    assert len(resting) >= 8
-
-
 @given(MOMENTS)
 def test_what_it_sees_is_where_it_stands_in_the_flat(t: float) -> None:
     here = robot.pose_in_map(t)
@@ -71,10 +60,3 @@ def test_what_it_sees_is_where_it_stands_in_the_flat(t: float) -> None:
         there = here.then(Planar(thing.point[0], thing.point[1], 0.0))
         assert (there.x, there.y, thing.point[2]) == pytest.approx((x, y, z), abs=1e-9)
         assert 0.6 < thing.score < 1.0
-
-
-def test_a_beam_ends_at_the_wall_and_goes_on_through_a_doorway() -> None:
-    east, north, west = 0.0, math.pi / 2, math.pi
-    bearings = np.array([east, north, west])
-    assert wall_distances(6.0, 2.0, bearings) == pytest.approx([5.0, 2.0, 6.0])
-    assert wall_distances(6.0, 3.0, bearings) == pytest.approx([1.0, 1.0, 1.0])

@@ -107,22 +107,6 @@ def test_a_robot_whose_turn_came_late_is_said_to_have_had_the_time_that_was_left
     assert second_s < 0.4
 
 
-def test_one_alone_may_take_most_of_the_time_and_is_not_told_to_be_asked_alone(
-    released: threading.Event,
-) -> None:
-    limits: list[float] = []
-
-    def hangs(_robot: Robot, call: Call) -> None:
-        limits.append(call.deadline.left_s())
-        released.wait()
-
-    # A clock that stands still: how soon the machine lets the thread run is none of it.
-    error = FanOut().ask(robots(1), hangs, Call(Deadline.after(0.5, lambda: 0.0)))["r0"]
-    assert isinstance(error, QueryTimeoutError)
-    assert "alone" not in str(error)
-    assert 0.4 < limits[0] <= 0.45
-
-
 def test_a_robot_is_told_when_its_time_is_up() -> None:
     now_s = 0.0
 

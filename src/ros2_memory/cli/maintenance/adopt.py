@@ -10,12 +10,7 @@ import typer
 
 from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.own_recordings import (
-    OwnRecordings,
-    bags_in,
-    folders_with_bags,
-    is_regular,
-)
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, bags_in, folders_with_bags, is_regular
 from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
 from ros2_memory.cli.output import print_json, print_line
@@ -30,8 +25,7 @@ _INSTEAD = "move or mount the bags into the bag directory"
 
 def adopt(
     directories: Annotated[
-        list[Path],
-        typer.Argument(metavar="DIR", help="Folders of bags, inside the bag directory."),
+        list[Path], typer.Argument(metavar="DIR", help="Folders of bags, inside the bag directory.")
     ],
     sets: Sets = None,
     as_json: AsJson = False,

@@ -79,14 +79,10 @@ def forget(
     *,
     times: Times,
     topic: Annotated[
-        list[str] | None,
-        "GLOB",
-        "Delete only messages of these topics, from all bags; repeatable.",
+        list[str] | None, "GLOB", "Delete only messages of these topics, from all bags; repeatable."
     ] = None,
     where: Annotated[
-        str | None,
-        "PLACE",
-        "Delete only messages from when the robot was in a named place.",
+        str | None, "PLACE", "Delete only messages from when the robot was in a named place."
     ] = None,
     yes: Annotated[bool, "Do not ask for confirmation."] = False,
     dry_run: Annotated[bool, "Show what would be deleted, and delete nothing."] = False,

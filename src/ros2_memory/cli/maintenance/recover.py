@@ -41,13 +41,9 @@ def recover(
         Path, typer.Argument(metavar="PATH", help="An MCAP file, or a folder of recordings.")
     ],
     force: Annotated[
-        bool,
-        "Also repair files that changed in the last 30 s. Make sure nothing writes them.",
+        bool, "Also repair files that changed in the last 30 s. Make sure nothing writes them."
     ] = False,
-    yes: Annotated[
-        bool,
-        "Do not ask where another program made the recording.",
-    ] = False,
+    yes: Annotated[bool, "Do not ask where another program made the recording."] = False,
     dry_run: Annotated[bool, "Show what would be changed, and change nothing."] = False,
     as_json: AsJson = False,
 ) -> bool:
@@ -161,13 +157,13 @@ def foreign_unfinished(path: Path) -> tuple[Path, ...]:
         with suppress(BagError):
             if file.parent not in found and not repairer.is_whole(file):
                 found.add(file.parent)
-    return tuple(sorted(folder for folder in found if not _is_own(folder)))
-
-
-def _is_own(folder: Path) -> bool:
-    whole = folder.absolute()
-    listing = next((above for above in whole.parents if (above / LIST_FILE).exists()), None)
-    return listing is not None and OwnRecordings(listing).owns(whole)
+    foreign: list[Path] = []
+    for folder in sorted(found):
+        above = folder.absolute().parents
+        listing = next((root for root in above if (root / LIST_FILE).exists()), None)
+        if listing is None or not OwnRecordings(listing).owns(folder.absolute()):
+            foreign.append(folder)
+    return tuple(foreign)
 
 
 class _Recovery:

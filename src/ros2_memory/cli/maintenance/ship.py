@@ -50,9 +50,7 @@ def ship(
     *,
     once: Annotated[bool, "Ship what is there, and end."] = False,
     forget: Annotated[
-        str | None,
-        "ROBOT",
-        "Forget the time from --start to --end of a robot, and end.",
+        str | None, "ROBOT", "Forget the time from --start to --end of a robot, and end."
     ] = None,
     start: Start = None,
     end: End = None,
@@ -138,11 +136,7 @@ def _forget(
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
     from ros2_memory.lake.files import Partitions  # noqa: PLC0415 - as in `ship`
-    from ros2_memory.lake.upkeep import (  # noqa: PLC0415
-        Tombstone,
-        append_tombstone,
-        forget_in_lake,
-    )
+    from ros2_memory.lake.upkeep import Tombstone, append_tombstone, forget_in_lake  # noqa: PLC0415
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:
