@@ -84,16 +84,13 @@ class FromLake(NamedTuple):
         return self._replace(older=None) if is_whole else self
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> list[str]:
         """The note on days that the answer would need, if any."""
         if self.older is None:
-            return ()
+            return []
         since = datetime.fromtimestamp((self.older + 1) // NS_PER_S, tz=UTC).date()
-        note = (
-            f"the lake has days before {since}, which were not looked at: an end (or before, or a "
-            "time) there has them looked at"
-        )
-        return (note,)
+        do = "an end (or before, or a time) there has them looked at"
+        return [f"the lake has days before {since}, which were not looked at: {do}"]
 
 
 @dataclass(eq=False, repr=False)
@@ -147,9 +144,11 @@ class Robot:
         def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
             return _of_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
 
-        if not self._has_bags():
+        is_mounted = self.is_mounted()
+        own = self.memory().index.snapshot() if is_mounted else None
+        if own is None or not (own.bags or own.problem is not None):
             # A folder that is there says best why nothing is, where nothing was shipped either.
-            return answer(of_lake=not self.is_mounted() or lake.index.snapshot().latest is not None)
+            return answer(of_lake=not is_mounted or lake.index.snapshot().latest is not None)
         is_lakes = _lacks(self.memory(), lake, since)
         try:
             return answer(of_lake=is_lakes)
@@ -165,13 +164,6 @@ class Robot:
                     raise
                 notes = (*error.notes, f"the lake has no answer either: {failure}")
                 raise NoDataError(error.reason, error.detail, notes) from failure
-
-    def _has_bags(self) -> bool:
-        """Returns whether there are bags besides those of the lake, or may be."""
-        if not self.is_mounted():
-            return False
-        snapshot = self.memory().index.snapshot()
-        return bool(snapshot.bags) or snapshot.problem is not None
 
     def latest_known(self) -> Ns:
         """Returns the log time of its newest data as of the last scan; the least before the first.
@@ -275,12 +267,10 @@ class Fleet:
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
-        for robot in allowed:
-            if robot.name == name:
-                return robot
-        raise InvalidArgumentsError(
-            f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
-        )
+        if found := next((robot for robot in allowed if robot.name == name), None):
+            return found
+        there = names_of(allowed)
+        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; there {there}")
 
 
 def names_of(robots: Iterable[Robot]) -> str:
@@ -324,13 +314,8 @@ class FanOut:
                 if refused is not None:
                     done[robot.name] = refused
                     continue
-                own = replace(
-                    call,
-                    deadline=call.deadline.within(own_s),
-                    stages=Stages(),
-                    used_active=False,
-                    used_thinned=False,
-                )
+                own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
+                own.used_active = own.used_thinned = False
                 until_s = now_s + own_s + left_s * _GRACE
                 running[robot.name] = _asked(robot, work, own), own, own_s, until_s
             # Without a deadline there is nothing to wake up for but an answer.
@@ -357,14 +342,11 @@ class FanOut:
     def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
         """Returns why a robot is not asked: it is stuck, or no time is left."""
         if robot.name in self._is_done and not self._is_done[robot.name]():
-            return BusyError(
-                "still busy with an earlier question that it did not finish in time: is its disk "
-                "reachable?"
-            )
+            late = "still busy with an earlier question that it did not finish in time"
+            return BusyError(f"{late}: is its disk reachable?")
         if own_s <= 0 or call.deadline.expired():
-            return QueryTimeoutError(
-                "not asked: the time of the call was up; ask about fewer robots, or a shorter time"
-            )
+            do = "ask about fewer robots, or a shorter time"
+            return QueryTimeoutError(f"not asked: the time of the call was up; {do}")
         self._is_done.pop(robot.name, None)
         return None
 

@@ -17,7 +17,7 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import partial
-from heapq import merge
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory import results
@@ -333,9 +333,8 @@ def _coordinates_in(given: Mapping[str, object]) -> str | None:
         is_object = isinstance(where, dict) or str(where).lstrip().startswith("{")
         if is_object and not (name == "near" and "label" in str(where)):
             return name
-    if given.get("condition_type") == "near_position":
-        return "value"
-    return next((name for name in ("x", "y") if given.get(name) is not None), None)
+    near = ("value",) if given.get("condition_type") == "near_position" else ()
+    return next((name for name in (*near, "x", "y") if given.get(name) is not None), None)
 
 
 def _only_one(tool: str, robots: Sequence[Robot]) -> Robot:
@@ -415,40 +414,33 @@ def merged(
 
 
 def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
+    """Returns the rows of all in order, those of robots whose clock is ahead last; and the rest."""
     values = {reply.name: _as_rows(reply) for reply in replies}
     times = {key.name: key.row_time for key in declared if key.row_time}
-    there = [key for key in times if any(key in value for value in values.values())]
-    key = (there or [*times])[0]
-    time_key, merging = times[key], {key.name: key.merging for key in declared if key.merging}
-
-    def order(row: JsonObject) -> float:
-        # A row whose time is null goes on.
-        time = math.inf if row.get(time_key, 0) is None else _number(row.get(time_key))
-        return time if page.oldest_first else -time
-
+    there = {name for value in values.values() for name in value}
+    key = next((name for name in times if name in there), next(iter(times)))
+    merging = {key.name: key.merging for key in declared if key.merging}
     names = {name for name, how in merging.items() if how == "inherited"}
-    inherited = {robot: _without(value, value.keys() - names) for robot, value in values.items()}
-    found: list[JsonObject] = []
-    for is_ahead in (False, True):
-        # Each reply is in order. A robot whose clock is ahead does not have the newest row.
-        lists = [
-            [
-                {ROBOT_NAME: reply.name, **inherited[reply.name], **row}
-                for row in _list(values[reply.name].get(key))
-            ]
-            for reply in replies
-            if reply.is_ahead is is_ahead
-        ]
-        found += merge(*lists, key=order)
-    rows: JsonObject = {key: [*found[: page.limit]]}
+    order: list[tuple[bool, float, JsonObject]] = []
+    for reply in replies:
+        value = values[reply.name]
+        same = _without(value, value.keys() - names)
+        for row in _list(value.get(key)):
+            time = row.get(times[key], 0)
+            # A row whose time is null goes on.
+            at = math.inf if time is None else _number(time)
+            named = {ROBOT_NAME: reply.name, **same, **row}
+            order.append((reply.is_ahead, at if page.oldest_first else -at, named))
+    order.sort(key=itemgetter(0, 1))
+    found: list[JsonValue] = [row for *_, row in order]
+    rows: JsonObject = {key: found[: page.limit]}
     if key == MATCHES:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
     rest = {name: _without(value, {key, *names}) for name, value in values.items()}
     is_cut = found[: page.limit] != found or any(value.get("more") for value in values.values())
-    if is_cut and any(key.name == "more" for key in declared):
-        return {**rows, **_rest(merging, replies, rest), "more": True}
-    return {**rows, **_rest(merging, replies, rest)}
+    marks_more = is_cut and any(key.name == "more" for key in declared)
+    return {**rows, **_rest(merging, replies, rest), **({"more": True} if marks_more else {})}
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -527,12 +519,12 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
     rows: list[JsonValue] = []
     every: JsonObject = {}
     for reply in replies:
-        own = headers[reply.name]
+        name, own = reply.name, headers[reply.name]
         for row in _items(reply.body, "rows"):
             cells = dict(zip(own, row if isinstance(row, list) else (), strict=True))
-            rows.append([reply.name, *map(cells.get, columns)])
+            rows.append([name, *map(cells.get, columns)])
         if total := _items(reply.body, "all"):
-            every[reply.name] = [*map(dict(zip(own[1:], total, strict=True)).get, columns[1:])]
+            every[name] = [*map(dict(zip(own[1:], total, strict=True)).get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": every}
     return table | _rest({}, replies, rest)
@@ -582,17 +574,12 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicErro
 
 def shipped_to(latest: Mapping[str, Ns | None]) -> list[str]:
     """Returns the note on answers from a lake: up to when each robot's bags were shipped."""
-    if not latest:
-        return []
-    order = sorted(latest, key=lambda name: latest[name] or 0)
-    parts = []
-    for name in order[:_MOST_NAMED]:
-        time = latest[name]
-        at = "no time" if time is None else iso_local(time) or str(time)
-        parts.append(f"{name} up to {at}")
-    if order[_MOST_NAMED:]:
-        parts.append(f"{len(order) - _MOST_NAMED} others up to later")
-    return [f"from the lake, which has what was shipped: {', '.join(parts)}"]
+    order = sorted(latest.items(), key=lambda of: of[1] or 0)
+    times = [(name, "no time" if at is None else iso_local(at) or str(at)) for name, at in order]
+    parts = [f"{name} up to {time}" for name, time in times[:_MOST_NAMED]]
+    if more := len(order) - len(parts):
+        parts.append(f"{more} others up to later")
+    return [f"from the lake, which has what was shipped: {', '.join(parts)}"] if parts else []
 
 
 def _without(value: JsonObject, keys: set[str]) -> JsonObject:

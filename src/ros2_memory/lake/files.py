@@ -85,12 +85,11 @@ class Partitions:
 
 
 def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
+    name = f"the lake's table {table.name()[-1]}"
     entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
     if entries and manifest.content is ManifestContent.DELETES:
-        raise RefusedError(
-            f"the lake's table {table.name()[-1]} has delete files, which another program "
-            "wrote: rewrite them into its data files first (copy-on-write)"
-        )
+        do = "rewrite them into its data files first (copy-on-write)"
+        raise RefusedError(f"{name} has delete files, which another program wrote: {do}")
     spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
     positions = {
         schema.find_column_name(part.source_id): position
@@ -99,10 +98,8 @@ def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, d
     }
     for column in ("robot", "day"):
         if column not in positions:
-            raise RefusedError(
-                f"the lake's table {table.name()[-1]} has files that are not of one {column}, "
-                "which another program wrote: partition it by robot and day again"
-            )
+            why = f"has files that are not of one {column}, which another program wrote"
+            raise RefusedError(f"{name} {why}: partition it by robot and day again")
     bag_id = schema.find_field("bag_id").field_id
     for data in (entry.data_file for entry in entries):
         day = _EPOCH + timedelta(days=data.partition[positions["day"]])
@@ -110,8 +107,8 @@ def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, d
             bytes((bounds or {}).get(bag_id) or b"").decode()
             for bounds in (data.lower_bounds, data.upper_bounds)
         )
-        size = data.file_size_in_bytes
-        file = LakeFile(data.file_path, data.record_count, size, first, last or _LAST)
+        of_file = data.file_path, data.record_count, data.file_size_in_bytes
+        file = LakeFile(*of_file, first, last or _LAST)
         yield str(data.partition[positions["robot"]]), day, file
 
 

@@ -190,11 +190,9 @@ class LakeIndex:
             window = self._window(date.max, self.days)
             timeline = window.timeline
             silent = {name for bag in timeline.bags for name in bag.summary.schema.silent}
+            topics, now = frozenset(silent.difference(timeline.topics())), self.clock.now()
             self._snapshot = Snapshot(
-                timeline,
-                silent_topics=frozenset(silent.difference(timeline.topics())),
-                scanned_at=self.clock.now(),
-                older=window.older,
+                timeline, silent_topics=topics, scanned_at=now, older=window.older
             )
             return self._snapshot
 
@@ -229,9 +227,8 @@ class LakeIndex:
             same = made_of.keys() - new.keys()
             bags = {path: bag for path, bag in known.bags.items() if bag.day in same}
             bags |= self._read(new, known.bags)
-            timeline = known.timeline.changed(
-                _missing(known.bags, bags), _missing(bags, known.bags)
-            )
+            gone, come = _missing(known.bags, bags), _missing(bags, known.bags)
+            timeline = known.timeline.changed(gone, come)
             joined = {bag.file.recording: bag.joined for bag in bags.values() if bag.joined}
             window = _Window(window.older, made_of, timeline, bags, joined)
         # A new dict: other threads look for the bags of their answers in the old one.
@@ -268,19 +265,15 @@ class LakeIndex:
             together = groups.setdefault((bag.day, of_day[bag.day] // _TOGETHER), {})
             together[bag.bag_id] = state
             of_day[bag.day] += 1
-            found[path] = LakeBag(
-                bag.bag_id, bag.day, file, tuple(joined.split("/")) if joined else (), together
-            )
+            names = tuple(joined.split("/")) if joined else ()
+            found[path] = LakeBag(bag.bag_id, bag.day, file, names, together)
         return found
 
 
 def _missing(bags: Mapping[str, LakeBag], others: Mapping[str, LakeBag]) -> list[BagFile]:
     """Returns the files of bags that are not, or not the same, among others."""
-    return [
-        bag.file
-        for path, bag in bags.items()
-        if path not in others or others[path].file is not bag.file
-    ]
+    same = {path for path, bag in others.items() if path in bags and bags[path].file is bag.file}
+    return [bag.file for path, bag in bags.items() if path not in same]
 
 
 class _Head(NamedTuple):
@@ -352,11 +345,9 @@ class LakeReader(BagReader):
         for head in wanted:
             topic = head.channel.topic
             if not head.has_payloads and topic not in bare:
-                raise NotInLakeError(
-                    f"the lake has only the times of {topic}, whose messages are large: name it in "
-                    "lake.messages of ros2-memory ship, ask about other topics, or ask the robot's "
-                    "own memory"
-                )
+                do = "name it in lake.messages of ros2-memory ship, ask about other topics"
+                why = f"the lake has only the times of {topic}, whose messages are large"
+                raise NotInLakeError(f"{why}: {do}, or ask the robot's own memory")
             data = self._packed_of(here, head.number, names)
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
@@ -434,10 +425,8 @@ class LakeReader(BagReader):
         """Returns the rows of a select over the channels of some bags of a day."""
         first, last = min(bags), max(bags)
         lake = self.index.lake
-        of_robot = lake.days("channels").get(self.index.robot, {})
-        files = [
-            file for file in of_robot.get(bag.day, ()) if file.first <= last and first <= file.last
-        ]
+        of_day = lake.days("channels").get(self.index.robot, {}).get(bag.day, ())
+        files = [file for file in of_day if file.first <= last and first <= file.last]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)
 

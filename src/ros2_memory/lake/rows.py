@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
@@ -141,18 +141,29 @@ class _BagRows:
         self._pose_topic = view.pose_topic
         self._poses = poses_of_bag(view, bag, self._pose_topic)
         self._thing = Labels(memory.limits.labels).key
-        self._types: dict[str, list[str]] = {}
+        self._types = defaultdict[str, list[str]](list)
         for known in bag.summary.topics:
-            self._types.setdefault(known.topic, []).append(known.type)
+            self._types[known.topic].append(known.type)
         self._undecodable = 0
         self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
     def rows(self, shipped: ShippedBag) -> dict[str, list[Row]]:
         """Returns the rows without the keys of the bag."""
-        tracks, events = self._tracks(), self._events()
+        tracks = self._tracks()
         for frame, track in tracks:
-            self._rows["poses"] += self._vertices(frame, track)
+            same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
+            columns = (track.times, track.x, track.y, track.heading, track.begins)
+            for vertex in zip(*(one.tolist() for one in columns), strict=True):
+                of = dict(zip(("time_ns", "x", "y", "heading", "begins"), vertex, strict=True))
+                known = None if math.isnan(of["heading"]) else of["heading"]
+                self._rows["poses"].append({**same, **of, "heading": known})
         self._rows["things"] += self._things()
+        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
+        # Of each topic that can have some.
+        events = {
+            topic: found.limited(MAX_PER_BAG, MAX_PER_BAG)
+            for topic, found in events_of_bag(self._view, self._bag, topics).items()
+        }
         for topic, found in events.items():
             self._rows["events"] += self._events_of(topic, found)
         driven = self._driven()
@@ -198,13 +209,6 @@ class _BagRows:
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]
 
-    def _vertices(self, frame: str, track: RobotTrack) -> Iterator[Row]:
-        same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-        columns = (track.times, track.x, track.y, track.heading, track.begins)
-        for time, x, y, heading, begins in zip(*(one.tolist() for one in columns), strict=True):
-            known = None if math.isnan(heading) else heading
-            yield {**same, "time_ns": time, "x": x, "y": y, "heading": known, "begins": begins}
-
     def _things(self) -> Iterator[Row]:
         for one in Watching(self._view).in_bag(self._bag):
             for sights in one.sights:
@@ -224,12 +228,6 @@ class _BagRows:
                         "spread_m": spot[Spot.DEV] / _MM,
                         "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
                     }
-
-    def _events(self) -> dict[str, TopicEvents]:
-        """Returns the events on each topic that can have some."""
-        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        found = events_of_bag(self._view, self._bag, topics)
-        return {topic: events.limited(MAX_PER_BAG, MAX_PER_BAG) for topic, events in found.items()}
 
     def _driven(self) -> Row:
         """Returns what the row of the bag has of its poses, whose standstills are events."""
@@ -283,18 +281,14 @@ class _BagRows:
         topics, window = {*self._whole, *seen}, TimeWindow.everything()
         reader, extractor = self._memory.reader, self._memory.extractor
         for record in reader.records(self._bag.path, topics, window):
-            topic = record.channel.topic
+            topic, kind = record.channel.topic, record.channel.type
             found: Sequence[Detection] = ()
-            row = {
-                "topic": topic,
-                "type": record.channel.type,
-                "time_ns": record.log_time,
-                "message": numbers[topic],
-            }
+            row = {"topic": topic, "type": kind, "time_ns": record.log_time}
+            row["message"] = numbers[topic]
             numbers[topic] += 1
             try:
                 message = reader.decode(record)
-                shown = extractor.exact(message, record.channel.type)
+                shown = extractor.exact(message, kind)
             except UndecodableError as error:
                 self._undecodable += topic in seen
                 value: Row = {"undecodable": error.reason}
@@ -302,27 +296,21 @@ class _BagRows:
                 value = taken_apart(shown) if topic in self._whole else {}
                 found = detections_of(shown, extractor.frame(message)) if topic in seen else ()
             if topic in self._whole:
-                whole = {**row, "publish_ns": record.publish_time, **value}
-                self._rows["messages"].append(whole)
+                published = {"publish_ns": record.publish_time}
+                self._rows["messages"].append({**row, **published, **value})
             at = place_at(track, record.log_time) if found else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
             for detection in found:
-                self._rows["sightings"].append(
-                    {
-                        **row,
-                        "label": detection.label,
-                        "thing": self._thing(detection.label),
-                        "score": detection.score,
-                        "frame_id": detection.frame_id,
-                        **dict(zip("xyz", detection.place or (), strict=False)),
-                    }
-                )
+                label, place = detection.label, detection.place or ()
+                named = {"label": label, "thing": self._thing(label), "score": detection.score}
+                where = {"frame_id": detection.frame_id, **dict(zip("xyz", place, strict=False))}
+                self._rows["sightings"].append({**row, **named, **where})
 
     def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
         for seen in found.visible.intervals():
-            thing = {"thing": self._thing(seen.label), "value": seen.best}
-            yield _event(topic, "thing", seen.first, seen.label, last_ns=seen.last, **thing)
+            of = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
+            yield _event(topic, "thing", seen.first, seen.label, **of)
         for flip in found.of_kind(FLAG)[1]:
             yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
         for error in found.errors:
@@ -355,10 +343,8 @@ def taken_apart(value: JsonValue) -> Row:
         found[kind].append((path, inner))
         return None
 
-    return {
-        **found,
-        "value": json.dumps(rest(value, ""), ensure_ascii=False, separators=(",", ":")),
-    }
+    text = json.dumps(rest(value, ""), ensure_ascii=False, separators=(",", ":"))
+    return {**found, "value": text}
 
 
 @dataclass(slots=True, eq=False)
@@ -395,14 +381,11 @@ class _Messages:
         if payloads is not None and not self.is_whole and len(packed) > most:
             payloads = None
             packed = packed_messages(logged, published, None)
+        schema = {"schema_encoding": channel.schema.encoding, "schema": channel.schema.text}
         return {
-            "topic": channel.topic,
+            **{name: getattr(channel, name) for name in ("topic", "type", "encoding", "latched")},
             "channel": number,
-            "type": channel.type,
-            "encoding": channel.encoding,
-            "latched": channel.latched,
-            "schema_encoding": channel.schema.encoding,
-            "schema": channel.schema.text,
+            **schema,
             "metadata": json.dumps(channel.metadata),
             "messages": len(logged),
             "first_ns": int(logged[0]),

@@ -12,6 +12,7 @@ import os
 import threading
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pyarrow as pa
@@ -71,16 +72,15 @@ class Shipped:
     problems: list[str] = field(default_factory=list)
 
 
-@dataclass(slots=True)
-class _Seen:
+class _Seen(NamedTuple):
     """A bag as it was: its file, and the sidecars that decide which of its messages count.
 
-    `is_forgotten`: whether it has messages that were forgotten; None before it was read for that.
+    `is_forgotten`: whether it has messages that were forgotten.
     """
 
     state: tuple[int, Ns, Ns]
     bag_id: str
-    is_forgotten: bool | None = None
+    is_forgotten: bool
 
 
 class _Ready(NamedTuple):
@@ -137,13 +137,13 @@ class Shipper:
         done = Shipped()
         batch: list[_Ready] = []
         size = 0
-        for robot in [robot for robot in self.robots if self._forget(robot, done)]:
-            for ready in robot.ready(self, done):
-                batch.append(ready)
-                size += sum(rows.nbytes for rows in ready.rows.values())
-                if len(batch) >= self.most_bags or size >= MOST_BYTES:
-                    self._commit(batch, done, is_full=True)
-                    batch, size = [], 0
+        known = [robot for robot in self.robots if self._forget(robot, done)]
+        for ready in chain.from_iterable(robot.ready(self, done) for robot in known):
+            batch.append(ready)
+            size += sum(rows.nbytes for rows in ready.rows.values())
+            if len(batch) >= self.most_bags or size >= MOST_BYTES:
+                self._commit(batch, done, is_full=True)
+                batch, size = [], 0
         if batch:
             self._commit(batch, done, is_full=False)
         return done
@@ -165,18 +165,17 @@ class Shipper:
             LakeError: the lake cannot be written; what is left is done when it is opened again.
         """
         if not robot.answers(self.patience_s):
+            why = f"{robot.bag_dir} does not answer: is its disk reachable?"
             done.problems.append(
-                f"{robot.name}: {robot.bag_dir} does not answer: is its disk reachable? Until it "
-                "does, nothing of this robot is shipped"
+                f"{robot.name}: {why} Until it does, nothing of this robot is shipped"
             )
             return False
         try:
             wanted = [Tombstone.of(robot.name, one) for one in read_forgettings(robot.bag_dir)]
         except (OSError, ValueError) as error:
-            done.problems.append(
-                f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}; nothing of this robot "
-                "is shipped until it is repaired, since what was forgotten could come back"
-            )
+            why = "until it is repaired, since what was forgotten could come back"
+            file = f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}"
+            done.problems.append(f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
         for tombstone in new:
@@ -185,10 +184,8 @@ class Shipper:
             self.alive()
             gone = forget_in_lake(self.lake, tombstone)
             done.forgotten += gone.bags
-            done.problems += [
-                f"{robot.name}: a branch or tag keeps what was forgotten: {kept}"
-                for kept in gone.kept_by
-            ]
+            kept = f"{robot.name}: a branch or tag keeps what was forgotten: "
+            done.problems += [f"{kept}{name}" for name in gone.kept_by]
             self.tombstones.add(tombstone)
         if new:
             self.look_again()
@@ -285,15 +282,14 @@ class RobotBags:
         for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
             shipper.alive()
             try:
-                seen = self._look(bag)
+                seen = self._look(bag, shipper.tombstones)
                 before = self.known.get(seen.bag_id)
                 if seen.bag_id in ids or (before is not None and bag.file in copies):
                     continue
-                if self._is_forgotten(bag, seen, shipper.tombstones):
-                    done.problems.append(
-                        f"{self.name}: {bag.file} has messages that were forgotten in the lake; "
-                        "it is not shipped: delete it, or the messages, with ros2-memory forget"
-                    )
+                if seen.is_forgotten:
+                    do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
+                    why = f"{bag.file} has messages that were forgotten in the lake; {do}"
+                    done.problems.append(f"{self.name}: {why}")
                     continue
                 ids.add(seen.bag_id)
                 shipped = self._described(bag, seen.bag_id, before, shipper.messages)
@@ -357,7 +353,7 @@ class RobotBags:
         if self._receipts is not None:
             self._receipts = {name: receipt for name, receipt in receipts if name in own}
 
-    def _look(self, bag: BagFile) -> _Seen:
+    def _look(self, bag: BagFile, tombstones: Collection[Tombstone]) -> _Seen:
         """Returns a state of a bag, which is read once."""
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
         seen = self._seen.get(bag.file)
@@ -366,18 +362,10 @@ class RobotBags:
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
             bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
-            seen = self._seen[bag.file] = _Seen(state, bag_id)
+            own = [tombstone for tombstone in tombstones if tombstone.robot == self.name]
+            forgotten = any(one.forbids(self.memory.reader, bag, bag_id) for one in own)
+            seen = self._seen[bag.file] = _Seen(state, bag_id, forgotten)
         return seen
-
-    def _is_forgotten(self, bag: BagFile, seen: _Seen, tombstones: Collection[Tombstone]) -> bool:
-        """Returns whether a bag has a message that was forgotten; it is read for that once."""
-        if seen.is_forgotten is None:
-            seen.is_forgotten = any(
-                tombstone.forbids(self.memory.reader, bag, seen.bag_id)
-                for tombstone in tombstones
-                if tombstone.robot == self.name
-            )
-        return seen.is_forgotten
 
     def _described(
         self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
@@ -418,10 +406,8 @@ class RobotBags:
                 append_receipts(self.bag_dir, missing)
                 known.update((receipt.bag, receipt) for receipt in missing)
         except OSError as error:
-            done.problems.append(
-                f"{self.name}: no receipts can be written into {self.bag_dir} "
-                f"({error.strerror or error}): its recorder cannot wait for shipping"
-            )
+            what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
+            done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")
 
 
 def _list_one(folder: Path) -> None:

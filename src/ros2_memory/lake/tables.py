@@ -62,7 +62,6 @@ _PROPERTIES: Final = {
 _PARTITIONED_BY: Final = ("robot", "day")
 _ROW_GROUP: Final = 1 << 17
 _INNER_IDS: Final = 100
-"""Parts of a map have ids that no column has."""
 
 
 @dataclass(frozen=True)
@@ -86,16 +85,14 @@ class LakeTable:
     @cached_property
     def schema(self) -> IcebergSchema:
         """Its columns for Iceberg, each with its meaning."""
-        fields = [
-            {
-                "id": number,
-                "name": name,
-                "type": _iceberg_type(kind, _INNER_IDS + 2 * number),
-                "required": name in KEYS,
-                "doc": meaning,
-            }
-            for number, (name, (kind, meaning)) in enumerate(self.columns.items(), 1)
-        ]
+        fields = []
+        for number, (name, (kind, meaning)) in enumerate(self.columns.items(), 1):
+            # Parts of a map have ids that no column has.
+            ids = {"key-id": _INNER_IDS + 2 * number, "value-id": _INNER_IDS + 2 * number + 1}
+            of_map = {"key": "string", "value": kind.removeprefix("map "), "value-required": False}
+            form = {"type": "map", **ids, **of_map} if kind.startswith("map ") else kind
+            known = {"id": number, "name": name, "type": form, "doc": meaning}
+            fields.append({**known, "required": name in KEYS})
         return IcebergSchema.model_validate({"type": "struct", "fields": fields})
 
     @cached_property
@@ -107,11 +104,8 @@ class LakeTable:
     def create(self, catalog: IcebergCatalog, identifier: str) -> IcebergTable:
         """Creates the table, partitioned by robot and day, in the order that `filled` keeps."""
         ids = {name: self.schema.find_field(name).field_id for name in self.columns}
-        same = IdentityTransform[Any]()
-        parts = (
-            PartitionField(ids[name], 1000 + nth, same, name)
-            for nth, name in enumerate(_PARTITIONED_BY)
-        )
+        same, keys = IdentityTransform[Any](), enumerate(_PARTITIONED_BY)
+        parts = (PartitionField(ids[name], 1000 + nth, same, name) for nth, name in keys)
         return catalog.create_table(
             identifier,
             self.schema,
@@ -141,32 +135,13 @@ class LakeTable:
         return self.sorted(found)
 
 
-def _iceberg_type(kind: str, inner_id: int) -> object:
-    if not kind.startswith("map "):
-        return kind
-    return {
-        "type": "map",
-        "key-id": inner_id,
-        "key": "string",
-        "value-id": inner_id + 1,
-        "value": kind.removeprefix("map "),
-        "value-required": False,
-    }
-
-
 _DECLARED: Final = yaml.safe_load(files(__package__).joinpath("tables.yaml").read_text("utf-8"))
 KEYS: Final[Mapping[str, tuple[str, str]]] = _DECLARED["keys"]
 """Columns of all tables; a row has a value for each."""
 
 TABLES: Final[Mapping[str, LakeTable]] = {
-    name: LakeTable(
-        name,
-        table["row"],
-        {**KEYS, **table["columns"]},
-        tuple(table["order"]),
-        table.get("row_group", _ROW_GROUP),
-    )
-    for name, table in _DECLARED["tables"].items()
+    name: LakeTable(name, **{**of, "columns": {**KEYS, **of["columns"]}, "order": (*of["order"],)})
+    for name, of in _DECLARED["tables"].items()
 }
 """The tables by name, `channels` first and `bags` last: in this order they are committed."""
 

@@ -140,23 +140,13 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 def _referenced(table: IcebergTable) -> set[str]:
     """Returns the files that some version, branch or tag of a table refers to."""
-    metadata = table.metadata
-    manifests = {
-        manifest.manifest_path: manifest
-        for snapshot in metadata.snapshots
-        for manifest in snapshot.manifests(table.io)
-    }
-    return {
-        table.metadata_location,
-        *(statistics.statistics_path for statistics in metadata.statistics),
-        *(snapshot.manifest_list for snapshot in metadata.snapshots),
-        *manifests,
-        *(
-            entry.data_file.file_path
-            for manifest in manifests.values()
-            for entry in manifest.fetch_manifest_entry(table.io, discard_deleted=True)
-        ),
-    }
+    metadata, io = table.metadata, table.io
+    found = {table.metadata_location, *(each.statistics_path for each in metadata.statistics)}
+    manifests = [one for version in metadata.snapshots for one in version.manifests(io)]
+    for manifest in {one.manifest_path: one for one in manifests}.values():
+        entries = manifest.fetch_manifest_entry(io, discard_deleted=True)
+        found |= {manifest.manifest_path, *(entry.data_file.file_path for entry in entries)}
+    return found | {version.manifest_list for version in metadata.snapshots}
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,10 +217,8 @@ def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
         for _, tombstone in TOMBSTONES.all_rows(state_dir):
             found[tombstone] = tombstone.done or found.get(tombstone, False)
     except (OSError, ValueError) as error:
-        raise LakeError(
-            f"{state_dir / TOMBSTONES_FILE}: {error}; nothing is shipped until it is repaired, "
-            "since what was forgotten could come back"
-        ) from error
+        why = "nothing is shipped until it is repaired, since what was forgotten could come back"
+        raise LakeError(f"{state_dir / TOMBSTONES_FILE}: {error}; {why}") from error
     return found
 
 

@@ -149,15 +149,13 @@ class LakeLocation:
             if self._is_file:
                 self.state_dir.mkdir(parents=True, exist_ok=True)
             file = self.state_dir.absolute() / CATALOGUE_FILE
-            properties = {
-                **self.properties,
-                **self.secrets,
+            own = {
                 "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
-                RECORD: os.fspath(self.state_dir.absolute()),
+                RECORD: os.fspath(file.parent),
                 "warehouse": self.warehouse,
                 "uri": f"sqlite:///{file}" if self._is_file else self.uri or "",
             }
-            catalog = kind("lake", **properties)
+            catalog = kind("lake", **{**self.properties, **self.secrets, **own})
         with closing(catalog):
             yield catalog
 
@@ -217,8 +215,9 @@ class LakeTables:
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
     ) -> pa.Table:
         """Returns the rows of which a condition is true."""
+        table = self.current(name)
         with self.location.translated(f"reading the lake's {name}"):
-            return self.tables[name].refresh().scan(condition, selected_fields=columns).to_arrow()
+            return table.scan(condition, selected_fields=columns).to_arrow()
 
     def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
         """Replaces rows by others, in one transaction."""
@@ -260,9 +259,8 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
     """
     with _locked(state_dir, os.O_RDWR | os.O_CREAT, fcntl.LOCK_EX) as (descriptor, holder):
         if holder is not None:
-            raise LakeError(
-                f"{holder} writes into this lake; a lake has one writer: stop that process first"
-            )
+            do = "a lake has one writer: stop that process first"
+            raise LakeError(f"{holder} writes into this lake; {do}")
         write_holder(descriptor)
         yield
 
@@ -302,10 +300,8 @@ def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str |
         except FileNotFoundError:
             raise
         except OSError as error:
-            raise LakeError(
-                f"{path} cannot be opened or locked: {error.strerror}; lake.state_dir must be on a "
-                "file system that supports locks"
-            ) from error
+            do = "lake.state_dir must be on a file system that supports locks"
+            raise LakeError(f"{path} cannot be opened or locked: {error.strerror}; {do}") from error
         yield descriptor, holder
 
 
@@ -367,11 +363,9 @@ class WarehouseLease:
             return
         until = known.get("until")
         if isinstance(until, int) and until > now:
-            raise LakeError(
-                f"process {known.get('pid')} on {known.get('host')} writes into this lake, with "
-                f"another lake.state_dir, until {iso_local(until)}: a lake has one writer, and one "
-                "state_dir"
-            )
+            who = f"process {known.get('pid')} on {known.get('host')} writes into this lake"
+            why = f"another lake.state_dir, until {iso_local(until)}"
+            raise LakeError(f"{who}, with {why}: a lake has one writer, and one state_dir")
 
     def _write(self, now: Ns, until: Ns) -> None:
         self._require_mine(now)

@@ -35,13 +35,10 @@ class DuckdbEngine(LakeEngine):
     """
 
     def __init__(self, memory_mb: int = 1024, threads: int | None = None) -> None:
-        settings: dict[str, str | bool | int | float | list[str]] = {
-            **_SETTINGS,
-            "memory_limit": f"{memory_mb}MiB",
-        }
-        if threads:
-            settings["threads"] = str(threads)
-        self._connection = duckdb.connect(config=settings)
+        limits = {"memory_limit": f"{memory_mb}MiB"} | (
+            {"threads": str(threads)} if threads else {}
+        )
+        self._connection = duckdb.connect(config={**_SETTINGS, **limits})
 
     def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
         """Runs the select in a cursor of its own, which alone knows the table."""
@@ -58,11 +55,11 @@ class DuckdbEngine(LakeEngine):
                 return cursor.sql(query, params=bound).to_arrow_table()
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             # Its sentence alone: a traceback with variables would show the keys of a store.
-            log.warning("lake_engine_failed", reason=f"{type(error).__name__}: {error}")
+            kind = type(error).__name__
+            log.warning("lake_engine_failed", reason=f"{kind}: {error}")
             # The error may name a path or a key: the client does not see it.
-            raise RefusedError(
-                f"the lake cannot be read ({type(error).__name__}); the server's log has the reason"
-            ) from error
+            text = f"the lake cannot be read ({kind}); the server's log has the reason"
+            raise RefusedError(text) from error
 
     def close(self) -> None:
         """Closes the database, which is in memory."""
