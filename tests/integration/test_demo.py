@@ -66,7 +66,7 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     assert output[-1] == "1 of 2 answers are right."
 
 
-@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("ending", [signal.SIGINT, signal.SIGTERM])
 async def test_it_stays_for_other_clients_and_leaves_a_closed_recording(
     tmp_path: Path, scratch: Path, ending: signal.Signals
 ) -> None:

@@ -117,18 +117,6 @@ class TestMcap:
         assert len(wanted) == 35
         assert "35 messages" in capsys.readouterr().out
 
-    def test_what_two_recordings_hold_is_there_once(
-        self, bag_dir: Path, tmp_path: Path, exits: Program
-    ) -> None:
-        copies = [
-            Msg(each.topic, each.type, each.log_time + 1000, each.body, each.published)
-            for each in driven(T0, 0)
-        ]
-        write_mcap(bag_dir / "rec_2" / "rec_2_0.mcap", copies)
-        out = tmp_path / "out.mcap"
-        exits(0, "export", "--mcap", out, "--end", T0 / NS_PER_S + 60)
-        assert read(out) == read(bag_dir / "rec_0" / "rec_0_0.mcap")
-
     def test_what_latched_messages_held_at_the_start_comes_along_unless_it_is_refused(
         self, bag_dir: Path, tmp_path: Path, exits: Program
     ) -> None:
@@ -247,17 +235,6 @@ class TestMcap:
             }
         assert values.keys() == {"/odom", "/chatter", "/bell"}
         assert "x=1.5," in repr(values["/odom"])
-
-    def test_types_without_any_definition_are_named_and_the_exit_code_is_1(
-        self, tmp_path: Path, exits: Program
-    ) -> None:
-        odd = [Msg(f"/odd_{n}", f"nobody_msgs/msg/Knows{n}", T0, b"\0\1\0\0\0") for n in range(5)]
-        write_db3(tmp_path / "bags" / "rec" / "rec_0.db3", [*odd, *odd], definitions=False)
-        words = ["export", "--mcap", str(tmp_path / "out.mcap"), "--bag-dir"]
-        err = exits(1, *words, tmp_path / "bags", "deployment=replay").err
-        named = ", ".join(each.type for each in odd)
-        assert err.count(f"{named} have no definition") == 1
-        assert "reader.custom_msg_paths" in err
 
     def test_an_interrupted_export_leaves_nothing(self, bag_dir: Path, tmp_path: Path) -> None:
         def interrupted() -> Iterator[StoredMessage]:

@@ -387,25 +387,6 @@ def test_a_path_may_come_first(folder: Path, exits: Program, tmp_path: Path) -> 
         picture.unlink()
 
 
-def test_help_on_a_tool_and_a_purpose_for_each(folder: Path, exits: Program) -> None:
-    shown = exits(0, "ask", "visits", "--help").out
-    assert "ros2-memory ask visits key=value" in shown
-    assert "  where?" in shown
-    assert all(each["purpose"] for each in exits(0, "ask", folder / "a", "--json").json)
-
-
-def test_commands_take_a_path_and_the_log_is_shown_on_request(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-    exits(0, "index", folder / "a")
-    assert exits(0, "config", "show", folder / "a", "--json").json["recording.bag_dir"] == str(
-        folder / "a"
-    )
-    assert "expecting" not in exits(2, "config", "show", "foo=[bar").err
-    assert "index_scanned" in exits(0, "-v", "info", folder / "a").err
-
-
 def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, exits: Program) -> None:
     reply = exits(0, "ask", "recap", folder / "b", "--json").json
     assert reply["start"] <= T0 / NS_PER_S + 100 < reply["end"]

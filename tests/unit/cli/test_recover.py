@@ -63,14 +63,6 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
 class TestMetadata:
     """Plain rosbags opens what was recovered as a recording, with the right counts."""
 
-    def test_of_a_recording_that_was_killed_is_made(self, tmp_path: Path) -> None:
-        write_mcap(tmp_path / "rec/rec_0.mcap", MESSAGES)
-        cut = left_open(tmp_path / "rec/rec_1.mcap")
-        write_mcap(tmp_path / "rec/.rec_0.mcap.tmp", MESSAGES)
-        recovered(tmp_path)
-        expected = 100 + McapReader().summarize(cut).count
-        assert counted(tmp_path / "rec") == {"/odom": expected}
-
     def test_that_speaks_of_more_than_there_is_is_corrected(self, tmp_path: Path) -> None:
         with Writer(tmp_path / "rec", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             store = typestore()

@@ -109,26 +109,6 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
         assert reply(lake, tool, asked) == expected
 
 
-def test_messages_that_are_not_there_are_refused_and_their_times_are_not(
-    both: tuple[Memory, Memory],
-) -> None:
-    over_bags, over_lake = (fleet_of({"hall": memory}) for memory in both)
-    at: dict[str, object] = {"topic": "/camera", "timestamp": START_S + 5, "tolerance_s": 9}
-    refused = reply(over_lake, "get_topic_at_time", at)
-    assert refused["error"] == "not_in_lake"
-    assert "only the times of /camera" in refused["detail"]
-    assert "lake.messages" in refused["detail"]
-    span: dict[str, object] = {"start": START_S, "end": START_S + 99}
-    for tool, given in (
-        ("list_recorded_topics", {}),
-        ("get_topic_in_range", {"topic": "/camera", **span, "by": "hour"}),
-        ("recap", span),
-    ):
-        expected = reply(over_bags, tool, given)
-        assert "error" not in expected
-        assert reply(over_lake, tool, given) == expected
-
-
 def test_copies_among_images_are_told_by_their_publish_times(
     engine: LakeEngine, tmp_path: Path
 ) -> None:

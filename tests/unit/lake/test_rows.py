@@ -7,9 +7,7 @@ from random import Random
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.recap import recap
+from ros2_memory.history.context import Memory
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
@@ -52,16 +50,6 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(lake: tuple[Path, 
             second = row["time_ns"] / NS_PER_S - ROBOT.start_s
             truth = math.sin(second / 10) * 3, 0.1 * second
             assert math.dist((row["x"], row["y"]), truth) <= row["error_m"] + 1e-6
-
-
-def test_metres_of_a_bag_are_those_of_a_recap_of_it(lake: tuple[Path, Memory]) -> None:
-    rows = lake_rows(lake[0], "bags")
-    assert len({row["made_of"] for row in rows}) == 2
-    for row in rows:
-        told = recap(
-            lake[1], Call(), TimeRange(row["start_ns"] / NS_PER_S, row["end_ns"] / NS_PER_S)
-        )
-        assert row["distance_m"] == pytest.approx(told.distance_m, abs=1e-6)
 
 
 def test_messages_of_a_chosen_topic_are_whole(lake: tuple[Path, Memory]) -> None:
