@@ -272,11 +272,14 @@ def test_files_of_others_and_young_ones_stay(tmp_path: Path) -> None:
     assert len(lake_column(lake, "messages", "texts")) == 2
 
 
-def test_a_closed_day_is_put_into_one_file_with_the_same_rows(tmp_path: Path) -> None:
+def test_a_closed_day_is_put_into_one_file_with_the_same_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """That of all robots in one transaction; the day of one with few files stays as it is."""
     lake = tmp_path / "lake"
-    robots = {"hall": (4, 0), "roof": (1, 0), "wing": (4, 1), "yard": (4, 0)}
-    for number in range(4):
+    monkeypatch.setattr("ros2_memory.lake.upkeep.FEW_FILES", 1)
+    robots = {"hall": (2, 0), "roof": (1, 0), "wing": (2, 1), "yard": (2, 0)}
+    for number in range(2):
         for robot, (bags, day) in robots.items():
             if number < bags:
                 write_bag(tmp_path / robot, number, at_s=START_S + 86_400 * day + 10 * number)
