@@ -16,7 +16,8 @@ from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.driven_inside import totals_inside
-from ros2_memory.places.where import parse_where, times_in_region
+from ros2_memory.places.robot_tracks import Inside, robot_inside
+from ros2_memory.places.where import joined_in_region, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import Bins
 
 
@@ -61,7 +61,8 @@ def count_path(
     total = way.totals.distance_m
     edges = binned.bins.edges[1:-1]
     if region is not None and by != "place":
-        inside = times_in_region(view, region, binned.counted)
+        track = joined_in_region(view, region, binned.counted).track
+        inside = robot_inside(track, region.region, binned.counted)
         total, inner = totals_inside(way.line, inside).distance_m, _upto(way.line, inside, edges)
     else:
         inner = way.line.metres_at(edges) if len(way.line) else np.zeros(len(edges))

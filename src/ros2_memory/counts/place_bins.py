@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.counts.time_bins import TimeBins
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.pose_frames import map_placement
-from ros2_memory.places.region_visits import placed_times, places_in, track_in
-from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.region_visits import joined_in, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
 
 if TYPE_CHECKING:
@@ -51,12 +51,11 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
             f"by place needs named places in {frames}, and there is none in "
             f"{places_setting(view.limits)}"
         )
-    track = track_in(view, placement.frame_id, window)
     inside = [
-        [(each.start, each.stop + 1) for each in robot_inside(own, place.region, window)]
-        for place, own in places
+        united((each.start, each.stop + 1) for each in joined.inside(place.region, window))
+        for place, joined in places
     ]
-    known = placed_times(track, [])
+    known = placed_times(joined_in(view, placement.frame_id, window).track, [])
     cuts = {at for spans in (*inside, known) for span in spans for at in span}
     within = sorted(at for at in cuts if window.start < at < window.stop)
     edges = np.array([window.start, *within, window.stop], np.int64)

@@ -15,7 +15,6 @@ from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times, places_in
-from ros2_memory.places.robot_tracks import Inside, robot_inside
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
 
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.places.robot_tracks import Inside
     from ros2_memory.results import Bins
 
 
@@ -70,13 +70,12 @@ def count_visits(
         place = replace(place, frame_id=asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,), place)
     joined = joined_in(view, placement.frame_id, binned.window)
-    track = joined.track
     binned.count_since(joined.since)
-    known = placed_times(track, mixed)
+    known = placed_times(joined.track, mixed)
     binned.add_lengths("placed_s", "duration", known)
     binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
     if place is not None and by != "place":
-        stayed = robot_inside(track, place.region, binned.window)
+        stayed = joined.inside(place.region, binned.window)
         if not stayed and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
@@ -84,7 +83,7 @@ def count_visits(
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
     places = places_in(view, named, placement, binned.window)
-    inside = [robot_inside(own, each.region, binned.window) for each, own in places]
+    inside = [own.inside(each.region, binned.window) for each, own in places]
     if by == "place":
         _add_each_place(binned, inside)
         return binned.answer()

@@ -33,10 +33,9 @@ from ros2_memory.places.pose_frames import (
     is_one_run,
     known_placement,
 )
-from ros2_memory.places.region_visits import places_in, track_in
-from ros2_memory.places.robot_tracks import robot_inside
+from ros2_memory.places.region_visits import joined_in, places_in
 from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
-from ros2_memory.places.where import Where, parse_where, places_asked, times_inside
+from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things, note_other_frames
@@ -207,7 +206,7 @@ def _paths_apart(
         return _WaysApart()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    tracks = [track_in(view, frame, each) for each in windows]
+    tracks = [joined_in(view, frame, each).track for each in windows]
     stands = [
         [
             *placed_standstills(
@@ -251,13 +250,14 @@ def _places(
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
             inside = [
-                (place.name, robot_inside(track, place.region, window))
-                for place, track in places_in(view, places, placement, window)
+                (place.name, joined.inside(place.region, window))
+                for place, joined in places_in(view, places, placement, window)
             ]
         else:
             inside = [
-                (place.title, times_inside(view, place, placement.frame_id, window))
+                (place.title, joined_in(view, frame, window).inside(place.region, window))
                 for place in where.each
+                for frame in [place.frame_id or placement.frame_id]
             ]
         lasted = {
             name: passed.among((one.start, one.stop) for one in times) for name, times in inside

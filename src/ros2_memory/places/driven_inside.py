@@ -17,6 +17,7 @@ from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Line, Waypoint
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.geometry import yaw
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_edges, note_unread, note_unrecorded
@@ -26,7 +27,8 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.farthest import farthest_from
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS, newest_pose, placed_waypoints
-from ros2_memory.places.where import parse_where, times_in_region
+from ros2_memory.places.robot_tracks import Inside, robot_inside
+from ros2_memory.places.where import joined_in_region, parse_where
 from ros2_memory.results import DrivenInside
 
 if TYPE_CHECKING:
@@ -35,7 +37,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
-    from ros2_memory.places.robot_tracks import Inside
 
 _SPEED_NS: Final[Ns] = NS_PER_S
 """Over so long a speed is measured: what is shorter is noise."""
@@ -73,7 +74,8 @@ def driven_inside(
     if way is None or not way.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    inside = times_in_region(view, region, window)
+    track = joined_in_region(view, region, window).track
+    inside = robot_inside(track, region.region, window)
     totals = totals_inside(way.line, inside)
     waypoints = way_inside(way.line, inside, max_waypoints)
     waypoints = tuple(_as_turned(view, name, way.line, each) for each in waypoints)
@@ -118,25 +120,24 @@ class InsideTotals(NamedTuple):
 def totals_inside(line: Line, spans: Sequence[Inside]) -> InsideTotals:
     """Returns what was driven along a line in some times."""
     metres, speeds = 0.0, [] if spans else [0.0]
-    for span in spans:
-        start, stop = line.metres_at(np.array([span.start, span.stop])).tolist()
-        metres += stop - start
-        fastest = _fastest(line, span, stop - start)
+    for start, stop in united((span.start, span.stop) for span in spans):
+        first_m, last_m = line.metres_at(np.array([start, stop])).tolist()
+        metres += last_m - first_m
+        fastest = _fastest(line, start, stop, last_m - first_m)
         speeds += [] if fastest is None else [fastest]
     return InsideTotals(metres, max(speeds, default=None))
 
 
-def _fastest(line: Line, span: Inside, driven_m: float) -> float | None:
-    lasted = span.stop - span.start
-    if lasted <= _SPEED_NS:
-        return mean_speed(driven_m, unix_from_ns(lasted))
-    end = span.stop - _SPEED_NS
-    inner = line.times[np.searchsorted(line.times, span.start) :]
+def _fastest(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
+    if stop - start <= _SPEED_NS:
+        return mean_speed(driven_m, unix_from_ns(stop - start))
+    end = stop - _SPEED_NS
+    inner = line.times[np.searchsorted(line.times, start) :]
     inner = inner[: np.searchsorted(inner, end)]
     # The speed over a second changes its slope only where it begins or ends at a vertex.
-    ends = line.times[np.searchsorted(line.times, span.start + _SPEED_NS) :]
-    ends = ends[: np.searchsorted(ends, span.stop)] - _SPEED_NS
-    begin = np.concatenate(([span.start, end], inner, ends))
+    ends = line.times[np.searchsorted(line.times, start + _SPEED_NS) :]
+    ends = ends[: np.searchsorted(ends, stop)] - _SPEED_NS
+    begin = np.concatenate(([start, end], inner, ends))
     driven = line.metres_at(begin + _SPEED_NS) - line.metres_at(begin)
     # Metres are without jumps, but noise may shift some of them along the way.
     moved = line.places_at(begin + _SPEED_NS) - line.places_at(begin)

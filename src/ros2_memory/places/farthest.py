@@ -14,7 +14,7 @@ from ros2_memory.core.regions import places_at
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.pose_frames import map_placement
-from ros2_memory.places.region_visits import track_in
+from ros2_memory.places.region_visits import joined_in
 from ros2_memory.places.robot_tracks import RobotTracks
 from ros2_memory.places.where import parse_where
 from ros2_memory.results import FarthestPose
@@ -59,7 +59,7 @@ def farthest_from(
     if not spans:
         return None
     window = TimeWindow(spans[0][0], spans[-1][1] + 1)
-    track, tracks = track_in(view, frame, window), RobotTracks(view, frame)
+    track, tracks = joined_in(view, frame, window).track, RobotTracks(view, frame)
     times, at_x, at_y = _along(track, spans)
     off_m = np.hypot(at_x - x, at_y - y)
     best: tuple[float, Ns, float, float] | None = None

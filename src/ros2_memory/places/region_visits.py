@@ -24,60 +24,28 @@ from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.places.pose_frames import MapPlacement, map_placement, note_runs
-from ros2_memory.places.robot_tracks import (
-    Inside,
-    JoinedTrack,
-    RobotTracks,
-    robot_inside,
-    times_inside,
-)
+from ros2_memory.places.robot_tracks import Inside, JoinedTrack, RobotTracks, times_inside
 from ros2_memory.results import PlaceVisits, Visit
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.history.view import View
-    from ros2_memory.places.where import Where
 
 
 WHEREABOUTS: Final = "where the robot was"
 """What is not known without poses, for sentences."""
 _CLOSE_NS: Final[Ns] = 60 * NS_PER_S
-_MOST_JOINED: Final = 50
+_MOST_TRIED: Final = 50
 
 
-class RegionVisits(NamedTuple):
-    """All visits to a region that reach into a window, newest first, and the track they are of.
-
-    `elapsed`: how much time passed between moments of the window. `is_all`: whether the track
-    reaches back to its begin. `tracks`: has the poses themselves.
-    """
-
-    track: RobotTrack
-    all: Sequence[tuple[Inside, RobotTrack]]
-    elapsed: Elapsed
-    is_all: bool
-    tracks: RobotTracks
-
-    @property
-    def duration(self) -> Ns:
-        """How long they were in all, as the track has them."""
-        return self.elapsed.among((one.start, one.stop) for one, _ in self.all)
-
-
-def track_in(view: View, frame_id: str, window: TimeWindow) -> RobotTrack:
+def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
     """Returns the robot's track in a window; a note says how far back it reaches, if not all.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    return joined_in(view, frame_id, window).track
-
-
-def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
-    """Returns what `track_in` does, and since when it is known."""
     joined = RobotTracks(view, frame_id).over(window)
     note_runs(view, resolve_path_topic(view), frame_id, window)
     if joined.since is not None:
@@ -107,35 +75,110 @@ def tracks_made(view: View, window: TimeWindow) -> Iterator[Ns]:
         yield from merge(*(RobotTracks(view, one).made(window) for one in frames), reverse=True)
 
 
-def region_visits(view: View, frame_id: str, where: Where, window: TimeWindow) -> RegionVisits:
-    """Returns the visits to a region that reach into a window, not cut at its ends.
+class RegionVisit(NamedTuple):
+    """A visit to a region by a track.
 
-    Raises:
-        QueryTimeoutError: the call's time runs out before any result.
+    Attributes:
+        inside: the part in the window, as long as the track has it.
+        whole: the visit, not cut.
+        track: of the robot.
     """
-    joined = joined_in(view, frame_id, window)
-    tracks = RobotTracks(view, frame_id)
-    every = [
-        (one, track)
-        for track in (joined.track, *joined.others)
-        for one in _joined_visits(tracks, times_inside(track, where.region), where.region)
-        if window.overlaps(one.start, one.stop)
-    ]
-    every.sort(key=lambda visit: visit[0], reverse=True)
-    elapsed = elapsed_in(view, window)
-    every = [
-        (one, track)
-        for one, track in every
-        if one == (cut := one.within(window)) or _has_pose(tracks, cut, track, where.region)
-    ]
-    return RegionVisits(joined.track, every, elapsed, joined.since is None, tracks)
+
+    inside: Inside
+    whole: Inside
+    track: RobotTrack
+
+
+class RegionVisits:
+    """The visits to a region of a frame that reach into a window.
+
+    Attributes:
+        joined: the tracks of the robots.
+        every: their visits, newest first.
+        elapsed: how much time passed between moments of the window.
+    """
+
+    def __init__(self, view: View, frame_id: str, region: Region, window: TimeWindow) -> None:
+        """Finds them.
+
+        Raises:
+            QueryTimeoutError: the call's time runs out before any result.
+        """
+        self.joined = joined_in(view, frame_id, window)
+        self.elapsed = elapsed_in(view, window)
+        self._region, self._window = region, window
+        self._tracks = RobotTracks(view, frame_id)
+        found = [
+            RegionVisit(one.within(window), one, track)
+            for track in self.joined.tracks
+            for one in _joined_visits(self._tracks, times_inside(track, region), region)
+            if window.overlaps(one.start, one.stop)
+        ]
+        found.sort(key=lambda visit: visit.whole, reverse=True)
+        self._looked_at = 0
+        self.every = [each for each in map(self._seen, found) if each is not None]
+
+    @property
+    def duration(self) -> Ns:
+        """How long they were in all, as the tracks have them."""
+        return self.elapsed.among((each.inside.start, each.inside.stop) for each in self.every)
+
+    def _seen(self, visit: RegionVisit) -> RegionVisit | None:
+        """Returns a visit; None where no pose in the window is inside: the line alone touches.
+
+        The newest `_MOST_TRIED` visits without a vertex inside are looked at.
+        """
+        window, whole = self._window, visit.whole
+        # So near to the window's ends, poses decide on which side a visit begins, or ends.
+        room = TRACK_SLICE_NS
+        if window.start + room <= whole.start and whole.stop < window.stop - room:
+            if any(True for _ in _vertices_inside(visit.track, whole, self._region)):
+                return visit
+            self._looked_at += 1
+            if self._looked_at > _MOST_TRIED:
+                return visit
+        exact = _by_poses(self._tracks, visit.track, whole, self._region)
+        if exact is None or not window.overlaps(exact.start, exact.stop):
+            return None
+        cut = exact.within(window)
+        if cut != exact and not _has_pose(self._tracks, cut, visit.track, self._region):
+            return None
+        inside = visit.inside._replace(entered=cut.entered, left=cut.left)
+        return visit._replace(inside=inside)
+
+    def ends(self, visit: RegionVisit) -> Inside:
+        """Returns a visit from its first to its last pose inside, cut at the window's ends."""
+        exact = _by_poses(self._tracks, visit.track, visit.whole, self._region)
+        return visit.inside if exact is None else exact.within(self._window)
+
+    def shown(self, visit: RegionVisit, newest: Ns | None) -> Visit:
+        """Returns a visit for the reply.
+
+        Its times are those of poses: of the first and the last one inside, and of the closest.
+        `newest` is the newest pose, if it is recent enough.
+        """
+        one = self.ends(visit)
+        is_there = newest is not None and one.start <= newest <= one.stop and not one.left
+        distance_m, at = None, None
+        if isinstance(self._region, Circle):
+            distance_m, at = _closest(self._tracks, visit.track, one, self._region)
+        return Visit(
+            arrived=one.start,
+            departed=None if is_there else one.stop,
+            duration=self.elapsed.between(one.start, one.stop),
+            closest_m=distance_m,
+            closest_at=at,
+            restarts=0,
+            already_inside=not one.entered,
+            still_inside=not one.left and not is_there,
+        )
 
 
 def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) -> list[Inside]:
     """Returns visits in order; those as one between which the robot's poses did not leave.
 
     Along the edge of a region its track may be outside where it was inside. The newest
-    `_MOST_JOINED` of such visits are looked at.
+    `_MOST_TRIED` of such visits are looked at.
     """
     found: list[Inside] = []
     looked_at = 0
@@ -146,7 +189,7 @@ def _joined_visits(tracks: RobotTracks, visits: list[Inside], region: Region) ->
             found.append(older)
             continue
         looked_at += 1
-        if looked_at <= _MOST_JOINED and _stays(tracks, region, older, newer):
+        if looked_at <= _MOST_TRIED and _stays(tracks, region, older, newer):
             found[-1] = newer._replace(start=older.start, entered=older.entered)
         else:
             found.append(older)
@@ -161,7 +204,7 @@ def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) ->
     first = max(older.start, older.stop - TRACK_SLICE_NS)
     last = min(newer.stop, newer.start + TRACK_SLICE_NS)
     times, x, y = tracks.poses(TimeWindow(first, last + 1))[:3]
-    inside = _inside(region, times, x, y)
+    inside = [*_inside(region, times, x, y)]
     if not inside or inside[0] > older.stop or inside[-1] < newer.start:
         return False
     return not any(_absences(times, inside))
@@ -169,76 +212,33 @@ def _stays(tracks: RobotTracks, region: Region, older: Inside, newer: Inside) ->
 
 def _has_pose(tracks: RobotTracks, one: Inside, track: RobotTrack, region: Region) -> bool:
     """Returns whether a visit that a window cuts off has a pose in the window."""
-    if _vertices_inside(track, one, region):
+    if any(True for _ in _vertices_inside(track, one, region)):
         return True
-    return bool(_inside(region, *tracks.poses(TimeWindow(one.start, one.stop + 1))[:3]))
+    poses = tracks.poses(TimeWindow(one.start, one.stop + 1))[:3]
+    return any(True for _ in _inside(region, *poses))
 
 
-def _inside(region: Region, times: Times, x: Floats, y: Floats) -> list[Ns]:
-    """Returns those of some times at which the robot was in a region."""
+def _inside(region: Region, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
+    """Yields those of some times at which the robot was in a region."""
     rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
-    return [time for time, *place in rows if region.contains(*place)]
+    return (time for time, *place in rows if region.contains(*place))
 
 
-def shown_visits(
-    found: RegionVisits, window: TimeWindow, limit: int, where: Where, newest: Ns | None
-) -> tuple[tuple[Visit, ...], RegionVisits]:
-    """Returns the newest visits in a window for the reply, and all, cut at the window's ends.
-
-    Not those that turned out to be none. `newest` is the newest pose, if it is recent enough.
-    """
-    shown: list[Visit] = []
-    every: list[tuple[Inside, RobotTrack]] = []
-    for by_track, track in found.all:
-        if len(shown) == limit:
-            every.append((by_track.within(window), track))
-            continue
-        of_track = found._replace(track=track)
-        one = _by_poses(of_track, by_track, where.region)
-        if one is not None and window.overlaps(one.start, one.stop):
-            cut = one.within(window)
-            lasted = by_track.within(window)
-            every.append((lasted._replace(entered=cut.entered, left=cut.left), track))
-            shown.append(_visit_of(of_track, cut, where, newest))
-    return tuple(shown), found._replace(all=every)
-
-
-def _visit_of(found: RegionVisits, one: Inside, where: Where, newest: Ns | None) -> Visit:
-    """Returns a visit for the reply.
-
-    Its times are those of poses: of the first and the last one inside, and of the closest.
-    """
-    is_there = newest is not None and one.start <= newest <= one.stop and not one.left
-    distance_m, at = None, None
-    if isinstance(where.region, Circle):
-        distance_m, at = _closest(found, one, where.region)
-    return Visit(
-        arrived=one.start,
-        departed=None if is_there else one.stop,
-        duration=found.elapsed.between(one.start, one.stop),
-        closest_m=distance_m,
-        closest_at=at,
-        restarts=0,
-        already_inside=not one.entered,
-        still_inside=not one.left and not is_there,
-    )
-
-
-def _by_poses(found: RegionVisits, one: Inside, region: Region) -> Inside | None:
+def _by_poses(tracks: RobotTracks, track: RobotTrack, one: Inside, region: Region) -> Inside | None:
     """Returns a visit from its first to its last pose inside, where it was entered and left.
 
     None where no pose is inside: the robot's line alone touches the region.
     """
-    within = _vertices_inside(found.track, one, region)
+    within = [*_vertices_inside(track, one, region)]
     start, stop = one.start, one.stop
     if one.entered:
-        poses = _poses_around(found, one.start)
+        poses = _poses_around(tracks, track, one.start)
         inside = [time for time in _inside(region, *poses) if time <= one.stop]
         others = [back for left, back in _absences(poses[0], inside) if left < one.start]
         inside = [time for time in inside if time >= max(others, default=MIN_NS)]
         start = min((*inside[:1], *within[:1]), default=MAX_NS)
     if one.left:
-        poses = _poses_around(found, one.stop)
+        poses = _poses_around(tracks, track, one.stop)
         inside = [time for time in _inside(region, *poses) if time >= one.start]
         others = [left for left, back in _absences(poses[0], inside) if back > one.stop]
         inside = [time for time in inside if time <= min(others, default=MAX_NS)]
@@ -257,26 +257,27 @@ def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
             yield left, back
 
 
-def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> list[Ns]:
-    """Returns the times of a visit's vertices that are inside."""
+def _vertices_inside(track: RobotTrack, one: Inside, region: Region) -> Iterator[Ns]:
+    """Yields the times of a visit's vertices that are inside."""
     first = int(np.searchsorted(track.times, one.start, side="left"))
     last = int(np.searchsorted(track.times, one.stop, side="right"))
     visit = slice(first, last)
     return _inside(region, track.times[visit], track.x[visit], track.y[visit])
 
 
-def _poses_around(found: RegionVisits, at: Ns) -> tuple[Times, Floats, Floats]:
+def _poses_around(tracks: RobotTracks, track: RobotTrack, at: Ns) -> tuple[Times, Floats, Floats]:
     """Returns the poses between the vertices before and after a time, these included."""
-    times = found.track.times
+    times = track.times
     last = len(times) - 1
     before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
     after = min(int(np.searchsorted(times, at, side="right")), last)
-    return found.tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
+    return tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
 
 
-def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, Ns]:
+def _closest(
+    tracks: RobotTracks, track: RobotTrack, one: Inside, circle: Circle
+) -> tuple[float, Ns]:
     """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
-    track = found.track
     first = max(int(np.searchsorted(track.times, one.start, side="right")) - 1, 0)
     last = int(np.searchsorted(track.times, one.stop, side="left"))
     times = track.times[first : last + 1]
@@ -294,7 +295,7 @@ def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, N
     nearest = int(off.argmin())
     lasted = int(inner[nearest + 1] - inner[nearest])
     at = int(inner[nearest] + round(float(along[nearest]) * lasted))
-    times, x, y = _poses_around(found, at)
+    times, x, y = _poses_around(tracks, track, at)
     away_m = np.hypot(x - circle.x, y - circle.y)
     near = (times >= one.start) & (times <= one.stop)
     poses = zip(away_m[near].tolist(), times[near].tolist(), strict=True)
@@ -303,7 +304,7 @@ def _closest(found: RegionVisits, one: Inside, circle: Circle) -> tuple[float, N
 
 def places_in(
     view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
-) -> list[tuple[Place, RobotTrack]]:
+) -> list[tuple[Place, JoinedTrack]]:
     """Returns the places of the map and of the poses' own frame, each with the track in its frame.
 
     Notes name the others.
@@ -311,49 +312,27 @@ def places_in(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    found: list[tuple[Place, RobotTrack]] = []
-    tracks: dict[str, RobotTrack] = {}
+    found: list[tuple[Place, JoinedTrack]] = []
     for place in places:
-        frame = place.frame_id
-        if frame not in placement.frames:
+        if place.frame_id in placement.frames:
+            found.append((place, joined_in(view, place.frame_id, window)))
+        else:
             view.notes.add(
-                f"{place.name} is left out: it is in {frame}, and where the robot was is known in "
-                f"{' and '.join(placement.frames)}"
+                f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
+                f"known in {' and '.join(placement.frames)}"
             )
-            continue
-        if frame not in tracks:
-            tracks[frame] = track_in(view, frame, window)
-        found.append((place, tracks[frame]))
     return found
 
 
-def place_visits(
-    view: View, places: Sequence[tuple[Place, RobotTrack]], window: TimeWindow, elapsed: Elapsed
-) -> tuple[PlaceVisits, ...]:
-    """Returns how often, and for how long, the robot was in each of `places_in`.
-
-    Those in which it was longest come first.
-    """
-    found: list[PlaceVisits] = []
-    for place, track in places:
-        inside = robot_inside(track, place.region, window)
-        tracks = RobotTracks(view, place.frame_id)
-        every = [(one, track) for one in inside]
-        of_place = RegionVisits(track, every, elapsed, is_all=True, tracks=tracks)
-        entries = [one for one in inside if one.entered]
-        exits = [one for one in inside if one.left]
-        first, last = (
-            _by_poses(of_place, some[nth], place.region) or some[nth] if some else None
-            for some, nth in ((entries, 0), (exits, -1))
-        )
-        found.append(
-            PlaceVisits(
-                place=place.name,
-                entries=len(entries),
-                exits=len(exits),
-                duration=of_place.duration,
-                first=None if first is None else first.start,
-                last=None if last is None else last.stop,
-            )
-        )
-    return tuple(sorted(found, key=lambda each: (-each.duration, each.place)))
+def place_visits(found: RegionVisits, name: str) -> PlaceVisits:
+    """Returns how often, and for how long, the robot was in a place."""
+    entries = [each for each in found.every if each.inside.entered]
+    exits = [each for each in found.every if each.inside.left]
+    return PlaceVisits(
+        place=name,
+        entries=len(entries),
+        exits=len(exits),
+        duration=found.duration,
+        first=found.ends(entries[-1]).start if entries else None,
+        last=found.ends(exits[0]).stop if exits else None,
+    )

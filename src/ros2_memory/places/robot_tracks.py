@@ -10,6 +10,7 @@ import hashlib
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -107,6 +108,15 @@ class JoinedTrack:
     since: Ns | None = None
     left_out: int = 0
     others: tuple[RobotTrack, ...] = ()
+
+    @property
+    def tracks(self) -> tuple[RobotTrack, ...]:
+        """Those of all robots."""
+        return self.track, *self.others
+
+    def inside(self, region: Region, window: TimeWindow) -> list[Inside]:
+        """Returns when any robot was inside of a region, in order; times of several may overlap."""
+        return sorted(chain(*(robot_inside(each, region, window) for each in self.tracks)))
 
 
 _JOINED: Final[Key[dict[tuple[str, TimeWindow], JoinedTrack]]] = Key()

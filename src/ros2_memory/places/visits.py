@@ -33,11 +33,10 @@ from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import map_placement
 from ros2_memory.places.region_visits import (
     WHEREABOUTS,
+    RegionVisits,
     place_visits,
     placed_times,
     places_in,
-    region_visits,
-    shown_visits,
 )
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import Visit, Visits
@@ -45,7 +44,6 @@ from ros2_memory.results import Visit, Visits
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
@@ -90,10 +88,13 @@ def visits(
     placement = map_placement(view, topic, asked)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
-        placed = places_in(view, memory.limits.places, placement, window)
-        elapsed = elapsed_in(view, window)
-        places = place_visits(view, placed, window, elapsed)
-        tracks = {each.frame_id: track for each, track in placed}.values()
+        table = [
+            (each, RegionVisits(view, each.frame_id, each.region, window))
+            for each, _ in places_in(view, memory.limits.places, placement, window)
+        ]
+        rows = (place_visits(found, each.name) for each, found in table)
+        places = tuple(sorted(rows, key=lambda each: (-each.duration, each.place)))
+        tracks = {each.frame_id: found.joined.track for each, found in table}.values()
         been = any(each.duration for each in places)
         note_unread(view, window, nothing=not been, gaps=not been)
         return Visits(
@@ -106,19 +107,19 @@ def visits(
             total=sum(each.entries for each in places),
             now=now,
             places=places,
-            unknown=_unknown(view, window, tracks, mixed, elapsed),
+            unknown=_unknown(view, window, tracks, mixed),
             notes=view.notes.sentences(),
         )
-    found = region_visits(view, placement.frame_id, place, window)
-    newest = _newest(view, topic, found.track, window, now + FUTURE_NS)
+    found = RegionVisits(view, placement.frame_id, place.region, window)
+    track, every = found.joined.track, found.every
+    newest = _newest(view, topic, track, window, now + FUTURE_NS)
     # A newer pose shows where the robot is now.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
     current = newest if newest is not None and newest >= stale else None
-    by_poses, found = shown_visits(found, window, limit, place, current)
-    shown = tuple(_within_asked(each, window) for each in by_poses)
+    shown = tuple(_within_asked(found.shown(each, current), window) for each in every[:limit])
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not found.all and asked is None:
+    if not every and asked is None:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
     view.notes.retract_outside(window)
@@ -130,15 +131,15 @@ def visits(
         y=None if circle is None else circle.y,
         radius_m=None if circle is None else circle.radius_m,
         visits=shown,
-        more=len(found.all) > len(shown),
-        total=len(found.all),
+        more=len(every) > len(shown),
+        total=len(every),
         now=now,
         duration=found.duration,
-        entries=sum(one.entered for one, _ in found.all),
-        exits=sum(one.left for one, _ in found.all),
-        all_counted=found.is_all,
+        entries=sum(each.inside.entered for each in every),
+        exits=sum(each.inside.left for each in every),
+        all_counted=found.joined.since is None,
         where=place.name,
-        unknown=_unknown(view, window, [found.track], mixed, found.elapsed),
+        unknown=_unknown(view, window, [track], mixed),
         reaches_now=newest is not None,
         notes=view.notes.sentences(),
     )
@@ -174,12 +175,10 @@ def asked_place(
     return None
 
 
-def _unknown(
-    view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans, elapsed: Elapsed
-) -> Ns:
+def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans) -> Ns:
     """Returns for how long it is not known where the robot was, by a track for each frame."""
     every = (unknown_times(view, window, placed_times(one, mixed), WHEREABOUTS) for one in tracks)
-    return elapsed.among(united(chain.from_iterable(every)))
+    return elapsed_in(view, window).among(united(chain.from_iterable(every)))
 
 
 def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns) -> Ns | None:

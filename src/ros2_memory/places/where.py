@@ -29,18 +29,16 @@ from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, c
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
 from ros2_memory.places.pose_frames import MapPlacement, map_placement
-from ros2_memory.places.region_visits import WHEREABOUTS, placed_times, track_in
-from ros2_memory.places.robot_tracks import Inside, robot_inside
+from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-
-    from ros2_memory.analysis.motion.robot_track import RobotTrack
 
     # Not at runtime: pydantic, which `WhileCondition` is an argument of, takes no recursive type.
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
+    from ros2_memory.places.robot_tracks import Inside, JoinedTrack
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
@@ -240,18 +238,6 @@ def _number(value: JsonValue) -> float | None:
     return number if math.isfinite(number) else None
 
 
-def times_inside(view: View, where: Where, frame_id: str, window: TimeWindow) -> list[Inside]:
-    """Returns when the robot was in a region, in order; a note says where that is not all known.
-
-    `frame_id` is the frame of regions that name none.
-
-    Raises:
-        QueryTimeoutError: the call's time runs out before any result.
-    """
-    track = track_in(view, where.frame_id or frame_id, window)
-    return robot_inside(track, where.region, window)
-
-
 def note_other_frame(
     view: View, where: Where, placement: MapPlacement, window: TimeWindow, ask: str
 ) -> None:
@@ -263,7 +249,7 @@ def note_other_frame(
     if where.frame_id is not None or own == placement.frame_id:
         return
     with suppress(QueryTimeoutError):
-        if times_inside(view, replace(where, frame_id=own), own, window):
+        if joined_in(view, own, window).inside(where.region, window):
             view.notes.add(
                 f"x and y were taken in {placement.frame_id}; the robot was at those in {own}, "
                 f"the frame of get_position_*: {ask}"
@@ -303,9 +289,12 @@ class Scope:
         self.unknown: Spans = []
         self._inside: list[tuple[Ns, Ns]] | None = None
         if where is not None:
-            track, inside = _in_region(view, parse_where(view.limits, where), window)
-            self._inside = [(each.start, each.stop) for each in inside]
-            known = placed_times(track, note_robots(view, resolve_path_topic(view), window))
+            region = parse_where(view.limits, where)
+            joined = joined_in_region(view, region, window)
+            inside = joined.inside(region.region, window)
+            self._inside = united((each.start, each.stop) for each in inside)
+            mixed = note_robots(view, resolve_path_topic(view), window)
+            known = placed_times(joined.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
         self._states = [_States(view, each) for each in during]
         for state, each in zip(self._states, during, strict=True):
@@ -342,27 +331,28 @@ class Scope:
         return all(state.holds_at(time) for state in self._states)
 
 
-def times_in_region(view: View, where: Where, window: TimeWindow) -> Sequence[Inside]:
-    """Returns when the robot was in a region, in order: one in the map, unless it names a frame.
+def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
+    """Returns when any robot was in a region, in order; raises as `joined_in_region`."""
+    return joined_in_region(view, where, window).inside(where.region, window)
+
+
+def joined_in_region(view: View, where: Where, window: TimeWindow) -> JoinedTrack:
+    """Returns the robot's track in the frame of a region: the map, unless it names another.
+
+    Notes say where it is not all known, and where it is in the region in another frame alone.
 
     Raises:
         InvalidArgumentsError: no pose is in the region's frame, and none can be placed there.
         NoDataError: no pose is recorded.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    return _in_region(view, where, window)[1]
-
-
-def _in_region(view: View, where: Where, window: TimeWindow) -> tuple[RobotTrack, Sequence[Inside]]:
-    """Returns the robot's track, and when it was in a region."""
     topic = resolve_path_topic(view)
     placement = map_placement(view, topic, where.frame_id)
-    track = track_in(view, where.frame_id or placement.frame_id, window)
-    found = robot_inside(track, where.region, window)
-    if not found:
+    joined = joined_in(view, where.frame_id or placement.frame_id, window)
+    if not joined.inside(where.region, window):
         ask = f'ask it with frame_id "{placement.frame_id}"'
         note_other_frame(view, where, placement, window, ask)
-    return track, found
+    return joined
 
 
 class _States:

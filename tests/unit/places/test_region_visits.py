@@ -15,7 +15,7 @@ from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
-from tests.support.bags import odom, tf, transform, write_mcap
+from tests.support.bags import odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
@@ -196,3 +196,72 @@ def test_the_poses_that_are_reported_in_a_place_are_visited(tmp_path: Path) -> N
     times = {message.log_time for message in messages}
     assert {visit.arrived for visit in there.visits[:-1]} <= times
     assert {visit.closest_at for visit in there.visits} <= times
+
+
+def spots(memory: Memory, **where: Circle) -> Memory:
+    places = tuple(Place(name, "odom", region) for name, region in where.items())
+    return replace(memory, limits=replace(memory.limits, places=places))
+
+
+@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+def test_each_of_two_robots_in_a_folder_is_in_its_place(tmp_path: Path, recalls: bool) -> None:
+    """The second one has a track of its own, in every tool that takes a place."""
+    words = [text(BEGIN + n * S, "hello") for n in range(90)]
+    for name, since, x, said in (("left", 0, 0.0, words), ("right", 5, 30.0, [])):
+        poses = [odom(BEGIN + since * S + n * S // 5, x + 9 * (n >= 150), 0.0) for n in range(400)]
+        messages = sorted([*poses, *said], key=lambda message: message.log_time)
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
+    span = {"start": BEGIN / S, "end": BEGIN / S + 90}
+    hello = {"topic": "/chatter", "condition_type": "contains", "value": "hello"}
+
+    def cells(tool: str, row: str, **given: Any) -> dict[str, Any]:
+        reply = asked(memory, tmp_path, tool, **given)
+        rows = {each[0]: each[1:] for each in reply["rows"]} | {"all": reply["all"]}
+        return dict(zip(reply["columns"][1:], rows[row], strict=True))
+
+    table = asked(memory, tmp_path, "visits")["places"]
+    assert [(row["place"], row["exits"], row["minutes"]) for row in table] == [
+        ("here", 1, 0.5),
+        ("there", 1, 0.5),
+    ]
+    for name, first in (("here", 0), ("there", 5)):
+        seen = asked(memory, tmp_path, "visits", where=name)
+        assert (seen["total"], seen["exits"], seen["minutes"]) == (1, 1, 0.5)
+        assert cells("visits", "all", where=name, by="hour")["minutes"] == 0.5
+        assert cells("visits", name, by="place")["minutes"] == 0.5
+        assert cells("visits", "all", by="hour")[f"{name}.minutes"] == 0.5
+        [found] = asked(memory, tmp_path, "find_matches", where=name, **hello)["sightings"]
+        assert (found["first_seen"] - BEGIN / S, found["count"]) == (first, 30)
+        assert cells("find_matches", name, by="place", **hello)["seconds"] == 29.8
+        assert asked(memory, tmp_path, "recap", where=name, **span)["visits"] == 1
+        later = {"with_start": BEGIN / S + 45, "with_end": BEGIN / S + 90}
+        compared = asked(memory, tmp_path, "compare", **span | {"end": BEGIN / S + 45}, **later)
+        assert compared["minutes"][name] == {"this": 0.5, "with": 0.0}
+
+
+@pytest.mark.parametrize("laps", [6, 130])
+def test_counts_of_visits_depend_on_no_limit_and_are_those_of_the_table(
+    tmp_path: Path, laps: int
+) -> None:
+    """In every second lap no pose is in the spot, but the line between two."""
+    write_mcap(
+        tmp_path / "rec/rec_0.mcap",
+        [
+            odom(BEGIN + (lap * 60 + n) * S, x, y)
+            for lap in range(laps)
+            for n in range(60)
+            for x, y in [(n - 10.0 + lap % 2 / 2, 0.0) if n < 20 else (15.0 - n / 2, 3.0)]
+        ],
+    )
+    memory = spots(memory_of(tmp_path), spot=Circle(0.5, 0.0, 0.2))
+    [row] = asked(memory, tmp_path, "visits")["places"]
+    for limit in (1, 2, 5, 60):
+        reply = asked(memory, tmp_path, "visits", where="spot", limit=limit)
+        assert (reply["total"], reply["entries"], reply["exits"], reply["minutes"]) == (
+            (row["entries"], row["entries"], row["exits"], row["minutes"])
+        )
+        assert len(reply["visits"]) == min(limit, reply["total"])
+    if laps == 6:
+        assert reply["total"] == 3
