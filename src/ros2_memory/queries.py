@@ -101,7 +101,7 @@ from ros2_memory.insights.status import (
     undecodable_topics,
     undecodable_types,
 )
-from ros2_memory.places.farthest import farthest_from
+from ros2_memory.places.driven_inside import farthest_from
 from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:

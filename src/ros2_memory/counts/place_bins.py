@@ -16,8 +16,7 @@ from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.counts.time_bins import TimeBins
 from ros2_memory.history.driven_path import resolve_path_topic
-from ros2_memory.places.pose_frames import map_placement
-from ros2_memory.places.region_visits import joined_in, placed_times, places_in
+from ros2_memory.places.pose_frames import joined_in, map_placement, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
 
 if TYPE_CHECKING:

@@ -13,8 +13,13 @@ from ros2_memory.history.coverage import unknown_times
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
-from ros2_memory.places.pose_frames import map_placement
-from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times, places_in
+from ros2_memory.places.pose_frames import (
+    WHEREABOUTS,
+    joined_in,
+    map_placement,
+    placed_times,
+    places_in,
+)
 from ros2_memory.places.visits import asked_place
 from ros2_memory.places.where import note_other_frame
 

@@ -368,11 +368,15 @@ def _newest_frame(view: View, topic: str) -> str:
 
 
 class Body(NamedTuple):
-    """The robot's body among the frames that move: `child` in `parent`, and the other frames."""
+    """The robot's body among the frames that move: `child` in `parent`, and the other frames.
+
+    `above`: the frames above it, the nearest first.
+    """
 
     parent: str
     child: str
     others: tuple[str, ...]
+    above: tuple[str, ...]
 
 
 def robot_body(view: View) -> Body | None:
@@ -390,7 +394,8 @@ def robot_body(view: View) -> Body | None:
     map_frame = view.limits.map_frame
     body = min(moving, key=lambda each: (_rank(each, map_frame), len(above[each]), each))
     root = map_frame if map_frame in above[body] else above[body][-1]
-    return Body(root, body, tuple(sorted({each for each in moving if each != body})))
+    others = sorted({each for each in moving if each != body})
+    return Body(root, body, tuple(others), tuple(above[body]))
 
 
 def _above(frame: str, parents: Mapping[str, str]) -> list[str]:

@@ -31,9 +31,10 @@ from ros2_memory.places.pose_frames import (
     MapPlacement,
     changing_origin,
     is_one_run,
+    joined_in,
     known_placement,
+    places_in,
 )
-from ros2_memory.places.region_visits import joined_in, places_in
 from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace

@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, jumps
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Line, Waypoint, drawn, mean_speed
 from ros2_memory.core.arrays import rows_of, stacked
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import yaw
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.regions import places_at
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import elapsed_in
@@ -25,19 +28,29 @@ from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, open_span
-from ros2_memory.places.farthest import farthest_from
-from ros2_memory.places.pose_frames import NEWEST_POSE_NS, newest_pose, placed_waypoints
-from ros2_memory.places.robot_tracks import Inside, robot_inside
+from ros2_memory.places.pose_frames import (
+    NEWEST_POSE_NS,
+    joined_in,
+    map_placement,
+    newest_pose,
+    placed_waypoints,
+)
+from ros2_memory.places.robot_tracks import Inside, RobotTracks, robot_inside
 from ros2_memory.places.where import joined_in_region, parse_where
-from ros2_memory.results import DrivenInside
+from ros2_memory.results import DrivenInside, FarthestPose
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.analysis.frames import Floats, Times
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import View
 
+_FARTHEST_FROM: Final = "farthest_from"
+_AROUND_NS: Final[Ns] = 10 * NS_PER_S
+_OFF_TRACK_M: Final = 0.1
+"""No pose is as far from the line of a track."""
+_MOST_TRIED: Final = 20
 _SPEED_NS: Final[Ns] = NS_PER_S
 """Over so long a speed is measured: what is shorter is noise."""
 _FEWEST_WAYPOINTS: Final = 2
@@ -180,3 +193,68 @@ def _part(line: Line, span: Inside) -> Line:
     first, last = line.at(np.array(ends[:1])), line.at(np.array(ends[1:], np.int64))
     begins = dataclasses.replace(first, jumps=np.array([True]))
     return stacked([begins, rows_of(line, inner), last])
+
+
+def farthest_from(
+    view: View,
+    value: JsonValue,
+    topic: str,
+    spans: Sequence[tuple[Ns, Ns]],
+    frame_id: str | None = None,
+) -> FarthestPose | None:
+    """Returns the pose in some times (both ends inclusive, in order) that is farthest from a point.
+
+    The point, of `value`, is in the frame of places or in `frame_id`. None where no pose could be
+    placed there.
+
+    Raises:
+        InvalidArgumentsError: `value` is no point, or the poses are not in its frame.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    place = parse_where(view.limits, value, 1.0, _FARTHEST_FROM)
+    if place.several:
+        raise InvalidArgumentsError(f"{_FARTHEST_FROM} has several places; give one, or x and y")
+    if topic != (known := resolve_path_topic(view)):
+        raise InvalidArgumentsError(f"{_FARTHEST_FROM} is measured along {known}: leave out topic")
+    frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
+    min_x, max_x, min_y, max_y = place.region.bounds
+    x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
+    if not spans:
+        return None
+    window = TimeWindow(spans[0][0], spans[-1][1] + 1)
+    track, tracks = joined_in(view, frame, window).track, RobotTracks(view, frame)
+    times, at_x, at_y = _along(track, spans)
+    off_m = np.hypot(at_x - x, at_y - y)
+    best: tuple[float, Ns, float, float] | None = None
+    for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
+        if best is not None and off_m[nth] <= best[0] - _OFF_TRACK_M:
+            break
+        at = int(times[nth])
+        first, last = next(span for span in spans if span[0] <= at <= span[1])
+        around = TimeWindow(max(first, at - _AROUND_NS), min(last, at + _AROUND_NS) + 1)
+        poses = tracks.poses(around)
+        for time, pose_x, pose_y in zip(*(part.tolist() for part in poses[:3]), strict=True):
+            away_m = math.hypot(pose_x - x, pose_y - y)
+            is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
+            if is_near and (best is None or away_m > best[0]):
+                best = away_m, time, pose_x, pose_y
+    if best is None:
+        return None
+    away_m, time, *there = best
+    inside = places_at(view.limits.places, frame, *there)
+    return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
+
+
+def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Floats, Floats]:
+    """Returns where the track was in some times: its vertices, and where each begins and ends.
+
+    Without those that the robot jumped to and from.
+    """
+    found = []
+    for first, last in spans:
+        part = cut(track, TimeWindow(first, last + 1))
+        jumped = jumps(part)
+        fine = ~(jumped & np.roll(jumped, 1))
+        found.append((part.times[fine], part.x[fine], part.y[fine]))
+    times, x, y = (np.concatenate(column) for column in zip(*found, strict=True))
+    return times, x, y

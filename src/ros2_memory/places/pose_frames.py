@@ -10,8 +10,10 @@ whenever the robot is started.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.frames import HOLD_NS
@@ -25,7 +27,8 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.geometry import multiply, transform_point, yaw
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.regions import places_at
+from ros2_memory.core.regions import Place, places_at
+from ros2_memory.core.spans import Spans, without
 from ros2_memory.core.text import abbreviate, counted
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.coverage import unix_text
@@ -43,16 +46,18 @@ from ros2_memory.history.transforms import (
     sessions_of,
     transform_at,
 )
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
 
+WHEREABOUTS: Final = "where the robot was"
+"""What is not known without poses, for sentences."""
 NEWEST_POSE_NS: Final[Ns] = SILENCE_NS
 """The robot may have moved since an older pose."""
 
@@ -211,16 +216,18 @@ class MapPlacement:
         frame_id: of the places.
         pose_frame: of the poses.
         is_map: whether the coordinates of places keep their meaning when odometry is reset.
+        above: where transforms alone place the robot, the frames above its body.
     """
 
     frame_id: str
     pose_frame: str
     is_map: bool
+    above: tuple[str, ...] = ()
 
     @property
     def frames(self) -> tuple[str, ...]:
         """The frames that positions are known in."""
-        return tuple(dict.fromkeys((self.frame_id, self.pose_frame)))
+        return tuple(dict.fromkeys((self.frame_id, self.pose_frame, *self.above)))
 
 
 def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPlacement:
@@ -232,7 +239,11 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         UndecodableError: no pose can be decoded.
     """
     frame = pose_frame(view, topic)
-    own = MapPlacement(frame, frame, frame == view.limits.map_frame)
+    body = robot_body(view) if topic in view.limits.tf_topics else None
+    above = () if body is None else body.above
+    if frame_id in above:
+        return MapPlacement(frame_id, frame, frame_id == view.limits.map_frame, above)
+    own = MapPlacement(frame, frame, frame == view.limits.map_frame, above)
     asked_for = frame_id is not None
     placement = own if frame_id == frame else _map_or_own(view, topic, own, asked_for)
     if frame_id not in (None, placement.frame_id):
@@ -262,7 +273,7 @@ def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> M
     recordings = view.timeline.recordings(topic).items()
     lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
     if any(leads(view, (target, pose_frame), among=each) for each in lending):
-        return MapPlacement(target, pose_frame, is_map=True)
+        return MapPlacement(target, pose_frame, True, own.above)
     return own
 
 
@@ -289,6 +300,63 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
             "coordinates may be another place in each"
         )
+
+
+def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
+    """Returns the robot's track in a window; a note says how far back it reaches, if not all.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    joined = RobotTracks(view, frame_id).over(window)
+    note_runs(view, resolve_path_topic(view), frame_id, window)
+    if joined.since is not None:
+        view.notes.add_lack(
+            f"visits are known back to {unix_text(joined.since)}: out of time before older "
+            "poses were placed"
+        )
+    if joined.left_out:
+        view.notes.add(f"poses that no transform places in {frame_id} are left out")
+    return joined
+
+
+def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
+    """Returns when it is known where the robot was: not at `mixed` times, which several have."""
+    starts, stops = track.pieces
+    return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
+
+
+def tracks_made(view: View, window: TimeWindow) -> Iterator[Ns]:
+    """Makes what the parts in a window say of where the robot was in the frames of places.
+
+    Yields a log time (ns) of each, the newest first.
+    """
+    with suppress(InvalidArgumentsError, NoDataError):
+        topic = resolve_path_topic(view)
+        frames = map_placement(view, topic).frames
+        yield from merge(*(RobotTracks(view, one).made(window) for one in frames), reverse=True)
+
+
+def places_in(
+    view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
+) -> list[tuple[Place, JoinedTrack]]:
+    """Returns the places of the map and of the poses' own frame, each with the track in its frame.
+
+    Notes name the others.
+
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    found: list[tuple[Place, JoinedTrack]] = []
+    for place in places:
+        if place.frame_id in placement.frames:
+            found.append((place, joined_in(view, place.frame_id, window)))
+        else:
+            view.notes.add(
+                f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
+                f"known in {' and '.join(placement.frames)}"
+            )
+    return found
 
 
 @dataclass

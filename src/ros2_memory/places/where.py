@@ -28,8 +28,13 @@ from ros2_memory.history.held_values import holds_on
 from ros2_memory.history.reverse_search import ReverseSearch, compared_frames, condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import scan
-from ros2_memory.places.pose_frames import MapPlacement, map_placement
-from ros2_memory.places.region_visits import WHEREABOUTS, joined_in, placed_times
+from ros2_memory.places.pose_frames import (
+    WHEREABOUTS,
+    MapPlacement,
+    joined_in,
+    map_placement,
+    placed_times,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

@@ -19,6 +19,7 @@ from ros2_memory.analysis.conditions import (
     at_field,
     parse_condition,
     positions,
+    refusal_for,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
 from tests.support.strategies import json_values, scalars
@@ -296,30 +297,10 @@ def test_a_field_with_positions_deeper_down_is_searched() -> None:
 # parsing
 
 
-@pytest.mark.parametrize(
-    ("kind", "value", "condition"),
-    [
-        ("contains", "mug", Condition(Contains("mug"))),
-        ("equals", True, Condition(Equals(True))),
-        ("equals", "", Condition(Equals(""))),
-        ("near_position", {"x": 1, "y": 2}, Condition(NearPosition(1.0, 2.0, None, 0.5))),
-        ("near_position", {"x": -0.5, "y": 0}, Condition(NearPosition(-0.5, 0.0, None, 0.5))),
-        ("near_position", {"x": 1, "y": 2, "z": 3}, Condition(NearPosition(1.0, 2.0, 3.0, 0.5))),
-        (
-            "near_position",
-            {"x": 1, "y": 2, "z": None},
-            Condition(NearPosition(1.0, 2.0, None, 0.5)),
-        ),
-    ],
-)
-def test_arguments_become_conditions(kind: str, value: JsonValue, condition: Condition) -> None:
-    assert parse_condition(kind, value, 0.5) == condition
-
-
-@pytest.mark.parametrize("asked", [0.5, "0.5"])
-def test_a_limit_may_stand_in_quotes(asked: JsonValue) -> None:
-    condition = parse_condition("above", asked, 0.5, "detections.score")
-    assert condition == Condition(Beyond(0.5, above=True), "detections.score")
+def test_a_limit_may_stand_in_quotes_and_a_height_be_left_out() -> None:
+    assert parse_condition("above", "0.5", 0.5, "x").test == Beyond(0.5, above=True)
+    near: JsonValue = {"x": 1, "y": -2, "z": None}
+    assert parse_condition("near_position", near, 0.5).test == NearPosition(1.0, -2.0, None, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -363,3 +344,85 @@ def test_arguments_that_mean_nothing_are_refused_with_an_example(
 def test_a_tolerance_that_is_no_distance_is_refused(tolerance_m: float) -> None:
     with pytest.raises(InvalidArgumentsError, match="tolerance"):
         parse_condition("near_position", {"x": 1, "y": 2}, tolerance_m)
+
+
+# what no value of a topic can meet
+
+ODOM: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 0.0}, "orientation": {"yaw_deg": 3.0}}
+SEEN: JsonValue = {"skill": "scene", "detections": [{"label": "cup", "point": {"x": 1, "y": 2}}]}
+NOTHING_SEEN: JsonValue = {"skill": "scene", "detections": []}
+LOG: JsonValue = {"level": 30, "msg": "x"}
+HERE: JsonValue = {"x": 1, "y": 2}
+LISTED = "position, orientation, position.x"
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "wanted", "field", "said"),
+    [
+        # A field that values have or may have.
+        *((ODOM, "equals", 1, field, None) for field in ("position", "position.x")),
+        *((SEEN, "equals", 1, f"detections.{field}", None) for field in ("label", "0.label")),
+        (NOTHING_SEEN, "equals", 1, "detections.label", None),
+        *(({"value": None}, "equals", 1, field, None) for field in ("value", "value.anything")),
+        *((ODOM, "equals", 1, f, LISTED) for f in ("data", "position.w", "pose.position", "nope")),
+        # Positions.
+        *((value, "near_position", HERE, None, None) for value in (ODOM, SEEN, NOTHING_SEEN)),
+        ({"percentage": 0.5}, "near_position", HERE, None, "no position"),
+        # A number is contained in a text, or in what a field names.
+        *((ODOM, "contains", number, None, "ask with equals") for number in (3, "3", 2.5)),
+        (ODOM, "contains", 3, "position", "ask with equals"),
+        (ODOM, "contains", 3, "position.x", None),
+        (SEEN, "contains", 3, None, None),
+        ({"data": []}, "contains", 3, None, None),
+        # A text is not asked of numbers or booleans.
+        *(
+            row
+            for kind in ("equals", "contains")
+            for row in (
+                ({"value": True}, kind, "yes", "value", "true or false"),
+                (LOG, kind, "WARN", "level", "must be a number"),
+                (LOG, kind, "WARN", None, None),
+                ({"value": None}, kind, "yes", None, None),
+                ({"value": True}, kind, "false", None, None),
+            )
+        ),
+        (ODOM, "equals", "cup", None, "must be a number"),
+        (ODOM, "contains", "cup", None, None),
+    ],
+    ids=count(),
+)
+def test_what_no_value_can_meet_is_refused_with_the_reason(
+    value: JsonValue, kind: str, wanted: JsonValue, field: str | None, said: str | None
+) -> None:
+    refused = refusal_for(parse_condition(kind, wanted, 0.5, field), value)
+    assert (refused is None) is (said is None)
+    assert said is None or said in (refused or "")
+
+
+_values = st.recursive(
+    st.none() | st.booleans() | st.integers(0, 3) | st.sampled_from(["cup", "x"]),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(st.sampled_from(["a", "b", "position", "x", "y"]), inner, max_size=3)
+    ),
+    max_leaves=8,
+)
+
+
+@given(_values, st.sampled_from(["a", "a.b", "position", "position.x", "b.0.x"]))
+def test_what_matches_is_never_refused(value: JsonValue, field: str) -> None:
+    tests: list[tuple[str, JsonValue]] = [
+        ("equals", 1),
+        ("equals", "cup"),
+        ("contains", "cup"),
+        ("contains", "1"),
+        ("contains", 2),
+        ("near_position", {"x": 1, "y": 1}),
+    ]
+    for kind, wanted in tests:
+        for condition in (
+            parse_condition(kind, wanted, 2.0, field),
+            parse_condition(kind, wanted, 2.0),
+        ):
+            if condition.matches(value):
+                assert refusal_for(condition, value) is None

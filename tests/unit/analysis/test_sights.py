@@ -61,11 +61,6 @@ def test_two_detections_of_one_message_are_never_one_spot() -> None:
     assert found.spots[:, Spot.TOGETHER].tolist() == [2, 2]
 
 
-def test_one_message_with_more_of_a_label_than_the_others_does_not_make_more_of_it() -> None:
-    found = sights_of([mug(1.0), mug(3.0)], *[[mug(1.0)]] * 5)
-    assert set(found.spots[:, Spot.TOGETHER].tolist()) == {1}
-
-
 def test_spots_that_grew_together_are_one_where_no_message_has_both() -> None:
     far_apart_at_first = [[mug(1.0)], [mug(1.8)], *[[mug(1.3)]] * 8, *[[mug(1.5)]] * 8]
     found = sights_of(*far_apart_at_first)
@@ -132,27 +127,6 @@ def test_messages_of_one_slice_of_the_clock_are_looked_at_together_and_no_others
     found = sights_of_messages(messages)
     assert found.spots[:, [Spot.SLICE, Spot.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
     assert found.looks[:, [Look.SLICE, Look.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
-
-
-def test_joined_sights_number_slices_and_name_topics_and_labels_once() -> None:
-    one = sights_of([mug(1.0), PlacedDetection("cup", (3, 0, 0))])
-    other = sights_of_messages(
-        [Message("/a", 12 * SECOND, HERE, [PlacedDetection("cup", (3, 0, 0)), mug(1.0)])]
-    )
-    both, epochs = joined_of([other, one], [1, 0])
-    assert both.topics == ("/a", "/detections")
-    assert both.labels == ("cup", "mug")
-    assert both.spots[:, Spot.SLICE].tolist() == [0, 0, 1, 1]
-    assert both.spots[:, Spot.TOPIC].tolist() == [1, 1, 0, 0]
-    assert both.spots[:, Spot.LABEL].tolist() == [0, 1, 0, 1]
-    assert both.hits[:, Hit.LOOK].tolist() == [0, 0, 1, 1]
-    assert (both.slices, epochs.tolist()) == (2, [0, 1])
-
-
-def test_one_slice_in_two_coordinate_systems_is_two() -> None:
-    both, epochs = joined_of([sights_of([mug(1.0)]), sights_of([mug(1.0)])], [0, 1])
-    assert both.spots[:, Spot.SLICE].tolist() == [0, 1]
-    assert epochs.tolist() == [0, 1]
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from itertools import count
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
-    HABIT_NS,
     LONGEST_OFF_NS,
     Presence,
     Silence,
@@ -30,36 +32,53 @@ def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Presence) -> list[Si
     return silences({f"/{name}": each for name, each in runs.items()}, [together])
 
 
-def test_a_topic_that_stops_for_a_while_is_silent_then() -> None:
-    seen = heard((0, HOUR), (3 * HOUR, 9 * HOUR))
-    assert found(odom=heard((0, 9 * HOUR)), seen=seen) == [Silence(SEEN, HOUR, 3 * HOUR, 2 * HOUR)]
+DAY = (0, 9 * HOUR)
+GAPPED = (0, 2 * HOUR), (5 * HOUR, 9 * HOUR)
+DRIVES = tuple((at * HOUR, at * HOUR + 20 * MINUTE) for at in range(9))
+SLOW = Presence(
+    ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)), {0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR
+)
+BURST = Presence(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
 
 
-def test_a_topic_that_never_returns_is_silent_up_to_the_end() -> None:
-    assert found(odom=heard((0, 9 * HOUR)), seen=heard((0, HOUR))) == [
-        Silence(SEEN, HOUR, 9 * HOUR, 8 * HOUR, goes_on=True)
-    ]
-
-
-def test_a_silence_that_the_newest_message_of_all_ends_does_not_go_on() -> None:
-    seen = heard((0, HOUR), (9 * HOUR, 9 * HOUR))
-    assert found(odom=heard((0, 9 * HOUR)), seen=seen) == [Silence(SEEN, HOUR, 9 * HOUR, 8 * HOUR)]
-
-
-def test_before_its_first_message_a_topic_was_not_there() -> None:
-    assert found(odom=heard((0, 9 * HOUR)), seen=heard((HOUR, 9 * HOUR))) == []
-
-
-def test_a_time_without_any_topic_is_a_gap_and_no_silence() -> None:
-    runs = (0, HOUR), (3 * HOUR, 9 * HOUR)
-    assert found(odom=heard(*runs), seen=heard(*runs)) == []
-
-
-def test_a_gap_inside_a_silence_does_not_count_and_does_not_part_it() -> None:
-    odom = heard((0, 2 * HOUR), (5 * HOUR, 9 * HOUR))
-    assert found(odom=odom, seen=heard((0, HOUR), (6 * HOUR, 9 * HOUR))) == [
-        Silence(SEEN, HOUR, 6 * HOUR, 2 * HOUR)
-    ]
+@pytest.mark.parametrize(
+    ("odom", "seen", "expected"),
+    [
+        (heard(DAY), heard((0, HOUR), (3 * HOUR, 9 * HOUR)), (HOUR, 3 * HOUR, 2 * HOUR)),
+        (heard(DAY), heard((0, HOUR)), (HOUR, 9 * HOUR, 8 * HOUR, True)),
+        # The newest message of all ends it.
+        (heard(DAY), heard((0, HOUR), (9 * HOUR, 9 * HOUR)), (HOUR, 9 * HOUR, 8 * HOUR)),
+        # Before its first message a topic was not there.
+        (heard(DAY), heard((HOUR, 9 * HOUR)), None),
+        # Without any topic it is a gap: it does not count, and does not part a silence.
+        (heard(*GAPPED), heard(*GAPPED), None),
+        (heard(*GAPPED), heard((0, HOUR), (6 * HOUR, 9 * HOUR)), (HOUR, 6 * HOUR, 2 * HOUR)),
+        # It begins where the robot is on again.
+        (
+            heard(*GAPPED),
+            heard((0, 2 * HOUR - S), (6 * HOUR, 9 * HOUR)),
+            (5 * HOUR, 6 * HOUR, HOUR),
+        ),
+        # Half a minute is none, nor are twenty periods.
+        (heard(DAY), heard((0, HOUR), (HOUR + 30 * S, 9 * HOUR)), None),
+        (heard(DAY), SLOW, None),
+        # What is published when something happens has no rate.
+        (heard(DAY), BURST, None),
+        # It is mostly silent by habit.
+        (heard(DAY), heard(*((at, at + 10 * MINUTE) for at, _ in DRIVES)), None),
+        # Of one that starts late each time only what is much longer counts.
+        (
+            heard(*DRIVES),
+            heard(*((first + MINUTE, last) for first, last in DRIVES if first != 5 * HOUR)),
+            (5 * HOUR, 6 * HOUR + MINUTE, 21 * MINUTE),
+        ),
+    ],
+    ids=count(),
+)
+def test_a_topic_is_silent_while_others_are_heard(
+    odom: Presence, seen: Presence, expected: tuple[int, int, int] | None
+) -> None:
+    assert found(odom=odom, seen=seen) == ([] if expected is None else [Silence(SEEN, *expected)])
 
 
 def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
@@ -77,13 +96,6 @@ def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
     assert (silence.start, silence.end, silence.length) == (80 * S, 150 * S, 41 * S)
 
 
-def test_a_silence_begins_where_the_robot_is_on_again() -> None:
-    odom = heard((0, 2 * HOUR), (5 * HOUR, 9 * HOUR))
-    assert found(odom=odom, seen=heard((0, 2 * HOUR - S), (6 * HOUR, 9 * HOUR))) == [
-        Silence(SEEN, 5 * HOUR, 6 * HOUR, HOUR)
-    ]
-
-
 def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_recorded() -> None:
     later = 9 * HOUR + LONGEST_OFF_NS
     for gap, goes_on in ((0, True), (1, False)):
@@ -94,24 +106,10 @@ def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_record
         assert [each.length for each in whole] == ([5 * HOUR] if goes_on else [])
 
 
-def test_half_a_minute_is_no_silence_nor_are_twenty_periods() -> None:
-    odom = heard((0, 9 * HOUR))
-    assert found(odom=odom, seen=heard((0, HOUR), (HOUR + 30 * S, 9 * HOUR))) == []
-    slow = Presence(
-        ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)), {0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR
-    )
-    assert found(odom=odom, seen=slow) == []
-
-
-def test_what_is_published_when_something_happens_has_no_rate() -> None:
-    burst = Presence(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
-    assert usual_period(burst) is None
-    assert found(odom=heard((0, 9 * HOUR)), seen=burst) == []
-
-
 def test_the_period_is_that_of_the_bags_around_the_median() -> None:
     spacings = {3: Spacing(1, 10 * S, 1), 0: Spacing(5, 50 * S, 500), 1: Spacing(1, 10 * S, 50)}
     assert usual_period(Presence(((0, 9 * S),), spacings, 600, 70 * S)) == S // 10
+    assert usual_period(BURST) is None
 
 
 def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
@@ -130,24 +128,10 @@ def test_one_of_many_topics_does_not_show_that_the_robot_is_on() -> None:
     assert silences(presences, [presences]) == []
 
 
-def test_a_topic_that_is_mostly_silent_is_so_by_habit() -> None:
-    drives = tuple((at * HOUR, at * HOUR + 10 * MINUTE) for at in range(9))
-    assert found(odom=heard((0, 9 * HOUR)), seen=heard(*drives)) == []
-
-
 def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
     days = tuple((at * 24 * HOUR, at * 24 * HOUR + 16 * HOUR) for at in range(5))
     nights = found(odom=heard((0, 112 * HOUR)), seen=heard(*days))
     assert [each.length for each in nights] == 4 * [8 * HOUR]
-
-
-def test_of_one_that_starts_late_each_time_only_what_is_much_longer_counts() -> None:
-    odom = tuple((at * HOUR, at * HOUR + 20 * MINUTE) for at in range(9))
-    seen = [(first + MINUTE, last) for first, last in odom if first != 5 * HOUR]
-    assert HABIT_NS > 20 * MINUTE
-    assert found(odom=heard(*odom), seen=heard(*seen)) == [
-        Silence(SEEN, 5 * HOUR, 6 * HOUR + MINUTE, 21 * MINUTE)
-    ]
 
 
 def test_a_part_of_a_silence_is_no_longer_than_its_window() -> None:

@@ -449,8 +449,20 @@ def test_by_transforms_alone_the_robot_is_what_moves_in_odometry(tmp_path: Path,
         )
     ]
     write_mcap(tmp_path / "rec/rec_0.mcap", messages)
-    found = asked(memory_of(tmp_path), tmp_path, "get_position_at", timestamp=BEGIN / S + 40)
+    memory = memory_of(tmp_path)
+    found = asked(memory, tmp_path, "get_position_at", timestamp=BEGIN / S + 40)
     assert found["x"] == pytest.approx(1.4 + 20.0, abs=0.1)
+    # It is in places of its odometry, too, as where a topic has its poses.
+    places = (Place("dock", "odom", Circle(10.0, 0.0, 1.0)), Place("hall", "map", Circle(11, 2, 1)))
+    memory = replace(memory, limits=replace(memory.limits, places=places))
+    table = asked(memory, tmp_path, "visits")["places"]
+    assert [(row["place"], row["entries"], row["minutes"]) for row in table] == [
+        ("dock", 1, 0.07),
+        ("hall", 1, 0.07),
+    ]
+    for asks in ({"where": "dock"}, {"x": 10.0, "y": 0.0, "radius_m": 1.0, "frame_id": "odom"}):
+        seen = asked(memory, tmp_path, "visits", **asks)
+        assert (seen["frame_id"], seen["total"]) == ("odom", 1)
 
 
 def test_a_frame_is_the_same_with_a_slash_and_without_one(tmp_path: Path) -> None:

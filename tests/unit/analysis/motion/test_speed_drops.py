@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import count
 
 import pytest
 from hypothesis import given
@@ -48,30 +49,24 @@ def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
 
 
 @pytest.mark.parametrize(
-    "legs",
+    "poses",
     [
-        ((5, 0.5, 0), (5, 0.4, 0), (5, 0.3, 0), (5, 0.25, 0)),  # slower, not much at a time
-        ((5, 0.5, 0), (2, 0.0, 0.8), (5, 0.5, 0)),  # to turn
-        ((5, 0.1, 0), (2, 0.0, 0), (5, 0.1, 0)),  # hardly moved
-        ((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
-        ((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
+        [],
+        driven((5, 0.5, 0), (5, 0.4, 0), (5, 0.3, 0), (5, 0.25, 0)),  # slower, not much at a time
+        driven((5, 0.5, 0), (2, 0.0, 0.8), (5, 0.5, 0)),  # to turn
+        driven((5, 0.1, 0), (2, 0.0, 0), (5, 0.1, 0)),  # hardly moved
+        driven((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
+        driven((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
+        driven((20, 0.5, 0), (20, 0.0, 0), rate=1),  # too seldom
+        [  # the position jumps back
+            (at, (x - 0.2 * (at >= BEGIN + 5.2 * S), y, z), turn)
+            for at, (x, y, z), turn in driven((10, 0.4, 0))
+        ],
     ],
+    ids=count(),
 )
-def test_what_is_no_sudden_loss_of_speed(legs: tuple[tuple[float, float, float], ...]) -> None:
-    assert found(driven(*legs)) == []
-
-
-def test_a_position_that_jumps_back_is_no_loss_of_speed() -> None:
-    poses = driven((10, 0.4, 0))
-    jumped = [
-        (at, (x - 0.2, y, z) if at >= BEGIN + 5.2 * S else (x, y, z), turn)
-        for at, (x, y, z), turn in poses
-    ]
-    assert found(jumped) == []
-
-
-def test_poses_that_come_too_seldom_show_none() -> None:
-    assert found(driven((20, 0.5, 0), (20, 0.0, 0), rate=1)) == []
+def test_what_is_no_sudden_loss_of_speed(poses: list[Pose]) -> None:
+    assert found(poses) == []
 
 
 def test_poses_without_orientation_show_some() -> None:
@@ -99,7 +94,3 @@ def test_slices_of_any_length_change_nothing(
     rows = [(at, place) for at, place, _ in poses]
     turned = posed(rows, [turn for *_, turn in poses])
     assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]
-
-
-def test_without_poses_there_is_no_drop() -> None:
-    assert speed_drops(posed([])) == ()
