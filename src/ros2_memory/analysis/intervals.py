@@ -146,14 +146,12 @@ class IntervalTable(NamedTuple):
         places = [place for place, label in enumerate(self.labels) if label in labels]
         if not places:
             return self
-        rows = _rows(self.rows)
-        return IntervalTable(self.labels, rows[~np.isin(rows["label"], places)].tobytes())
+        return self._some(~np.isin(_rows(self.rows)["label"], places))
 
     def scoring(self, least: float) -> IntervalTable:
         """Returns the intervals with a best score of so much at least, or without any."""
         best = _rows(self.rows)["best"]
-        chosen = (best == _NO_SCORE) | (best >= _stored_scores(np.array([least])))
-        return IntervalTable(self.labels, _rows(self.rows)[chosen].tobytes())
+        return self._some((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
 
     def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
         """Returns the intervals some of which is in one of these times (inclusive)."""
@@ -161,7 +159,7 @@ class IntervalTable(NamedTuple):
         chosen = np.zeros(rows.size, np.bool_)
         for start, stop in spans:
             chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
-        return IntervalTable(self.labels, rows[chosen].tobytes())
+        return self._some(chosen)
 
     def under_one_label(self, label: str) -> IntervalTable:
         """Returns the intervals of all labels under one label; these may overlap."""
@@ -171,8 +169,10 @@ class IntervalTable(NamedTuple):
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
-        rows = _rows(self.rows)
-        return IntervalTable(self.labels, rows[_by_length(rows)[:at_most]].tobytes()).intervals()
+        return self._some(_by_length(_rows(self.rows))[:at_most]).intervals()
+
+    def _some(self, which: Flags | NDArray[np.intp]) -> IntervalTable:
+        return IntervalTable(self.labels, _rows(self.rows)[which].tobytes())
 
 
 class IntervalPart(NamedTuple):

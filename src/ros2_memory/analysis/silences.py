@@ -51,12 +51,6 @@ class Spacing(NamedTuple):
     span: Ns = 0
     intervals: int = 0
 
-    def __add__(self, other: object) -> Spacing:
-        """Returns the spacing of both."""
-        if not isinstance(other, Spacing):
-            return NotImplemented
-        return Spacing(*(mine + its for mine, its in zip(self, other, strict=True)))
-
 
 class Presence(NamedTuple):
     """When some bags hold a topic, and how often.
@@ -105,7 +99,8 @@ def joined(parts: Sequence[Presence]) -> Presence:
     spacings: dict[int, Spacing] = {}
     for part in parts:
         for octave, spacing in part.spacings.items():
-            spacings[octave] = spacings.get(octave, Spacing()) + spacing
+            both = zip(spacings.get(octave, Spacing()), spacing, strict=True)
+            spacings[octave] = Spacing(*map(sum, both))
     runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
     return Presence(
         tuple(runs),

@@ -238,15 +238,21 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
         UndecodableError: no pose can be decoded.
     """
-    frame = pose_frame(view, topic)
+    target, frame = view.limits.map_frame, pose_frame(view, topic)
     body = robot_body(view) if topic in view.limits.tf_topics else None
     above = () if body is None else body.above
-    if frame_id in above:
-        return MapPlacement(frame_id, frame, frame_id == view.limits.map_frame, above)
-    own = MapPlacement(frame, frame, frame == view.limits.map_frame, above)
-    asked_for = frame_id is not None
-    placement = own if frame_id == frame else _map_or_own(view, topic, own, asked_for)
-    if frame_id not in (None, placement.frame_id):
+    if frame_id in (frame, *above):
+        return MapPlacement(frame_id, frame, frame_id == target, above)
+    # No answer is better than one that denies a frame which is asked for, since the time is over.
+    leads = connected if frame_id is None else connects
+    places_frame = frame
+    if target and target != frame and leads(view, (target, frame)):
+        recordings = view.timeline.recordings(topic).items()
+        lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
+        if any(leads(view, (target, frame), among=each) for each in lending):
+            places_frame = target
+    placement = MapPlacement(places_frame, frame, places_frame == target, above)
+    if frame_id not in (None, places_frame):
         known = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)} (as asked, or of a place), and where the robot "
@@ -261,20 +267,6 @@ def known_placement(view: View) -> MapPlacement | None:
         return map_placement(view, resolve_path_topic(view))
     except (InvalidArgumentsError, NoDataError, UndecodableError):
         return None
-
-
-def _map_or_own(view: View, topic: str, own: MapPlacement, asked_for: bool) -> MapPlacement:
-    """Returns the placement in the map, where transforms of some recording lead there."""
-    target, pose_frame = view.limits.map_frame, own.pose_frame
-    # No answer is better than one that denies a frame which is asked for, since the time is over.
-    leads = connects if asked_for else connected
-    if not target or target == pose_frame or not leads(view, (target, pose_frame)):
-        return own
-    recordings = view.timeline.recordings(topic).items()
-    lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
-    if any(leads(view, (target, pose_frame), among=each) for each in lending):
-        return MapPlacement(target, pose_frame, True, own.above)
-    return own
 
 
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:

@@ -431,8 +431,8 @@ def _joined(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
     columns = [np.concatenate(each) for each in zip(*(part[:4] for part in parts), strict=True)]
     order = np.argsort(columns[0], kind="stable")
-    times, x, y, heading = (column[order] for column in columns)
-    return Placed(times, x, y, heading, sum(part.left_out for part in parts))
+    left_out = sum(part.left_out for part in parts)
+    return Placed._make((*(column[order] for column in columns), left_out))
 
 
 def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -261,7 +262,8 @@ class RegionVisits:
         self.joined = joined_in(view, frame_id, window)
         self.elapsed = elapsed_in(view, window)
         self._region, self._window = region, window
-        self._tracks = RobotTracks(view, frame_id)
+        # What shows that a visit is one shows where it begins, too.
+        self._poses = lru_cache(2 * _MOST_TRIED)(RobotTracks(view, frame_id).poses)
         found = [
             RegionVisit(one.within(window), one, track)
             for track in self.joined.tracks
@@ -329,7 +331,7 @@ class RegionVisits:
         """
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
-        poses = self._tracks.poses(TimeWindow(first, last + 1))
+        poses = self._poses(TimeWindow(first, last + 1))
         inside = [*self._inside(*poses[:3])]
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
@@ -352,7 +354,7 @@ class RegionVisits:
             return None
         cut = exact.within(window)
         if cut != exact and not any(True for _ in self._vertices(track, cut)):
-            poses = self._tracks.poses(TimeWindow(cut.start, cut.stop + 1))
+            poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
             if not any(True for _ in self._inside(*poses[:3])):
                 return None
         inside = visit.inside._replace(entered=cut.entered, left=cut.left)
@@ -397,7 +399,7 @@ class RegionVisits:
         times = track.times
         before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
         after = min(int(np.searchsorted(times, at, side="right")), len(times) - 1)
-        return self._tracks.poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
+        return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
 
     def _closest(self, track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]:
         """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
@@ -446,5 +448,5 @@ def place_visits(found: RegionVisits, name: str) -> PlaceVisits:
         exits=len(exits),
         duration=found.duration,
         first=found.ends(entries[-1]).start if entries else None,
-        last=found.ends(exits[0]).stop if exits else None,
+        last=found.ends(max(exits, key=lambda each: each.inside.stop)).stop if exits else None,
     )

@@ -210,41 +210,40 @@ def test_near_is_within_the_tolerance_in_the_plane(
     assert near == (math.dist((x, y), (px, py)) <= tolerance_m)
 
 
-def test_height_counts_where_it_is_asked() -> None:
-    near = NearPosition(0.0, 0.0, 1.0, 0.5)
-    assert near.matches({"x": 0.0, "y": 0.0, "z": 1.4})
-    assert not near.matches({"x": 0.0, "y": 0.0, "z": 1.6})
-    assert not near.matches({"x": 0.0, "y": 0.0})
+ONE_TWO, OTHER = {"x": 1.0, "y": 2.0}, {"x": 9.0, "y": 9.0}
+BAD = (None, math.nan, math.inf)
 
 
 @pytest.mark.parametrize(
-    ("value", "is_met"),
+    ("z", "field", "value", "is_met"),
     [
-        ({"position": {"x": 1.0, "y": 2.0}}, True),
-        ({"pose": {"pose": {"position": {"x": 1.0, "y": 2.0, "z": 0.0}}}}, True),
-        ({"transforms": [{"transform": {"translation": {"x": 1.0, "y": 2.0}}}]}, True),
-        ([{"x": 9.0, "y": 9.0}, {"x": 1.0, "y": 2.0}], True),
-        ({"position": [{"x": 9.0, "y": 9.0}, {"x": 1.0, "y": 2.0}]}, True),
-        (SCENE, True),
-        ({"linear_velocity": {"x": 1.0, "y": 2.0}}, False),
-        ({"twist": {"linear": {"x": 1.0, "y": 2.0, "z": 0.0}}}, False),
-        ({"position": [1.0, 2.0]}, False),
-        ({"position": {"x": "1", "y": "2"}}, False),
-        ({"position": {"x": True, "y": 2.0}}, False),
-        ("1.0 2.0", False),
-        (None, False),
+        (None, None, {"position": ONE_TWO}, True),
+        (None, None, {"pose": {"pose": {"position": {**ONE_TWO, "z": 0.0}}}}, True),
+        (None, None, {"transforms": [{"transform": {"translation": ONE_TWO}}]}, True),
+        (None, None, [OTHER, ONE_TWO], True),
+        (None, None, {"position": [OTHER, ONE_TWO]}, True),
+        (None, None, SCENE, True),
+        (None, "detections", SCENE, True),
+        (None, "detections.1", SCENE, False),
+        # A velocity is none, unless a field names it.
+        (None, None, {"linear_velocity": ONE_TWO}, False),
+        (None, None, {"twist": {"linear": {**ONE_TWO, "z": 0.0}}}, False),
+        (None, "linear", {"linear": ONE_TWO, "position": OTHER}, True),
+        (None, "linear", {"linear": OTHER, "position": ONE_TWO}, False),
+        *((None, None, {"position": each}, False) for each in ([1.0, 2.0], {"x": "1", "y": "2"})),
+        *((None, None, each, False) for each in ({"position": {"x": True, "y": 2.0}}, "1 2", None)),
+        # Without a coordinate that is asked it is near nothing.
+        *((None, None, {"position": {"x": bad, "y": 2.0}}, False) for bad in BAD),
+        *((1.0, None, {**ONE_TWO, "z": bad}, False) for bad in BAD),
+        (1.0, None, ONE_TWO, False),
+        *((1.0, None, {**ONE_TWO, "z": z}, is_near) for z, is_near in ((1.4, True), (1.6, False))),
     ],
+    ids=count(),
 )
 def test_positions_are_found_under_the_keys_that_hold_places(
-    value: JsonValue, is_met: bool
+    z: float | None, field: str | None, value: JsonValue, is_met: bool
 ) -> None:
-    assert NearPosition(1.0, 2.0, None, 0.01).matches(value) is is_met
-
-
-@pytest.mark.parametrize("bad", [None, math.nan, math.inf])
-def test_a_position_without_a_coordinate_is_near_nothing(bad: JsonValue) -> None:
-    assert not NearPosition(0.0, 0.0, None, 1e9).matches({"position": {"x": bad, "y": 0.0}})
-    assert not NearPosition(0.0, 0.0, 0.0, 1e9).matches({"x": 0.0, "y": 0.0, "z": bad})
+    assert Condition(NearPosition(1.0, 2.0, z, 0.5), field).matches(value) is is_met
 
 
 def test_a_value_that_is_a_position_is_not_searched_for_others() -> None:
@@ -281,17 +280,6 @@ def test_a_field_narrows_a_condition_to_its_targets(leaf: JsonValue) -> None:
     value: JsonValue = {"x": leaf, "label": "the label"}
     assert Condition(Contains("label"), "label").matches(value)
     assert not Condition(Contains("label"), "x").matches(value)
-
-
-def test_a_field_that_names_a_velocity_is_taken_at_its_word() -> None:
-    value: JsonValue = {"linear": {"x": 1.0, "y": 2.0}, "position": {"x": 0.0, "y": 0.0}}
-    assert Condition(NearPosition(1.0, 2.0, None, 0.1), "linear").matches(value)
-    assert not Condition(NearPosition(0.0, 0.0, None, 0.1), "linear").matches(value)
-
-
-def test_a_field_with_positions_deeper_down_is_searched() -> None:
-    assert Condition(NearPosition(4.0, -1.0, None, 0.1), "detections").matches(SCENE)
-    assert not Condition(NearPosition(4.0, -1.0, None, 0.1), "detections.0").matches(SCENE)
 
 
 # parsing

@@ -6,6 +6,7 @@ What is expected is counted from the drawn world itself, second by second.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -200,6 +201,9 @@ def test_compare_has_the_minutes_in_each_and_recap_what_happened_in_any(
         ({"hall": {"z": 1}}, 'where: "hall" has no "z"; give'),
         ({"x": 1, "y": 2, "radius": 3}, 'where has no "radius"; give'),
         ({f"p{nth}": {"x": nth, "y": 0, "radius_m": 1} for nth in range(31)}, "more than 30"),
+        ({"x": [1, 0], "y": [0, 1]}, "not a range"),
+        ({"x": [0, 1], "y": [0, 1], "radius_m": 1}, "radius_m and a range"),
+        (5, "where was 5; give the name"),
     ],
 )
 def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
@@ -208,6 +212,24 @@ def test_what_is_no_place_is_named_with_the_reason_and_what_to_do(
     reply = asked(memory, folder, "visits", where=where)
     assert reply["error"] == "invalid_arguments"
     assert said in reply["detail"]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"where": "hall", "x": 1.0}, "give either"),
+        ({"x": 1.0}, "both"),
+        ({"where": "hall", "frame_id": "moon"}, None),
+        ({"x": 1.0, "y": 1.0, "frame_id": "moon"}, 'frame_id was "moon"'),
+        *(({"x": 0, "y": 0, "radius_m": each}, "radius_m") for each in (0.0, -1.0, math.inf)),
+    ],
+)
+def test_a_place_is_named_once_and_in_a_frame_of_the_robot(
+    memory: Memory, folder: Path, given: dict[str, Any], said: str | None
+) -> None:
+    reply = asked(memory, folder, "visits", **given)
+    assert (said is None) == ("error" not in reply)
+    assert said is None or said in reply["detail"]
 
 
 def test_places_of_two_frames_are_refused(memory: Memory, folder: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track
+from ros2_memory.analysis.motion.robot_track import RobotTrack
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Rectangle
 from ros2_memory.places.two_paths import (
@@ -90,12 +90,6 @@ def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap()
     assert across.away_m == 2.5
 
 
-def test_without_a_way_there_is_nothing_to_be_far_from() -> None:
-    way = track([(0.0, 0.0, 0.0), (10.0, 10.0, 0.0)])
-    assert farthest_apart((way, EVER), (empty_track(), EVER)) == (None, None)
-    assert [*placed_standstills(empty_track(), [(0, S)])] == []
-
-
 def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:
     way = track([(0.0, 1.0, 2.0), (20.0, 1.0, 2.0)], [(100.0, 7.0, 2.0), (120.0, 7.0, 2.0)])
     spans = [(2 * S, 18 * S), (50 * S, 70 * S), (105 * S, 115 * S)]
@@ -130,9 +124,3 @@ def test_every_standstill_is_of_one_place_and_near_to_it(
             assert min(math.dist((at.x, at.y), (each.x, each.y)) for at in found) <= 0.5
     assert {(at.x, at.y) for at in found} <= {(each.x, each.y) for each in (*one, *two)}
     assert [at.durations for at in stood_at(two, one)] == [at.durations[::-1] for at in found]
-
-
-def test_standstills_at_one_place_add_up_and_have_the_first_time() -> None:
-    here, again = PlacedStandstill(1.0, 1.0, 50, 10), PlacedStandstill(1.2, 1.1, 5, 7)
-    [at] = stood_at([here, again], [])
-    assert (at.durations, at.since) == ((17, 0), (5, None))

@@ -75,18 +75,6 @@ def cells(reply: Any) -> dict[str, Any]:
     return dict(zip(reply["columns"][1:], reply["all"], strict=True))
 
 
-@each_way
-def test_visits_say_for_how_long_no_pose_is_known(tmp_path: Path, stored: bool) -> None:
-    memory = world(tmp_path, life(220, {"/odom": [(60, 160)]}), stored=stored)
-    never = asked(memory, tmp_path, "visits", **FAR)
-    assert (never["total"], never["unknown_s"]) == (0, pytest.approx(100.2))
-    twice = asked(memory, tmp_path, "visits", **HERE)
-    assert (twice["total"], twice["unknown_s"]) == (2, pytest.approx(100.2))
-    table = cells(asked(memory, tmp_path, "visits", **FAR, by="day"))
-    assert (table["entries"], table["unknown_s"]) == (0, pytest.approx(100.2, abs=0.06))
-    assert table["placed_s"] + table["unknown_s"] == pytest.approx(table["recorded_s"], abs=0.2)
-
-
 def test_a_window_without_any_pose_says_that_all_of_it_is_unknown(tmp_path: Path) -> None:
     memory = world(tmp_path, life(220, {"/odom": [(60, 160)], "/mood": [(60, 160)]}))
     window = {"start": T0 + 80, "end": T0 + 120}

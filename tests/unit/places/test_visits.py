@@ -16,11 +16,9 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
-    QueryTimeoutError,
     UndecodableError,
 )
 from ros2_memory.core.regions import Circle, Place
-from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
@@ -162,14 +160,6 @@ def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> 
     assert len(spans(memory, 0.0, radius_m=1.0)) == 2
 
 
-def test_the_newest_visits_come_first_and_more_are_counted(tmp_path: Path) -> None:
-    there_and_back = [leg for _ in range(4) for leg in ((10, 1.0), (10, -1.0))]
-    memory = remembering(tmp_path, line(*there_and_back))
-    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0, limit=2)
-    assert (answer.more, answer.total, answer.notes) == (True, 4, ())
-    assert [round(((each.arrived or 0) - BEGIN) / S) for each in answer.visits] == [69, 49]
-
-
 def test_visits_of_before_a_restart_of_odometry_are_marked_and_not_mixed(tmp_path: Path) -> None:
     first = line((10, 0.0), (20, 0.5))
     second = line((10, 0.0), (20, 0.5), begin=1000.0)
@@ -242,29 +232,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
         assert not any("were taken in" in note for note in found.notes)
 
 
-@pytest.mark.parametrize("radius", [0.0, -1.0, math.inf, math.nan])
-def test_a_radius_must_be_a_length(tmp_path: Path, radius: float) -> None:
-    memory = remembering(tmp_path, line((5, 0.5)))
-    with pytest.raises(InvalidArgumentsError, match="radius_m"):
-        visits(memory, Call(), 0.0, 0.0, radius_m=radius)
-
-
-def test_a_visit_whose_search_runs_out_of_time_has_no_arrival(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, line((100, 0.003)))
-    outcomes = set()
-    for looks in range(1, 120):
-        call = Call(Deadline.after(looks, iter(range(100_000)).__next__))
-        try:
-            answer = visits(memory, call, 0.0, 0.0, radius_m=0.28)
-        except QueryTimeoutError:
-            continue
-        for visit in answer.visits:
-            outcomes.add(visit.arrived is None)
-            assert (visit.arrived is None) == any("out of time" in note for note in answer.notes)
-    assert False in outcomes
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
@@ -303,7 +271,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
         )
 
 
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
 @example(seed=2013, split_s=5.0)
 @example(seed=7197, split_s=5.0)

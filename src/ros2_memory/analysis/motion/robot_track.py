@@ -108,28 +108,14 @@ class TrackPart(NamedTuple):
 
     def some(self, index: NDArray[np.intp]) -> TrackPart:
         """Returns some vertices of it, in the order given."""
-        return self._replace(
-            times=self.times[index],
-            x=self.x[index],
-            y=self.y[index],
-            turns=self.turns[index],
-            known=self.known[index],
-            settled=self.settled[index],
-        )
+        return TrackPart._make((*(column[index] for column in self[:6]), *self[6:]))
 
 
 def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
     """Returns the vertices of some parts, one at least, in their order; as of the first one."""
-    return TrackPart(
-        np.concatenate([part.times for part in parts]),
-        np.concatenate([part.x for part in parts]),
-        np.concatenate([part.y for part in parts]),
-        np.concatenate([part.turns for part in parts]),
-        np.concatenate([part.known for part in parts]),
-        np.concatenate([part.settled for part in parts]),
-        sum(part.left_out for part in parts),
-        parts[0].recording,
-    )
+    columns = map(np.concatenate, zip(*(part[:6] for part in parts), strict=True))
+    left_out = sum(part.left_out for part in parts)
+    return TrackPart._make((*columns, left_out, parts[0].recording))
 
 
 def empty_track() -> RobotTrack:
