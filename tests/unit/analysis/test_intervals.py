@@ -13,7 +13,6 @@ from ros2_memory.analysis.intervals import (
     FLICKER_NS,
     SILENCE_NS,
     IntervalPart,
-    IntervalTable,
     VisibleInterval,
     joined,
     united,
@@ -126,12 +125,6 @@ def test_of_several_topics_a_thing_is_in_view_while_one_of_them_has_it(
             assert own[at].first <= one.first
 
 
-def test_what_lasted_longest_comes_first_and_of_equals_the_earliest() -> None:
-    seen = watched([(0, ("b", "a")), (NS_PER_S, ("a",)), (20 * NS_PER_S, ("c",))]).visible
-    assert [each.label for each in seen.longest(3)] == ["a", "b", "c"]
-    assert [each.label for each in seen.longest(1)] == ["a"]
-
-
 def test_the_longest_intervals_remain_in_order_with_the_labels_that_they_need() -> None:
     late = 40 * NS_PER_S
     seen = watched(
@@ -200,13 +193,6 @@ def test_no_thing_is_seen_throughout_a_time_in_which_it_is_missed_for_long(
         usual = (times[-1] - times[0]) / max(1, len(times) - 1)
         edges = [start, *times, end]
         assert max(b - a for a, b in pairwise(edges)) <= max(NS_PER_S, 3 * usual)
-
-
-def test_nothing_seen_is_joined_to_nothing_seen() -> None:
-    nothing = watched([(0, ())])
-    assert joined([nothing, watched([(1, ())])]) == IntervalPart(0, 1, IntervalTable())
-    assert united([]) == IntervalTable()
-    assert IntervalTable().longest(3) == ()
 
 
 def test_times_at_either_end_of_the_range_are_far_apart() -> None:

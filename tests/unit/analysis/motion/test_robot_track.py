@@ -16,7 +16,6 @@ from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_RAD,
     RobotTrack,
     TrackPart,
-    empty_track,
     joined_parts,
     thinned,
     track_by,
@@ -135,11 +134,6 @@ def test_poses_that_are_no_place_are_left_out() -> None:
     times = np.arange(4, dtype=np.int64) * S + START
     x = np.array([0.0, np.nan, 1e9, 1.0])
     assert track_of(times, x, np.zeros(4), np.zeros(4)).x.tolist() == [0.0, 1.0]
-
-
-def test_without_a_pose_there_is_no_track() -> None:
-    assert not len(empty_track().times)
-    assert not len(track_by(*joined_parts([])).times)
 
 
 def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None:
