@@ -6,13 +6,13 @@ start again between the two.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
+from ros2_memory.core.arrays import Groups, distinct_rows
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -143,13 +143,9 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
     """Returns the first point in each cell of a grid as fine as leaves few of them."""
     size = _STEP_M
     while True:
-        cells = np.floor(points / size).astype(np.int64)
-        # As `np.unique` by rows, which takes several times as long.
-        order = np.lexsort((cells[:, 1], cells[:, 0]))
-        row = cells[order]
-        first = order[np.append([True], (row[1:] != row[:-1]).any(axis=1))]
+        x, y = np.floor(points / size).astype(np.int64).T
+        first = np.sort(Groups.of(distinct_rows((x, y))[1]).firsts)
         if len(first) <= _MOST_CELLS:
-            first.sort()
             return points[first], times[first]
         size *= 2
 
@@ -212,31 +208,21 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
     """
     every = [(0, each) for each in this] + [(1, each) for each in other]
     every.sort(key=lambda each: (-each[1].duration, each[1]))
-    middles: list[PlacedStandstill] = []
-    in_cell: dict[tuple[int, int], list[int]] = {}
+    middles = np.empty((len(every), 2))
     sums: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
     for side, stand in every:
-        column, row = int(stand.x // SAME_STAND_M), int(stand.y // SAME_STAND_M)
-        away, nth = min(
-            (
-                ((middles[one].x - stand.x) ** 2 + (middles[one].y - stand.y) ** 2, one)
-                for x in (column - 1, column, column + 1)
-                for y in (row - 1, row, row + 1)
-                for one in in_cell.get((x, y), ())
-            ),
-            default=(math.inf, 0),
-        )
-        if away > SAME_STAND_M**2:
-            nth = len(middles)
-            in_cell.setdefault((column, row), []).append(nth)
-            middles.append(stand)
+        count = len(sums)
+        away = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
+        nth = int(away.argmin()) if (away <= SAME_STAND_M**2).any() else count
+        if nth == count:
+            middles[nth] = stand.x, stand.y
             sums.append([0, 0])
             since.append([None, None])
         sums[nth][side] += stand.duration
         known = since[nth][side]
         since[nth][side] = stand.start if known is None else min(known, stand.start)
     return [
-        StoodAt(middle.x, middle.y, (both[0], both[1]), (first[0], first[1]))
-        for middle, both, first in zip(middles, sums, since, strict=True)
+        StoodAt(x, y, (both[0], both[1]), (first[0], first[1]))
+        for (x, y), both, first in zip(middles[: len(sums)].tolist(), sums, since, strict=True)
     ]

@@ -19,7 +19,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS, pieces_of
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import AnyOf, Circle, Place, Rectangle, Region
-from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.spans import Spans, lies_inside, united, without
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unknown_times
@@ -292,12 +292,12 @@ class Scope:
     ) -> None:
         self.window = window
         self.unknown: Spans = []
-        self._inside: list[tuple[Ns, Ns]] | None = None
+        self._inside: Spans | None = None
         if where is not None:
             region = parse_where(view.limits, where)
             joined = joined_in_region(view, region, window)
             inside = joined.inside(region.region, window)
-            self._inside = united((each.start, each.stop) for each in inside)
+            self._inside = united((each.start, each.stop + 1) for each in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)
             known = placed_times(joined.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
@@ -323,16 +323,14 @@ class Scope:
             yield self.window
             return
         for start, stop in reversed(self._inside):
-            part = self.window.intersect(TimeWindow(start, stop + 1))
+            part = self.window.intersect(TimeWindow(start, stop))
             if not part.empty:
                 yield part
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether a match at a moment counts."""
-        if self._inside is not None:
-            number = bisect_right(self._inside, time, key=lambda each: each[0])
-            if not number or time > self._inside[number - 1][1]:
-                return False
+        if self._inside is not None and not lies_inside(self._inside, time):
+            return False
         return all(state.holds_at(time) for state in self._states)
 
 
@@ -442,6 +440,5 @@ def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
             every = scan(view, topic, window, columns=False, within=united(within))
             spans += [pieces_of(rows.times, rows.times) for rows in every]
     starts, stops = (np.concatenate(some) for some in zip(*spans, strict=True))
-    order = np.argsort(starts, kind="stable")
-    starts, stops = pieces_of(starts[order], stops[order])
+    starts, stops = pieces_of(starts, stops)
     return list(zip(starts.tolist(), (stops + 1).tolist(), strict=True))
