@@ -161,6 +161,18 @@ def write_mcap(
     return path
 
 
+def write_splits(
+    bag_dir: Path, messages: Iterable[Msg], split_s: float = 10.0, name: str = "rec"
+) -> None:
+    """Writes a recording in splits of so many seconds, numbered from 1,784,000,000 s on."""
+    splits: dict[int, list[Msg]] = {}
+    for each in sorted(messages, key=lambda each: each.log_time):
+        number = int((each.log_time / 1e9 - 1_784_000_000) // split_s)
+        splits.setdefault(number, []).append(each)
+    for number, some in splits.items():
+        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some)
+
+
 def write_db3(
     path: Path,
     messages: Iterable[Msg],

@@ -400,7 +400,7 @@ class Notes:
     def __init__(self) -> None:
         self.complete = True
         self.added = 0
-        self._order: dict[str | Reason, None] = {}
+        self._sentences: dict[str, None] = {}
         self._notes: dict[NoteKey, Note] = {}
         self._remarks: dict[str, tuple[str, ...]] = {}
 
@@ -408,10 +408,9 @@ class Notes:
         """Adds sentences, or notes that share one with others of their kind."""
         for note in notes:
             if isinstance(note, str):
-                self._order.setdefault(note)
+                self._sentences.setdefault(note)
                 continue
             self.added += 1
-            self._order.setdefault(note.kind)
             known = self._notes.get((note.kind, note.file), note)
             newest = note if known.until < note.until else known
             since = min(known.since, note.since)
@@ -435,20 +434,18 @@ class Notes:
             self.complete = self.complete and before
 
     def sentences(self) -> tuple[str, ...]:
-        """Returns the sentences for the reply, in the order in which each was first needed."""
+        """Returns the sentences for the reply: those that files share, then the others as added.
+
+        Which file is read first, and for what, depends on which bags are stored, and the reply must
+        not: so the shared ones are sorted.
+        """
         by_kind: dict[Reason, dict[str, str]] = {}
         for note in self._notes.values():
             # A sentence on the bag's summary may report the same already.
             if note.detail not in self._remarks.get(note.file, ()):
                 by_kind.setdefault(note.kind, {})[note.file] = note.detail
-        # The order in which damaged bags are found depends on which bags are stored, and the reply
-        # must not: so these sentences are sorted.
-        shared = iter(sorted(kind.sentence(files) for kind, files in by_kind.items()))
-        return tuple(
-            each if isinstance(each, str) else next(shared)
-            for each in self._order
-            if isinstance(each, str) or each in by_kind
-        )
+        shared = sorted(kind.sentence(files) for kind, files in by_kind.items())
+        return (*shared, *self._sentences)
 
     def add_remarks(self, bags: Iterable[BagFile]) -> None:
         """Records that sentences already have what the summaries of these bags remark."""

@@ -23,7 +23,7 @@ from tests.support.bags import (
     point,
     tf,
     transform,
-    write_mcap,
+    write_splits,
 )
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, replied
@@ -89,14 +89,6 @@ def base(at: int, x: float, y: float, yaw: float) -> object:
     return transform(at, "odom", "base_link", (x, y, 0.0), yaw)
 
 
-def write(bag_dir: Path, messages: Sequence[Msg], split_s: float = 10.0, name: str = "rec") -> None:
-    splits: dict[int, list[Msg]] = {}
-    for each in messages:
-        splits.setdefault(int((each.log_time / S - BEGIN) // split_s), []).append(each)
-    for number, some in splits.items():
-        write_mcap(bag_dir / name / f"{name}_{number}.mcap", some)
-
-
 HERE = (1.0, 0.0, 0.0)
 AWAY = (1.0, 0.0, math.pi)
 
@@ -111,7 +103,7 @@ def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: object) -> Any:
 
 
 def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     table = Place("table", "map", Circle(3.0, 0.0, 1.0))
     reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
     [mug] = reply["things"]
@@ -119,7 +111,7 @@ def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
 
 
 def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     reply = ask(tmp_path, label="coffee mug")
     [mug] = reply["things"]
     assert reply["frame_id"] == "map"
@@ -136,7 +128,7 @@ def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path
 
 
 def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> None:
-    write(tmp_path, [each for each in looked(0, 3, HERE) if "vision" not in each.topic])
+    write_splits(tmp_path, [each for each in looked(0, 3, HERE) if "vision" not in each.topic])
     reply = ask(tmp_path)
     assert (reply["things"], len(reply["notes"])) == ([], 1)
     assert "there is no message of a detector" in reply["notes"][0]
@@ -144,20 +136,20 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
 
 
 def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 3, HERE))
+    write_splits(tmp_path, looked(0, 3, HERE))
     assert "notes" not in ask(tmp_path)
 
 
 def test_chairs_are_counted(tmp_path: Path) -> None:
     chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
-    write(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
+    write_splits(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
     assert ask(tmp_path, label="Chairs")["total"] == 3
     assert ask(tmp_path)["labels"] == {"chair": 3, "table": 1}
 
 
 def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
     beside, one = ("chair", 3.0, 0.4), ("chair", 3.0, 0.0)
-    write(tmp_path / "two", looked(0, 30, HERE, one, beside))
+    write_splits(tmp_path / "two", looked(0, 30, HERE, one, beside))
     reply = ask(tmp_path / "two", label="chair")
     assert (reply["total"], reply["labels"]) == (2, {"chair": 2})
     [chairs] = reply["things"]
@@ -169,7 +161,7 @@ def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path
         for at in range(30)
         for message in scene(at, HERE, [one, beside] if at in {5, 16, 17, 18} else [one])
     ]
-    write(tmp_path / "double", now_and_then)
+    write_splits(tmp_path / "double", now_and_then)
     reply = ask(tmp_path / "double", label="chair")
     assert reply["total"] == 1
     assert "at_once" not in reply["things"][0]
@@ -183,7 +175,7 @@ def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
         *looked(30, 40, HERE),
         *looked(40, 60, AWAY, moved),
     ]
-    write(tmp_path, messages)
+    write_splits(tmp_path, messages)
     [thing] = ask(tmp_path, label="mug")["things"]
     assert thing["moved_times"] == 1
     assert thing["moved"] == [
@@ -202,10 +194,10 @@ def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
 def test_a_thing_that_was_taken_away_and_brought_back_has_its_place_twice(tmp_path: Path) -> None:
     mug = ("mug", 3.0, 0.5)
     away = [*looked(0, 20, HERE, mug), *looked(30, 50, AWAY), *looked(60, 80, HERE, mug)]
-    write(tmp_path / "unseen", away)
+    write_splits(tmp_path / "unseen", away)
     assert "moved" not in ask(tmp_path / "unseen", label="mug")["things"][0]
     missed = [*looked(0, 20, HERE, mug), *looked(30, 50, HERE), *looked(60, 80, HERE, mug)]
-    write(tmp_path / "missed", missed)
+    write_splits(tmp_path / "missed", missed)
     [thing] = ask(tmp_path / "missed", label="mug")["things"]
     assert [(each["from"], each["to"]) for each in thing["moved"]] == [
         (BEGIN, BEGIN + 19),
@@ -222,17 +214,17 @@ def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
 ) -> None:
     mug = ("mug", 3.0, 0.5)
     seen = looked(0, 20, HERE, mug)
-    write(tmp_path / "away", [*seen, *looked(20, 60, AWAY)])
+    write_splits(tmp_path / "away", [*seen, *looked(20, 60, AWAY)])
     [thing] = ask(tmp_path / "away", label="mug")["things"]
     assert thing["still_there"] == {"not_looked_at_since": BEGIN + 19}
-    write(tmp_path / "missed", [*seen, *looked(20, 60, HERE)])
+    write_splits(tmp_path / "missed", [*seen, *looked(20, 60, HERE)])
     [thing] = ask(tmp_path / "missed", label="mug")["things"]
     # Two looks in ten seconds of the clock, which count as a whole.
     assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
 
 
 def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)))
     [thing] = ask(tmp_path, label="mug", end=BEGIN + 25)["things"]
     assert thing["still_there"] == {"seen_since": BEGIN + 59}
     assert thing["last_seen"] == BEGIN + 29  # ten seconds count as a whole
@@ -252,7 +244,7 @@ LATER: list[list[Seen]] = [
 def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[Seen]) -> None:
     before = [("mug", 3.0, 0.5), ("chair", 4.0, -1.0)]
     side = (3.0, -3.0, math.pi / 2)
-    write(tmp_path, [*looked(0, 20, HERE, *before), *looked(20, 40, side, *before)])
+    write_splits(tmp_path, [*looked(0, 20, HERE, *before), *looked(20, 40, side, *before)])
     windows = {"start": BEGIN + 20, "end": BEGIN + 39, "with_start": BEGIN, "with_end": BEGIN + 19}
     questions = {"find_things": {"start": BEGIN, "end": BEGIN + 39}, "compare": windows}
 
@@ -265,7 +257,7 @@ def test_what_is_said_of_a_past_window_stays_said(tmp_path: Path, seen: list[See
         [*looked(at, at + 20, HERE, *seen), *looked(at + 20, at + 40, side, *seen)]
         for at in range(86_400, 5 * 86_400, 86_400)
     ]
-    write(tmp_path, [message for day in days for message in day], name="later")
+    write_splits(tmp_path, [message for day in days for message in day], name="later")
     now = answers()
     since = {thing["label"]: thing.pop("still_there") for thing in now["find_things"]["things"]}
     assert all(thing.pop("still_there") for thing in then["find_things"]["things"])
@@ -285,7 +277,7 @@ def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
         for at in range(30)
         for message in scene(at, HERE, [("person", 2.0 + at * 0.3, 0.0), ("person", 3.0, 1.0)])
     ]
-    write(tmp_path, walk)
+    write_splits(tmp_path, walk)
     [people] = ask(tmp_path, label="people")["things"]
     assert people["moves"] is True
     assert people["at_once"] == 2
@@ -293,12 +285,12 @@ def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
 
 
 def test_a_score_that_no_thing_can_have_is_refused(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     assert "from 0 to 1" in ask(tmp_path, label="mug", min_score=60)["detail"]
 
 
 def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 20, HERE, ("headphones", 3.0, 0.5)))
     reply = ask(tmp_path, label="phone")
     assert reply["things"] == []
     near = "there are: headphones; did you mean headphones?"
@@ -307,14 +299,18 @@ def test_an_unknown_label_is_answered_with_those_that_there_are(tmp_path: Path) 
 
 def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:
     at = BEGIN * S
-    write(tmp_path, [detections(at + nth * S, ["mug"], at=(0.0, 0.0, 0.0)) for nth in range(5)])
+    write_splits(
+        tmp_path, [detections(at + nth * S, ["mug"], at=(0.0, 0.0, 0.0)) for nth in range(5)]
+    )
     reply = ask(tmp_path, label="mug")
     assert reply["total"] == 0
     assert reply["notes"][0] == "5 detections of it could not be placed, and are left out"
 
 
 def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5), ("book", 3.0, -1.0), ("cup", 4.0, 2.0)))
+    write_splits(
+        tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5), ("book", 3.0, -1.0), ("cup", 4.0, 2.0))
+    )
     reply = ask(tmp_path, label=["mug", "Book", "keys"])
     assert sorted(each["label"] for each in reply["things"]) == ["book", "mug"]
     assert (reply["total"], reply["labels"]) == (2, {"book": 1, "mug": 1})
@@ -345,7 +341,7 @@ PLAIN = QuerySettings()
 def test_two_labels_that_a_detector_gives_to_one_thing_are_one_row(
     tmp_path: Path, short: str, long: str
 ) -> None:
-    write(tmp_path, alternating(short, long, short) + looked(40, 50, AWAY))
+    write_splits(tmp_path, alternating(short, long, short) + looked(40, 50, AWAY))
     for label in (short, long, None):
         reply = ask(tmp_path, PLAIN, **({} if label is None else {"label": label}))
         [thing] = reply["things"]
@@ -356,7 +352,7 @@ def test_two_labels_that_a_detector_gives_to_one_thing_are_one_row(
 
 
 def test_labels_that_the_owner_lists_apart_are_two_things(tmp_path: Path) -> None:
-    write(tmp_path, alternating("mug", "coffee mug"))
+    write_splits(tmp_path, alternating("mug", "coffee mug"))
     apart = QuerySettings(labels={"mug": [], "coffee mug": []})
     assert ask(tmp_path, apart)["labels"] == {"coffee mug": 1, "mug": 1}
 
@@ -368,7 +364,7 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
         *looked(40, 60, HERE),
         *alternating("red mug", "mug", y=-1.5, begin=60),
     ]
-    write(tmp_path / "moved", moved)
+    write_splits(tmp_path / "moved", moved)
     apart = QuerySettings(labels={"coffee mug": [], "red mug": []})
     reply = ask(tmp_path / "moved", apart)
     assert reply["labels"].keys() == {"coffee mug", "mug", "red mug"}
@@ -380,19 +376,19 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("other", ["dog bed", "mugshot", "cup"])
 def test_labels_that_end_in_another_word_are_two_things(tmp_path: Path, other: str) -> None:
-    write(tmp_path, alternating("coffee mug", other))
+    write_splits(tmp_path, alternating("coffee mug", other))
     assert ask(tmp_path, PLAIN)["labels"] == dict.fromkeys(sorted(["coffee mug", other]), 1)
 
 
 def test_labels_that_one_message_has_both_of_are_two_things(tmp_path: Path) -> None:
     both = [("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)]
-    write(tmp_path, looked(0, 20, HERE, *both) + looked(20, 30, HERE, both[0]))
+    write_splits(tmp_path, looked(0, 20, HERE, *both) + looked(20, 30, HERE, both[0]))
     assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
 
 
 def test_a_thing_that_another_took_the_place_of_is_another_thing(tmp_path: Path) -> None:
     mug, other = ("mug", 3.0, 0.5), ("coffee mug", 3.0, 0.5)
-    write(tmp_path, looked(0, 30, HERE, mug) + looked(30, 60, HERE, other))
+    write_splits(tmp_path, looked(0, 30, HERE, mug) + looked(30, 60, HERE, other))
     assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
 
 
@@ -400,7 +396,7 @@ def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -
     messages = [
         message for at in range(20) for message in scene(at, HERE, [("mug", 3.0, 0.5)], score=0.3)
     ]
-    write(tmp_path, messages + looked(20, 40, HERE, ("cup", 3.0, 0.5)))
+    write_splits(tmp_path, messages + looked(20, 40, HERE, ("cup", 3.0, 0.5)))
     strict = QuerySettings(min_score=0.5)
     reply = ask(tmp_path, strict)
     assert reply["labels"] == {"cup": 1}
@@ -417,7 +413,7 @@ def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -
 def test_labels_without_a_place_are_named(tmp_path: Path) -> None:
     at = BEGIN * S
     lost = [detections(at + nth * S, ["Scissors (open)"], at=(0.0, 0.0, 0.0)) for nth in range(5)]
-    write(tmp_path, lost)
+    write_splits(tmp_path, lost)
     reply = ask(tmp_path)
     times = f"from {BEGIN}.000000 to {BEGIN + 4}.000000"
     note = f"detected, but could not be placed: scissors (open) (5 times, {times})"
@@ -433,7 +429,7 @@ def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -
             for at in range(run * 100, run * 100 + 20)
             for message in scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False)
         ]
-        write(tmp_path, messages, name=f"run{run}")
+        write_splits(tmp_path, messages, name=f"run{run}")
     reply = ask(tmp_path, label="mug")
     assert reply["frame_id"] == "odom"
     assert reply["total"] == 2
@@ -444,7 +440,7 @@ def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -
 def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(
     tmp_path: Path, limit: int
 ) -> None:
-    write(tmp_path, looked(0, 20, HERE, *[("chair", 3.0, each * 1.5) for each in range(3)]))
+    write_splits(tmp_path, looked(0, 20, HERE, *[("chair", 3.0, each * 1.5) for each in range(3)]))
     reply = ask(tmp_path, limit=limit)
     assert len(reply["things"]) == limit
     assert reply["total"] == 3
@@ -452,7 +448,7 @@ def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(
 
 def test_a_long_list_has_each_thing_shortly_and_says_how_to_ask_for_more(tmp_path: Path) -> None:
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(70)]
-    write(tmp_path, looked(0, 8, HERE, *many))
+    write_splits(tmp_path, looked(0, 8, HERE, *many))
     reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
     answer = json.loads(reply.text)
     rows = answer["things"]
@@ -469,7 +465,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
 ) -> None:
     many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(36)]
     elsewhere = [("thing 00", 2.0, 5.0), *many[1:]]
-    write(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
+    write_splits(tmp_path, [*looked(0, 8, HERE, *many), *looked(100, 108, HERE, *elsewhere)])
     reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
     answer = json.loads(reply.text)
     [moved] = [row for row in answer["things"] if row["label"] == "thing 00"]
@@ -482,7 +478,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
 
 def test_a_place_in_a_frame_in_which_nothing_is_known_is_named(tmp_path: Path) -> None:
     scenes = (scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False) for at in range(10))
-    write(tmp_path, [message for one in scenes for message in one])
+    write_splits(tmp_path, [message for one in scenes for message in one])
     reply = ask(tmp_path, where="kitchen")
     assert reply["things"] == []
     assert (
@@ -515,15 +511,6 @@ def random_messages(draw: Random) -> list[Msg]:
     return messages
 
 
-QUESTIONS: tuple[dict[str, object], ...] = (
-    {},
-    {"label": "mug"},
-    {"label": "cup", "min_score": 0.5},
-    {"where": "kitchen"},
-    {"start": BEGIN + 20, "end": BEGIN + 50},
-)
-
-
 def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
     return asked(memory, bag_dir, "find_things", **question)
 
@@ -551,7 +538,7 @@ def test_things_are_the_same_in_one_file_and_in_many(
     answers, missed_by = [], []
     for each in (split_s, 1e6):
         bag_dir = tmp_path_factory.mktemp("bags")
-        write(bag_dir, messages, each)
+        write_splits(bag_dir, messages, each)
         answers.append(answer(memory_of(bag_dir, limits=NAMED), bag_dir, {}))
         [lost] = [each for each in answers[-1]["things"] if each["label"] == "cup"]
         missed_by.append(lost["still_there"].pop("not_seen_where_expected", None))
@@ -563,7 +550,7 @@ def test_things_are_the_same_in_one_file_and_in_many(
 
 def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Path) -> None:
     blind = [each for each in looked(30, 60, HERE) if "vision" not in each.topic]
-    write(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.5)) + blind)
+    write_splits(tmp_path, looked(0, 30, HERE, ("cup", 3.0, 0.5)) + blind)
     window: dict[str, Any] = {"start": BEGIN + 40, "end": BEGIN + 60}
     silent = "/vision/scene/scene_objects published nothing in this window: "
     reply = ask(tmp_path, **window)
@@ -578,7 +565,7 @@ def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Pat
 def test_the_median_score_is_known_to_a_twentieth(
     tmp_path: Path, scores: tuple[float, ...]
 ) -> None:
-    write(
+    write_splits(
         tmp_path,
         [
             each
@@ -596,7 +583,7 @@ def test_the_median_score_is_known_to_a_twentieth(
 def test_scores_are_those_of_the_detections_that_count(tmp_path: Path) -> None:
     scores = (0.1, 0.1, 0.1, 0.9)
     seen = [("cup", 3.0, 0.5)]
-    write(
+    write_splits(
         tmp_path, [each for at in range(40) for each in scene(at, HERE, seen, score=scores[at % 4])]
     )
     [cup] = ask(tmp_path, min_score=0.5)["things"]
@@ -607,7 +594,7 @@ def test_scores_are_those_of_the_detections_that_count(tmp_path: Path) -> None:
 
 def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
     seen = (("table", 3.0, 0.5), ("mug", 3.3, 0.9), ("mug", 5.0, -1.0), ("plate", 2.6, 0.5))
-    write(tmp_path, looked(0, 30, HERE, *seen))
+    write_splits(tmp_path, looked(0, 30, HERE, *seen))
     by_label = ask(tmp_path, near={"label": "Tables", "radius_m": 0.6})
     assert {(each["label"], each["near_m"]) for each in by_label["things"]} == {
         ("mug", 0.5),
@@ -625,21 +612,23 @@ def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
 
 
 def test_a_thing_is_not_near_itself_but_near_another_of_its_label(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5), ("mug", 3.7, 0.5), ("cup", 5.0, 1.0)))
+    write_splits(
+        tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5), ("mug", 3.7, 0.5), ("cup", 5.0, 1.0))
+    )
     assert ask(tmp_path, label="cup", near={"label": "cup", "radius_m": 9})["total"] == 0
     mugs = ask(tmp_path, label="mug", near="mug")
     assert [each["near_m"] for each in mugs["things"]] == [0.7, 0.7]
 
 
 def test_what_is_near_a_thing_in_another_place_counts_where_it_is(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 30, HERE, ("table", 3.0, 0.5), ("mug", 3.3, 0.5)))
+    write_splits(tmp_path, looked(0, 30, HERE, ("table", 3.0, 0.5), ("mug", 3.3, 0.5)))
     where = {"x": 3.4, "y": 0.5, "radius_m": 0.2}
     found = ask(tmp_path, near="table", where=where)
     assert [each["label"] for each in found["things"]] == ["mug"]
 
 
 def test_near_what_is_not_there_is_nothing_and_a_note_says_so(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5)))
     reply = ask(tmp_path, near="sofa")
     assert reply["total"] == 0
     assert 'near: there is no thing "sofa" in this window' in reply["notes"]
@@ -661,7 +650,7 @@ def test_near_what_is_not_there_is_nothing_and_a_note_says_so(tmp_path: Path) ->
     ids=str,
 )
 def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path, near: Any) -> None:
-    write(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)))
     reply = ask(tmp_path, near=near)
     assert reply["error"] == "invalid_arguments"
     assert "near" in reply["detail"]
@@ -676,7 +665,7 @@ def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
         for hour in (7, 8, 9, 15, 16, 17):
             at = first + day * 86_400 + hour * 3600
             messages += looked(at, at + 4, HERE, table if hour < 12 else shelf)
-    write(tmp_path, messages, split_s=86_400.0)
+    write_splits(tmp_path, messages, split_s=86_400.0)
     evening = BEGIN + first + 13 * 86_400 + 18 * 3600
     [mug] = ask(tmp_path, label="mug", end=evening)["things"]
     afternoon, morning = mug["usually"]
@@ -696,6 +685,6 @@ def test_a_thing_that_is_moved_without_a_routine_has_no_pattern(tmp_path: Path) 
     for nth in range(84):
         at = nth // 6 * 86_400 + (7 + nth % 6) * 3600
         messages += looked(at, at + 4, HERE, ("mug", 3.0, chance.choice([0.5, -1.0])))
-    write(tmp_path, messages, split_s=86_400.0)
+    write_splits(tmp_path, messages, split_s=86_400.0)
     [mug] = ask(tmp_path, label="mug")["things"]
     assert mug["usually"] == "no pattern"
