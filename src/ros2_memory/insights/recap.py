@@ -65,9 +65,6 @@ _MOST_CHARS: Final = 1_200
 _CHANGE_CHARS: Final = 30
 """What the reply adds to a change's text."""
 
-_STANDSTILLS_UNKNOWN: Final = (
-    "the positions are too noisy, or too few, to detect standstills: stood_s is null"
-)
 _PLURALS: Final = {
     "gap": "gaps",
     "clock step": "clock steps",
@@ -151,12 +148,7 @@ def recap(
     if there is not None:
         stops = tuple(each for each in stops if there.overlaps(each[0].start, each[0].end))
     longest = nsmallest(most_events, stops, key=lambda each: each[0].start - each[0].end)
-    events = [*_stops(longest, places), *_drops(drive), *reported]
-    events += [
-        Event("gap", begin, until, _why_nothing(view, begin, until))
-        for begin, until in recording_gaps(view, TimeWindow(start, end))
-    ]
-    events += [*_clock_steps(view, window), *_silences(view, window)]
+    events = [*_stops(longest, places), *reported, *_of_recording(view, window, drive)]
     events += [_goal(each, start, elapsed) for each in goals_in(view, window, found)]
     if there is not None:
         events = [each for each in events if there.has(each)]
@@ -168,15 +160,20 @@ def recap(
     shown = _most_important(view, events, counts, most_events)
     if with_changes:
         shown = _with_changes(changes_in(view, window, found), shown)
-    if places is not None:
-        shown = [_in_place(each, places) for each in shown]
     shown = [
         replace(each, skipped=elapsed.skipped_between(each.start, each.end or each.start))
         for each in shown
     ]
+    if places is not None:
+        shown = [
+            replace(each, places=places.names_at(_when(each))) if each.kind in _OF_ROBOT else each
+            for each in shown
+        ]
     stood = drive.stood(end - start)
     if stood is None and drive.known is not None:
-        view.notes.add(_STANDSTILLS_UNKNOWN)
+        view.notes.add(
+            "the positions are too noisy, or too few, to detect standstills: stood_s is null"
+        )
     answer = Recap(
         start=start,
         end=end,
@@ -194,10 +191,7 @@ def recap(
     if there is None or region is None:
         answer = _with_way(view, answer, drive)
     else:
-        answer = _with_way_there(answer, drive, there)
-        answer = replace(answer, where=region.shown)
-        if stood is not None:
-            answer = replace(answer, stood=there.length_of(drive.standstills))
+        answer = replace(_with_way_there(answer, drive, there), where=region.shown)
     view.notes.retract_outside(window)
     return replace(answer, notes=view.notes.sentences())
 
@@ -230,11 +224,6 @@ class _There:
     def __init__(self, spans: Sequence[Inside], elapsed: Elapsed) -> None:
         self.spans = spans
         self._elapsed = elapsed
-
-    @property
-    def length(self) -> Ns:
-        """How long they were in all."""
-        return self._elapsed.among((each.start, each.stop) for each in self.spans)
 
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
@@ -284,18 +273,16 @@ def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
         answer,
         distance_m=None if driven is None else driven.distance_m,
         max_speed=None if driven is None else driven.max_speed,
+        stood=None if answer.stood is None else there.length_of(drive.standstills),
         visits=len(there.spans),
-        inside=there.length,
+        inside=drive.elapsed.among((each.start, each.stop) for each in there.spans),
     )
 
 
-def _in_place(event: Event, places: RobotPlaces) -> Event:
-    """Returns an event of the robot itself with the named places that it was in then."""
-    if event.kind not in _OF_ROBOT:
-        return event
+def _when(event: Event) -> Ns:
+    """Returns when the robot was where an event is said to be: in the middle of a stop."""
     stood = event.kind == "stop" and event.end is not None
-    at = (event.start + (event.end or 0)) // 2 if stood else event.start
-    return replace(event, places=places.names_at(at))
+    return (event.start + (event.end or 0)) // 2 if stood else event.start
 
 
 def found_events(
@@ -369,6 +356,22 @@ def _topic_events(
     return events, things.size, throughout
 
 
+def _of_recording(view: View, window: TimeWindow, drive: Drive) -> Iterator[Event]:
+    """Yields losses of speed, and when nothing was recorded, clocks were set or topics silent."""
+    for time, before_mps, after_mps in drive.drops:
+        text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
+        yield Event("drop", time, None, text)
+    for begin, until in recording_gaps(view, TimeWindow(*window.asked())):
+        yield Event("gap", begin, until, _why_nothing(view, begin, until))
+    for at, by in clock_steps(view, window):
+        how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
+        yield Event("clock step", at, None, f"the clock was set {how}")
+    for group in grouped(silences_in(view, window)):
+        topics, first = listed([each.topic for each in group]), group[0]
+        text = f"{topics} {'was' if len(group) == 1 else 'were'} silent"
+        yield Event("silence", first.start, first.end, text, goes_on=first.goes_on)
+
+
 def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     deleted = unix_from_ns(deleted_length(view, TimeWindow(begin, until)))
     if not deleted:
@@ -388,12 +391,6 @@ def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None)
         # z: a rounded -0.00 reads as 0.00.
         text = f"stood at x {x:z.2f}, y {y:z.2f}{frame}"
         yield Event("stop", start, end, text, goes_on, point=point)
-
-
-def _drops(drive: Drive) -> Iterator[Event]:
-    for time, before_mps, after_mps in drive.drops:
-        text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
-        yield Event("drop", time, None, text)
 
 
 def _errors(view: View, topic: str, found: TopicEvents, there: _There | None) -> tuple[Report, ...]:
@@ -432,24 +429,6 @@ def _flips(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterato
             end = ends[ceased]
         yield Event("flip", toggle.time, end, text, goes_on=end is None)
         until[toggle.name] = toggle.time
-
-
-def _clock_steps(view: View, window: TimeWindow) -> Iterator[Event]:
-    """Yields when the clock was set."""
-    for at, by in clock_steps(view, window):
-        how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
-        yield Event("clock step", at, None, f"the clock was set {how}")
-
-
-def _silences(view: View, window: TimeWindow) -> Iterator[Event]:
-    """Yields when topics with a usual rate were silent; several at the same time are one event."""
-    for group in grouped(silences_in(view, window)):
-        topics = listed([each.topic for each in group])
-        were = "was" if len(group) == 1 else "were"
-        first = group[0]
-        yield Event(
-            "silence", first.start, first.end, f"{topics} {were} silent", goes_on=first.goes_on
-        )
 
 
 def _error(error: Report) -> Event:

@@ -22,7 +22,6 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.results import ComparedMover, ComparedThing, ComparedThings, MoverSeen, ThingStay
 from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
 from ros2_memory.things.moves import LEAST_MM
-from ros2_memory.things.presence import missed_in
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -65,7 +64,7 @@ class ThingsBetween:
 
     def compared(self) -> ComparedThings:
         """Returns what differs, each list with those seen last first."""
-        lists: dict[str, list[ComparedThing]] = {}
+        lists: dict[str, list[ComparedThing]] = {"moved": [], "appeared": [], "missed": []}
         unknown: list[tuple[Instance, ComparedThing]] = []
         same = 0
         for instance in self.known.estimate.instances:
@@ -83,19 +82,11 @@ class ThingsBetween:
             if kind == "not_looked_at":
                 unknown.append((instance, thing))
             else:
-                lists.setdefault(kind, []).append(thing)
+                lists[kind].append(thing)
         lists["not_looked_at"], lists["not_comparable"] = _in_both(unknown)
-        movers = sorted(self._movers(), key=_mover_order)
-        ordered = {kind: tuple(sorted(each, key=_by_time)) for kind, each in lists.items()}
-        return ComparedThings(
-            moved=ordered.get("moved", ()),
-            appeared=ordered.get("appeared", ()),
-            missed=ordered.get("missed", ()),
-            not_looked_at=ordered["not_looked_at"],
-            same=same,
-            movers=tuple(movers),
-            not_comparable=ordered["not_comparable"],
-        )
+        ordered = {kind: tuple(sorted(each, key=_newest_first)) for kind, each in lists.items()}
+        movers = tuple(sorted(self._movers(), key=_newest_first))
+        return ComparedThings(**ordered, same=same, movers=movers)
 
     def _counts(self, instance: Instance, before: _Seen | None, after: _Seen | None) -> bool:
         """Whether a thing was seen there in either window."""
@@ -116,10 +107,10 @@ class ThingsBetween:
         )
         estimate = self.known.estimate
         if before is None and after is not None:
-            evidence = estimate.evidence[instance.key, instance.epoch].at(after.stay.place)
             end = min(self.earlier.stop, self.later.start)
-            looked = missed_in(estimate.cells, evidence, after.stay.stay, (self.earlier.start, end))
-            return "appeared" if looked else "not_looked_at", thing
+            window = self.earlier.start, end
+            _, _, crossed = estimate.missing(instance, after.stay, window)
+            return "not_looked_at" if crossed is None else "appeared", thing
         if before is not None and after is None:
             _, looks, crossed = estimate.missing(instance, self._last_there(instance, before))
             if crossed is None or crossed >= self.later.stop:
@@ -207,11 +198,8 @@ def _in_both(
     return alone + [thing for some in waiting.values() for _, thing in some], both
 
 
-def _by_time(thing: ComparedThing) -> tuple[int, str]:
-    stay = thing.after or thing.before
-    return (0 if stay is None else -stay.end, thing.label)
-
-
-def _mover_order(mover: ComparedMover) -> tuple[int, str]:
-    seen = mover.after or mover.before
-    return (0 if seen is None else -seen.last, mover.label)
+def _newest_first(each: ComparedThing | ComparedMover) -> tuple[int, str]:
+    seen = each.after or each.before
+    if seen is None:
+        return 0, each.label
+    return -(seen.end if isinstance(seen, ThingStay) else seen.last), each.label

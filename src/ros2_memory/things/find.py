@@ -22,7 +22,14 @@ from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, ThingStay, UsualPlace
-from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
+from ros2_memory.things.instances import (
+    Instance,
+    Mover,
+    PlacedStay,
+    most_at_once,
+    named,
+    spellings,
+)
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
@@ -210,7 +217,7 @@ class _Finder:
             if not keys or not names.isdisjoint(keys):
                 yield from self._instance(instance, names)
         for mover in result.movers:
-            names = {self.known.labels.key(name) for name, _ in self._labels(mover.spots)}
+            names = {self.known.labels.key(name) for name in self._labels(mover.spots)}
             if not keys or not names.isdisjoint(keys):
                 yield from self._mover(mover, names)
 
@@ -221,7 +228,7 @@ class _Finder:
         if not parts:
             return
         last, newest = parts[-1]
-        place, frame = _place(last), self.known.frames[instance.epoch]
+        place, frame = last.at, self.known.frames[instance.epoch]
         if self.where is not None and not self.where.contains(frame, place[0], place[1]):
             return
         seen_last = max(int(result.sights.spots[rows, Spot.LAST].max()) for _, rows in parts)
@@ -238,14 +245,15 @@ class _Finder:
         stays = [self._stay(frame, group) for group in _by_place(parts)]
         every = np.concatenate([rows for _, rows in parts])
         labels = self._labels(every)
-        spellings, misread = Counter[str](), Counter[str]()
+        result, rows = self.known.estimate, np.concatenate([stay.spots for stay in instance.stays])
+        written = spellings(result.sights, result.counts, rows)
+        misread = Counter[str]()
         for stay in instance.stays:
-            spellings.update(stay.spellings)
             misread.update(stay.also)
         return replace(
-            self._thing(instance.label, frame, _place(last), every, newest),
-            labels=tuple(labels) if len(labels) > 1 else (),
-            also_seen_as=_commonest(spellings, instance.labels),
+            self._thing(instance.label, frame, last.at, every, newest),
+            labels=tuple(labels.items()) if len(labels) > 1 else (),
+            also_seen_as=_commonest(written, instance.labels),
             misread_as=_commonest(misread, instance.labels),
             spread_m=last.dev_mm / _MM,
             still_there=self._still_there(instance, last, newest),
@@ -281,14 +289,11 @@ class _Finder:
             still_there=None,
         )
 
-    def _labels(self, rows: Ints) -> list[tuple[str, int]]:
+    def _labels(self, rows: Ints) -> dict[str, int]:
         """Returns how often each label has these spots, the commonest first."""
-        result, labels = self.known.estimate, self.known.labels
-        often = np.bincount(result.sights.spots[rows, Spot.LABEL], result.counts[rows])
-        counts: Counter[str] = Counter()
-        for label in np.flatnonzero(often).tolist():
-            counts[result.names[labels.key(result.sights.labels[label])]] += int(often[label])
-        return counts.most_common()
+        result = self.known.estimate
+        found = spellings(result.sights, result.counts, rows)
+        return named(found, self.known.labels, result.names)
 
     def _side_by_side(self, rows: Ints) -> int | None:
         """Returns how many of a label are at one place, where messages have several at once.
@@ -360,7 +365,7 @@ class _Finder:
         """Returns the stays at one place in a row, as one."""
         last, _ = parts[-1]
         rows = np.concatenate([rows for _, rows in parts])
-        return self.known.stay(rows, _place(last), frame, self.places)
+        return self.known.stay(rows, last.at, frame, self.places)
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
         """Returns the best score of some spots, and their median to 0.05, the width of a bin.
@@ -415,10 +420,6 @@ class _Finder:
             return StillThere("in_view", last)
         # Of a later look nothing is known where the estimate ends.
         return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None
-
-
-def _place(stay: PlacedStay) -> tuple[float, float, float]:
-    return stay.x / _MM, stay.y / _MM, stay.z / _MM
 
 
 def _commonest(names: Counter[str], without: Collection[str]) -> tuple[str, ...]:

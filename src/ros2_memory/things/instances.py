@@ -35,7 +35,6 @@ from ros2_memory.things.places import GATE_MM, places_of
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
-    FieldOfView,
     Stay,
     chance_of_missing,
     evidence_at,
@@ -79,7 +78,6 @@ class PlacedStay:
         left: the time by which it was seen to be gone; None if it was not.
         count: of its detections.
         spots: rows of `Sights.spots`, in order of time.
-        spellings: how often it was seen under each label.
         place: its number.
         stay: when it was there, by slices.
         weak: whether it was seen too rarely to be a thing.
@@ -97,11 +95,15 @@ class PlacedStay:
     left: Ns | None
     count: int
     spots: Ints
-    spellings: Counter[str]
     place: int
     stay: Stay
     weak: bool
     also: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def at(self) -> tuple[float, float, float]:
+        """The mean of its detections (m)."""
+        return self.x / 1000, self.y / 1000, self.z / 1000
 
 
 @dataclass(slots=True)
@@ -153,8 +155,8 @@ class Estimate:
     names: dict[str, str]
     """The name to show of each key."""
     cells: Cells
-    evidence: dict[tuple[str, int], Evidence]
-    """By key and epoch: the evidence for the places of things."""
+    evidence: dict[tuple[str, int, int], Evidence]
+    """By key, epoch and place: the evidence for the places of things."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
     """Of each spot, the first of `stays` that has it; -1 where none has."""
@@ -190,7 +192,7 @@ class Estimate:
         """Returns the mean place (m) of some spots of a stay; of all of it if these are poor."""
         rows = rows[~self.poor[rows]]
         if not len(rows):
-            return stay.x / 1000, stay.y / 1000, stay.z / 1000
+            return stay.at
         spots = self.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z]]
         x, y, z = (np.average(spots, axis=0, weights=self.counts[rows]) / 1000).tolist()
         return x, y, z
@@ -216,10 +218,14 @@ class Estimate:
         )
         return x, y, yaw
 
-    def missing(self, instance: Instance, stay: PlacedStay) -> tuple[float, int, Ns | None]:
-        """Returns `chance_of_missing` a thing after one of its stays."""
-        evidence = self.evidence[instance.key, instance.epoch].at(stay.place)
-        return chance_of_missing(self.cells, evidence, stay.stay, stay.last)
+    def missing(
+        self, instance: Instance, stay: PlacedStay, window: tuple[Ns, Ns] | None = None
+    ) -> tuple[float, int, Ns | None]:
+        """Returns `chance_of_missing` a thing after one of its stays, or in a window before it."""
+        evidence = self.evidence[instance.key, instance.epoch, stay.place]
+        seen_to = stay.last if window is None else MAX_NS
+        window = window or (stay.last + 1, MAX_NS)
+        return chance_of_missing(self.cells, evidence, stay.stay, seen_to, window)
 
     def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
@@ -275,7 +281,7 @@ def estimate(
     _fold(groups, seen, keys, go_on)
     instances: list[Instance] = []
     movers: list[Mover] = []
-    evidence: dict[tuple[str, int], Evidence] = {}
+    evidence: dict[tuple[str, int, int], Evidence] = {}
     for group in groups:
         linked = _link(group, seen, go_on)
         _add_poor(group, linked, seen)
@@ -283,12 +289,13 @@ def estimate(
             instances += linked
             if group.evidence is not None:
                 # Most places are of false detections.
-                places = {stay.place for each in linked for stay in each.stays}
-                evidence[group.key, group.epoch] = group.evidence.among(places)
+                for place in {stay.place for each in linked for stay in each.stays}:
+                    evidence[group.key, group.epoch, place] = group.evidence.at(place)
         elif _is_seen(group, seen):
             movers.append(Mover(group.key, group.epoch, group.rows))
     for each in instances:
-        each.labels = _labels_of(each, labels, names)
+        rows = np.concatenate([stay.spots for stay in each.stays])
+        each.labels = named(spellings(sights, seen.counts, rows), labels, names)
     instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
     found = Estimate(
         sights=sights.only(Spot, Score, Unplaced).with_scores_from(_lowest_bin(min_score)),
@@ -307,11 +314,19 @@ def estimate(
     return found
 
 
-def _labels_of(instance: Instance, labels: Labels, names: Mapping[str, str]) -> dict[str, int]:
+def spellings(sights: Sights, counts: Ints, rows: Ints) -> Counter[str]:
+    """Returns how often some spots were seen under each label, as detectors write it."""
+    often = np.bincount(sights.spots[rows, Spot.LABEL], counts[rows])
+    return Counter(
+        {sights.labels[label]: int(often[label]) for label in np.flatnonzero(often).tolist()}
+    )
+
+
+def named(found: Mapping[str, int], labels: Labels, names: Mapping[str, str]) -> dict[str, int]:
+    """Returns how often each name was seen, the commonest first; `names` has that of each key."""
     counts: Counter[str] = Counter()
-    for stay in instance.stays:
-        for spelling, n in stay.spellings.items():
-            counts[names[labels.key(spelling)]] += n
+    for spelling, n in found.items():
+        counts[names[labels.key(spelling)]] += n
     return dict(sorted(counts.items(), key=lambda each: (-each[1], each[0])))
 
 
@@ -323,14 +338,20 @@ class _Seen:
         poor: which spots were seen while localisation was poor: these move nothing.
         hits: the hits of these, by spot; `starts` is where each spot's begin.
         groups: of each spot a number; those of one slice, topic and label have the same.
+        view: by topic the field of view that its detections show.
         side: of each spot, the mean of the unit vectors to it from where it was seen.
     """
 
     def __init__(self, sights: Sights, epoch: Ints, min_score: float) -> None:
         self.sights = sights
-        self.counts = _counts(sights, min_score)
+        self.counts = sights.spots[:, Spot.N].copy()
+        low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
+        np.subtract.at(self.counts, low[:, Score.SPOT], low[:, Score.N])
         self.poor, poor = poorly_localised(sights)
-        self.hits, self.starts = _by_spot(_hits(sights, self.counts), sights)
+        # The hits of detections that count: in proportion, rounded up.
+        every, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
+        every[:, Hit.N] = -(-every[:, Hit.N] * self.counts[spot] // sights.spots[spot, Spot.N])
+        self.hits, self.starts = _by_spot(every[every[:, Hit.N] > 0], sights)
         self.hits[np.append(poor, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
         by = (Spot.SLICE, Spot.TOPIC, Spot.LABEL)
         self.groups = distinct_rows([sights.spots[:, column] for column in by])[1]
@@ -339,7 +360,12 @@ class _Seen:
         away, bearing = self.cells.seen_at(
             hits[:, Hit.LOOK], *(sights.spots[hits[:, Hit.SPOT]][:, [Spot.X, Spot.Y]].T)
         )
-        self.view = _fields_of_view(sights, hits, away, bearing)
+        topics = sights.spots[hits[:, Hit.SPOT], Spot.TOPIC]
+        self.view = {
+            topic: field_of_view(away[of], bearing[of], hits[of, Hit.N])
+            for topic in np.unique(topics).tolist()
+            for of in (topics == topic,)
+        }
         heading = np.radians(bearing + self.cells.yaw[hits[:, Hit.LOOK]])
         spot, n, size = hits[:, Hit.SPOT], hits[:, Hit.N], len(sights.spots)
         sums = [np.bincount(spot, n * of(heading), size) for of in (np.cos, np.sin)]
@@ -372,37 +398,9 @@ def _rows_of(spots: Ints, table: Ints, starts: Ints) -> Ints:
     return rows
 
 
-def _counts(sights: Sights, min_score: float) -> Ints:
-    """Returns how many detections of each spot have a score that counts."""
-    counts = sights.spots[:, Spot.N].copy()
-    low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
-    np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
-    return counts
-
-
 def _lowest_bin(min_score: float) -> int:
     """Returns the lowest bin of scores that count."""
     return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
-
-
-def _hits(sights: Sights, counts: Ints) -> Ints:
-    """Returns the hits of detections that count: in proportion, rounded up."""
-    hits = sights.hits.copy()
-    spot = hits[:, Hit.SPOT]
-    hits[:, Hit.N] = -(-hits[:, Hit.N] * counts[spot] // sights.spots[spot, Spot.N])
-    return hits[hits[:, Hit.N] > 0]
-
-
-def _fields_of_view(
-    sights: Sights, hits: Ints, away: Floats, bearing: Floats
-) -> dict[int, FieldOfView]:
-    """Returns by topic the field of view that its detections show."""
-    topics = sights.spots[hits[:, Hit.SPOT], Spot.TOPIC]
-    return {
-        topic: field_of_view(away[of], bearing[of], hits[of, Hit.N])
-        for topic in np.unique(topics).tolist()
-        for of in (topics == topic,)
-    }
 
 
 def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
@@ -481,10 +479,6 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     total = int(n.sum())
     x, y, z = (n @ spots[:, [Spot.X, Spot.Y, Spot.Z]] / total).tolist()
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
-    often = np.bincount(spots[:, Spot.LABEL], n).astype(np.int64)
-    spellings = Counter(
-        {seen.sights.labels[label]: int(often[label]) for label in np.flatnonzero(often).tolist()}
-    )
     firm = spots[:, Spot.SLICE]
     firm = spots[(firm >= stay.firm_first) & (firm <= stay.firm_last)]
     firm = firm if len(firm) and stay.firm_first >= 0 else spots
@@ -500,7 +494,6 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
         left=None if stay.left is None else seen.cells.looked_in(stay.left),
         count=total,
         spots=rows,
-        spellings=spellings,
         place=place,
         stay=stay,
         weak=stay.hits < max(_FEWEST, _LOWEST_RATE * stay.messages),
@@ -528,7 +521,7 @@ def _fold(
             gone.add(nth)
             host_group, host = every[best]
             if host_group is not group:
-                host.also += stay.spellings
+                host.also += spellings(seen.sights, seen.counts, stay.spots)
     for group in groups:
         group.stays = []
     for nth, (group, stay) in enumerate(every):
@@ -544,10 +537,6 @@ class _Hosts:
     ) -> None:
         self._every, self._seen, self._keys = every, seen, keys
         self._beside = _by_spot(seen.sights.beside, seen.sights)
-        self._hits = [
-            (seen.sights.spots[rows, Spot.SLICE], np.append(0, np.cumsum(seen.counts[rows])))
-            for rows in (stay.spots for _, stay in every)
-        ]
         columns = [
             (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in every
         ]
@@ -566,7 +555,7 @@ class _Hosts:
         beside: Counter[str] | None = None
         found = zip(self._order[start:stop][near].tolist(), away[near].tolist(), strict=True)
         for other, away_mm in sorted(found):
-            host_group, _ = self._every[other]
+            host_group, host = self._every[other]
             if other == nth:
                 continue
             if host_group is not group:
@@ -575,7 +564,11 @@ class _Hosts:
                 beside = self._beside_of(stay) if beside is None else beside
                 if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
                     continue
-            yield other, self._seen_during(other, stay.stay)
+            rows = host.spots
+            slices = self._seen.sights.spots[rows, Spot.SLICE]
+            ends = stay.stay.first_slice, stay.stay.last_slice + 1
+            during = slice(*np.searchsorted(slices, ends))
+            yield other, int(self._seen.counts[rows[during]].sum())
 
     def _beside_of(self, stay: PlacedStay) -> Counter[str]:
         """Returns how often its detections had other labels beside them, by the key of these."""
@@ -583,11 +576,6 @@ class _Hosts:
         for _, label, n in _rows_of(stay.spots, *self._beside).tolist():
             counts[self._keys[label]] += n
         return counts
-
-    def _seen_during(self, host: int, stay: Stay) -> int:
-        slices, counts = self._hits[host]
-        start, stop = np.searchsorted(slices, (stay.first_slice, stay.last_slice + 1))
-        return int(counts[stop] - counts[start])
 
 
 def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instance]:
@@ -686,7 +674,7 @@ def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
 def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None:
     """Adds what was seen while localisation was poor to the things that it may have been."""
     for row in np.setdiff1d(group.rows, seen.firm(group.rows)).tolist():
-        spot, n = seen.sights.spots[row], int(seen.counts[row])
+        spot = seen.sights.spots[row]
         # Of each thing the last stay that had begun by then.
         begun = [
             stay
@@ -698,8 +686,7 @@ def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None
             stay = begun[away_mm.index(min(away_mm))]
             stay.spots = np.sort(np.append(stay.spots, row))
             stay.last = max(stay.last, int(spot[Spot.LAST]))
-            stay.count += n
-            stay.spellings[seen.sights.labels[spot[Spot.LABEL]]] += n
+            stay.count += int(seen.counts[row])
 
 
 def most_at_once(spots: Ints) -> int:

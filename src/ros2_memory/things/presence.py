@@ -32,7 +32,7 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.timebase import Ns
 
@@ -215,17 +215,6 @@ class Evidence(NamedTuple):
         looks, blind = (
             np.arange(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind)
         )
-        return self._some(looks, blind)
-
-    def among(self, places: Iterable[int]) -> Evidence:
-        """Returns that for some places."""
-        some = np.array([*places], np.int64)
-        looks, blind = (
-            np.flatnonzero(np.isin(_place(keys), some)) for keys in (self.looks, self.blind)
-        )
-        return self._some(looks, blind)
-
-    def _some(self, looks: Ints, blind: Ints) -> Evidence:
         return Evidence(
             self.looks[looks],
             self.cell[looks],
@@ -390,43 +379,21 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
 
 
 def chance_of_missing(
-    cells: Cells, evidence: Evidence, stay: Stay, after: Ns
+    cells: Cells, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
 ) -> tuple[float, int, Ns | None]:
-    """Returns how likely it is that a thing which is still at its place was missed since.
+    """Returns how likely it is that a thing was missed in a window [start, stop).
 
     `evidence` is that for this place.
 
-    By the looks after a time (ns) from cells that saw it during the stay; each cell's own rate is
-    known as well as its messages make it (a uniform prior). With the number of messages of these
-    looks, and when the chance fell below 1 %; None where it did not.
+    By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
+    cell's own rate is known as well as its messages make it (a uniform prior). With the number of
+    messages of these looks, and when the chance fell below 1 %; None where it did not.
     """
-    looks, hits = _number(evidence.looks), evidence.hits
-    own = cells.slice[looks]
-    during = (own >= stay.first_slice) & (own <= stay.last_slice) & (cells.last[looks] <= after)
-    during |= (own >= stay.first_slice) & (own <= stay.last_slice) & (hits > 0)
-    since = (cells.first[looks] > after) & evidence.fair & ~during
-    return _missed(cells, evidence, during, since)
-
-
-def missed_in(cells: Cells, evidence: Evidence, stay: Stay, window: tuple[Ns, Ns]) -> bool:
-    """Whether a window [start, stop) has so many looks that a thing would not have been missed.
-
-    That is what was seen in a stay after the window: it was not there in the window, but for a
-    chance of 1 %.
-    """
-    looks = _number(evidence.looks)
-    own, first = cells.slice[looks], cells.first[looks]
-    during = (own >= stay.first_slice) & (own <= stay.last_slice)
-    inside = (first >= window[0]) & (cells.last[looks] < window[1])
-    _, _, crossed = _missed(cells, evidence, during, inside & evidence.fair & ~during)
-    return crossed is not None
-
-
-def _missed(
-    cells: Cells, evidence: Evidence, during: Flags, since: Flags
-) -> tuple[float, int, Ns | None]:
-    """Returns `chance_of_missing` by the looks `since`, with the rates of those `during`."""
     looks, hits, cell = _number(evidence.looks), evidence.hits, evidence.cell
+    own, last = cells.slice[looks], cells.last[looks]
+    during = (own >= stay.first_slice) & (own <= stay.last_slice)
+    during &= (last <= seen_to) | (hits > 0)
+    after = (cells.first[looks] >= window[0]) & (last < window[1]) & evidence.fair & ~during
     known: dict[int, list[float]] = {}
     for each, n, hit in zip(
         cell[during].tolist(), cells.n[looks[during]].tolist(), hits[during].tolist(), strict=True
@@ -436,11 +403,11 @@ def _missed(
         entry[1] += n - hit
     chance, messages = 0.0, 0
     crossed: Ns | None = None
-    for each, n, hit, last in zip(
-        cell[since].tolist(),
-        cells.n[looks[since]].tolist(),
-        hits[since].tolist(),
-        cells.last[looks[since]].tolist(),
+    for each, n, hit, ended in zip(
+        cell[after].tolist(),
+        cells.n[looks[after]].tolist(),
+        hits[after].tolist(),
+        last[after].tolist(),
         strict=True,
     ):
         entry = known.get(each, [0.0, 0.0])
@@ -457,7 +424,7 @@ def _missed(
         entry[1] += n
         messages += n
         if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
-            crossed = last
+            crossed = ended
     return math.exp(chance), messages, crossed
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from hashlib import blake2b
-from itertools import accumulate, chain, pairwise
+from itertools import accumulate, pairwise
 from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -86,7 +86,7 @@ class Stretch(NamedTuple):
 
 
 class SeenBytes(NamedTuple):
-    """What was seen in a stretch; see `in_bytes`. Empty where no detector published."""
+    """What was seen in a stretch, as `Watching` has it in bytes."""
 
     data: bytes
 
@@ -143,21 +143,6 @@ def may_have_detections(type_name: str) -> bool:
     return type_name == _TEXT or type_name.partition("/")[0] not in _NO_DETECTIONS
 
 
-def in_bytes(placed: Sequence[tuple[int, SessionSights]]) -> SeenBytes:
-    """Returns what was seen as bytes: of each session what there is, as JSON, then the sights.
-
-    With each comes which of the sessions around it is.
-    """
-    parts = [[packed(sights) for sights in one.sights] for _, one in placed]
-    head = [
-        (nth, one.frame_id, sum(len(sights.spots) for sights in one.sights), [*map(len, own)])
-        for (nth, one), own in zip(placed, parts, strict=True)
-    ]
-    described = json.dumps(head).encode()
-    data = (_SIZE.pack(len(described)), described, *chain.from_iterable(parts))
-    return SeenBytes(b"".join(data) if placed else b"")
-
-
 class Watching:
     """Reads what detectors saw in the bags of a view.
 
@@ -193,9 +178,19 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         for around in self._stretches_in(TimeWindow(MIN_NS, until)):
-            sessions = [one.own for one in around.sessions]
-            if found := self._unpacked(around.window.start, sessions, self._known(around)):
-                yield found
+            data = self._known(around)
+            if not data:
+                continue
+            [size] = _SIZE.unpack_from(data)
+            at = _SIZE.size + size
+            found = []
+            for nth, frame, spots, lengths in json.loads(data[_SIZE.size : at]):
+                ends = [*accumulate(lengths, initial=at)]
+                parts = tuple(data[begin:end] for begin, end in pairwise(ends))
+                at = ends[-1]
+                own = around.sessions[nth].own
+                found.append(Stretch(around.window.start, frame, own, spots, parts))
+            yield found
 
     def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the sights that follow from the parts of a window; those of others are left out.
@@ -215,7 +210,7 @@ class Watching:
         if not self._topics:
             return
         bags = _Bags(self._view, self._topics, self._needed, window)
-        for number in bags.stretches():
+        for number in bags.stretches:
             self._view.bags.check_deadline()
             yield self._around(_window(number), *bags.around(_window(number).widened(AROUND_NS)))
 
@@ -238,20 +233,6 @@ class Watching:
             among = self._transforms_of(own, bag, window)
             placed = self._placer.placed(window, own, among, rows)
             found += [] if placed is None else [placed]
-        return found
-
-    def _unpacked(self, start: Ns, sessions: Sequence[Session], data: bytes) -> list[Stretch]:
-        """Returns what was seen from its bytes; see `in_bytes`."""
-        if not data:
-            return []
-        [size] = _SIZE.unpack_from(data)
-        at = _SIZE.size + size
-        found = []
-        for nth, frame, spots, lengths in json.loads(data[_SIZE.size : at]):
-            ends = [*accumulate(lengths, initial=at)]
-            parts = tuple(data[begin:end] for begin, end in pairwise(ends))
-            at = ends[-1]
-            found.append(Stretch(start, frame, sessions[nth], spots, parts))
         return found
 
     def _session(self, bag: BagFile) -> Session:
@@ -347,18 +328,30 @@ class Watching:
         return self._followed[1]
 
     def _read(self, around: _Around) -> bytes:
+        """Returns what was seen: of each session what there is, as JSON, then the sights.
+
+        With each comes which of the sessions around it is. Empty where no detector published.
+        """
         every: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
         for topic, rows in self._found(around.window):
             every[self._sessions.of(rows.recording)].append((topic, rows))
-        placed: list[tuple[int, SessionSights]] = []
+        head: list[tuple[int, str, int, list[int]]] = []
+        data: list[bytes] = []
         for nth, (own, among, slices) in enumerate(around.sessions):
             found = every[own]
             if slices is not None:
-                found = [(topic, _in_slices(rows, slices)) for topic, rows in found]
+                found = [
+                    (topic, rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices))))
+                    for topic, rows in found
+                ]
             seen = self._placer.placed(around.window, own, among, found)
             if seen is not None:
-                placed.append((nth, seen))
-        return in_bytes(placed).data
+                some = [*map(packed, seen.sights)]
+                spots = sum(len(sights.spots) for sights in seen.sights)
+                head.append((nth, seen.frame_id, spots, [*map(len, some)]))
+                data += some
+        described = json.dumps(head).encode()
+        return b"".join((_SIZE.pack(len(described)), described, *data)) if head else b""
 
     def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
         """Yields the rows in a window that may have detections."""
@@ -367,8 +360,28 @@ class Watching:
                 yield topic, rows
 
 
+class _Spans(NamedTuple):
+    """Spans of log times (inclusive), in order of the first ones; `latest` is the latest so far."""
+
+    firsts: Ints
+    lasts: Ints
+    latest: Ints
+
+    @classmethod
+    def of(cls, spans: Sequence[tuple[Ns, Ns]]) -> _Spans:
+        firsts, lasts = np.array(spans, np.int64).reshape(-1, 2).T.copy()
+        return cls(firsts, lasts, np.maximum.accumulate(lasts))
+
+    def reaching_into(self, window: TimeWindow) -> Ints:
+        """Returns the positions of those that do."""
+        begin = int(np.searchsorted(self.latest, window.start))
+        end = int(np.searchsorted(self.firsts, window.stop))
+        found: Ints = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
+        return found
+
+
 class _Bags:
-    """The bags of a view in a window, and what is stored of them, as arrays.
+    """The bags of a view in a window, and what is stored of them.
 
     Without those of carried messages that nothing is seen by: they reach over all of the history.
 
@@ -382,35 +395,25 @@ class _Bags:
     def __init__(
         self, view: View, topics: Sequence[str], needed: Sequence[str], window: TimeWindow
     ) -> None:
-        self._view = view
-        self._topics = topics
-        self._window = window
         around = window.widened(AROUND_NS)
         self._bags = [
             bag
             for bag in view.timeline.overlapping(around)
             if not is_carried(bag.file) or any(map(bag.summary.of, needed))
         ]
-        count = len(self._bags)
-        self._starts = np.fromiter((bag.start for bag in self._bags), np.int64, count)
-        self._ends = np.fromiter((bag.end for bag in self._bags), np.int64, count)
-        self._latest = np.maximum.accumulate(self._ends)
+        self._spans = _Spans.of([(bag.start, bag.end) for bag in self._bags])
         self._parts = _Parts.of(view, needed, around, self._bags)
-
-    def stretches(self) -> list[int]:
-        """Returns the numbers of the stretches in which there may be messages, the newest first."""
-        first, last = self._starts // SIGHTS_NS, self._ends // SIGHTS_NS
+        first, last = self._spans.firsts // SIGHTS_NS, self._spans.lasts // SIGHTS_NS
         long = np.flatnonzero(last - first > 1)
-        more = [_numbers_of(self._view, self._topics, self._bags[nth]) for nth in long.tolist()]
+        more = [_numbers_of(view, topics, self._bags[nth]) for nth in long.tolist()]
         every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
         numbers: list[int] = np.unique(every)[::-1].tolist()
-        return [nth for nth in numbers if not _window(nth).intersect(self._window).empty]
+        self.stretches = [nth for nth in numbers if not _window(nth).intersect(window).empty]
+        """The numbers of the stretches in which there may be messages, the newest first."""
 
     def around(self, window: TimeWindow) -> tuple[list[BagFile], tuple[int, ...] | None]:
         """Returns the bags that reach into a window, and the parts; see `_Around`."""
-        begin = int(np.searchsorted(self._latest, window.start))
-        end = int(np.searchsorted(self._starts, window.stop))
-        here = begin + np.flatnonzero(self._ends[begin:end] >= window.start)
+        here = self._spans.reaching_into(window)
         bags = [self._bags[nth] for nth in here.tolist()]
         return bags, None if self._parts is None else self._parts.around(window, here)
 
@@ -420,17 +423,13 @@ class _Parts(NamedTuple):
 
     Attributes:
         is_merged: of each bag, whether it is in parts.
-        firsts: of each part, the first log time, ascending.
-        lasts: likewise the last one.
-        latest: the latest of the parts so far.
+        spans: when the parts are.
         numbers: of the parts.
         all_count: whether all rows of the part do.
     """
 
     is_merged: Flags
-    firsts: Ints
-    lasts: Ints
-    latest: Ints
+    spans: _Spans
     numbers: Ints
     all_count: Flags
 
@@ -467,16 +466,11 @@ class _Parts(NamedTuple):
         if scanner.store.failures != failures:
             return None
         heads.sort(key=lambda head: head.first)
-        firsts = np.array([head.first for head in heads], np.int64)
-        lasts = np.array([head.last for head in heads], np.int64)
-        counting = coverage.counts([head.bags for head in heads])
         return cls(
-            np.fromiter((bag.file in merged for bag in bags), np.bool_, len(bags)),
-            firsts,
-            lasts,
-            np.maximum.accumulate(lasts),
+            np.array([bag.file in merged for bag in bags], np.bool_),
+            _Spans.of([(head.first, head.last) for head in heads]),
             np.array([head.number for head in heads], np.int64),
-            counting == [head.bags.size for head in heads],
+            coverage.counts([head.bags for head in heads]) == [head.bags.size for head in heads],
         )
 
     def around(self, window: TimeWindow, bags: Ints) -> tuple[int, ...] | None:
@@ -484,16 +478,10 @@ class _Parts(NamedTuple):
 
         `bags` are the positions of the bags.
         """
-        if not self.is_merged[bags].all():
+        here = self.spans.reaching_into(window)
+        if not (self.is_merged[bags].all() and self.all_count[here].all()):
             return None
-        begin = int(np.searchsorted(self.latest, window.start))
-        end = int(np.searchsorted(self.firsts, window.stop))
-        here = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
-        return tuple(np.sort(self.numbers[here]).tolist()) if self.all_count[here].all() else None
-
-
-def _in_slices(rows: Rows, slices: Sequence[int]) -> Rows:
-    return rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices)))
+        return tuple(np.sort(self.numbers[here]).tolist())
 
 
 def _window(number: int) -> TimeWindow:

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.history import clock_steps
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, battery, boolean, odom, write_mcap
+from tests.support.bags import Msg, battery, boolean, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
@@ -40,12 +40,9 @@ def recorded(
         messages: list[Msg] = []
         for beat in range(number * SPLIT * HZ, (number + 1) * SPLIT * HZ):
             t = beat / HZ
-            if not is_on(t):
-                continue
             at = BEGIN * S + round(shown(t) * S)
-            messages.append(odom(at, SPEED * driven(t), 0.0, 0.0))
-            if beat % HZ == 0:
-                messages.append(boolean(at + 1, data=False))
+            messages += [odom(at, SPEED * driven(t), 0.0, 0.0)] * is_on(t)
+            messages += [boolean(at + 1, data=False)] * (is_on(t) and beat % HZ == 0)
         write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
     return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
@@ -63,7 +60,9 @@ def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
     at = BEGIN + round(when - 0.05, 1)
     expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(8.0, abs=0.01)}]
     assert asked(memory, tmp_path, "data_time_range")["clock_steps"] == expected
-    assert asked(memory, tmp_path, "memory_status")["clock_steps"] == expected
+    status = asked(memory, tmp_path, "memory_status")
+    assert status["clock_steps"] == expected
+    assert status["doubts"].endswith("the clock was set 8 s ahead")
     reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 100)
     [event] = [each for each in reply["events"] if "clock" in each["text"]]
     assert event["text"] == "the clock was set forward by 8 s"
@@ -89,12 +88,6 @@ def steps(memory: Memory, folder: Path) -> list[Any]:
     return found
 
 
-def test_a_recorder_that_stalled_while_the_robot_drove_on_is_no_step(tmp_path: Path) -> None:
-    memory = recorded(tmp_path, is_on=lambda t: not 52 < t < 57)
-    assert len(memory.index.snapshot().suspects) == 1
-    assert steps(memory, tmp_path) == []
-
-
 def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_path: Path) -> None:
     for name, begin in (("early", 0), ("late", 200)):
         drive = [
@@ -113,6 +106,40 @@ def test_between_two_recordings_is_no_step_where_a_third_one_has_a_pause(tmp_pat
     assert steps(memory, tmp_path) == []
 
 
+def late(t: float) -> float:
+    """Messages wait for the recorder, ever shorter."""
+    return max(0.0, 2.0 - 0.8 * (t - 55)) if t > 54.95 else 0.0
+
+
+@pytest.mark.parametrize(
+    ("memory_in", "suspects"),
+    [
+        # The recorder stalled while the robot drove on.
+        (lambda folder: recorded(folder, is_on=lambda t: not 52 < t < 57), 1),
+        # Where the robot stood, a step and a pause are alike.
+        (
+            lambda at: recorded(
+                at, shown=lambda t: t + 8.0 * (t > 55), driven=lambda t: min(t, 50)
+            ),
+            1,
+        ),
+        (lambda folder: recorded(folder, shown=lambda t: t + 1.0 * (t > 55)), 0),
+        (lambda folder: stamped(folder, delay=late), 1),
+        (lambda folder: stamped(folder, is_lost=lambda t: 54.95 < t < 57), 1),
+        # One topic pauses, or all publish little.
+        (lambda folder: recorded(folder, is_on=lambda t: not 53 < t < 57 or t % 1 == 0), 0),
+        (lambda folder: recorded(folder, is_on=lambda t: t % 10 == 0), 0),
+    ],
+    ids=["stall", "standing", "a second", "waiting", "lost", "one topic", "rare"],
+)
+def test_what_only_looks_like_a_step_is_none(
+    tmp_path: Path, memory_in: Callable[[Path], Memory], suspects: int
+) -> None:
+    memory = memory_in(tmp_path)
+    assert len(memory.index.snapshot().suspects) == suspects
+    assert steps(memory, tmp_path) == []
+
+
 @pytest.mark.parametrize("queued", [3, 10, 100])
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
 def test_what_queued_up_while_the_recorder_stalled_is_no_step(
@@ -123,51 +150,23 @@ def test_what_queued_up_while_the_recorder_stalled_is_no_step(
     def is_kept(t: float) -> bool:
         return not when < t < when + 3.5 or t < when + queued / HZ
 
-    memory = driven_with_delay(
-        tmp_path, lambda t: max(0.0, when + 3.5 - t) if t > when else 0.0, is_kept
-    )
-    assert steps(known(memory), tmp_path) == []
-
-
-def driven_with_delay(
-    folder: Path, delay: Callable[[float], float], is_kept: Callable[[float], bool]
-) -> Memory:
-    """A robot that drives, whose messages are logged after a delay, or lost."""
-    splits: dict[int, list[Msg]] = {}
+    messages: list[Msg] = []
     for beat in range(SPLITS * SPLIT * HZ):
         t = beat / HZ
         if is_kept(t):
-            at, logged = (BEGIN * S + round((t + extra) * S) for extra in (0.0, delay(t)))
-            flag = boolean(at, data=False)
-            splits.setdefault(int((t + delay(t)) / SPLIT), []).extend(
-                [
-                    odom(at, SPEED * t, 0.0, 0.0, log_time=logged),
-                    replace(flag, log_time=logged, publish_time=at),
-                ]
-            )
-    for number, messages in splits.items():
-        messages.sort(key=lambda message: message.log_time)
-        write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
-    return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
-
-
-def test_where_the_robot_stood_a_step_and_a_pause_are_alike(tmp_path: Path) -> None:
-    memory = recorded(
-        tmp_path, shown=lambda t: t + 8.0 * (t > 55), driven=lambda t: t if t < 50 else 50.0
-    )
-    assert len(memory.index.snapshot().suspects) == 1
-    assert steps(memory, tmp_path) == []
-
-
-def test_a_second_is_no_step(tmp_path: Path) -> None:
-    memory = recorded(tmp_path, shown=lambda t: t + 1.0 * (t > 55))
-    assert steps(memory, tmp_path) == []
+            at = BEGIN * S + round(t * S)
+            logged = max(at, BEGIN * S + round((when + 3.5) * S)) if t > when else at
+            messages.append(odom(at, SPEED * t, 0.0, 0.0, log_time=logged))
+            messages.append(replace(boolean(logged, data=False), publish_time=at))
+    write_splits(tmp_path, messages)
+    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
+    assert steps(known(memory), tmp_path) == []
 
 
 def stamped(
     folder: Path,
     *,
-    delay: Callable[[float], float],
+    delay: Callable[[float], float] = lambda t: 0.0,
     is_lost: Callable[[float], bool] = lambda t: False,
 ) -> Memory:
     """A robot that stands, whose sensors stamp by a clock of their own, logged after a delay."""
@@ -218,45 +217,15 @@ def test_pauses_that_are_not_looked_at_are_noted(
     assert len(steps(memory, tmp_path)) == 1
 
 
-def test_messages_that_waited_for_the_recorder_are_no_step(tmp_path: Path) -> None:
-    def delay(t: float) -> float:
-        return max(0.0, 2.0 - 0.8 * (t - 55)) if t > 54.95 else 0.0
-
-    assert steps(stamped(tmp_path, delay=delay), tmp_path) == []
-
-
-def test_messages_that_were_lost_are_no_step(tmp_path: Path) -> None:
-    memory = stamped(tmp_path, delay=lambda t: 0.0, is_lost=lambda t: 54.95 < t < 57)
-    assert steps(memory, tmp_path) == []
-
-
 def test_a_clock_that_was_set_back_is_listed_with_a_negative_step(tmp_path: Path) -> None:
     memory = recorded(tmp_path, shown=lambda t: t - 30.0 * (t >= 100))
     [step] = steps(memory, tmp_path)
     assert step == {"at": BEGIN + 70, "step_s": pytest.approx(-29.9, abs=0.01)}
-
-
-def test_one_topic_that_pauses_is_no_hole(tmp_path: Path) -> None:
-    for number in range(SPLITS):
-        begin = (BEGIN + number * SPLIT) * S
-        messages = [
-            odom(begin + at * S // HZ, 0.0, 0.0, 0.0)
-            for at in range(SPLIT * HZ)
-            if number != 5 or not 30 < at < 70
-        ]
-        messages += [boolean(begin + at * S + 1, data=False) for at in range(SPLIT)]
-        messages.sort(key=lambda each: each.log_time)
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", messages)
-    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspects == []
-
-
-def test_a_robot_that_publishes_little_has_no_holes_to_look_at(tmp_path: Path) -> None:
-    for number in range(SPLITS):
-        begin = (BEGIN + number * SPLIT) * S
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(begin, 0.0, 0.0, 0.0)])
-    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert memory.index.snapshot().suspects == []
+    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 160)
+    assert reply["duration_s"] == 160.0
+    [note, of_path] = [each for each in reply["notes"] if "set back" in each]
+    assert note.startswith("the clock was set back by 29.9 s or more at ")
+    assert of_path.endswith("the path there is that from before")
 
 
 WHEN = 54.95
@@ -329,20 +298,6 @@ def test_an_answer_that_no_step_is_in_does_not_name_it(tmp_path: Path) -> None:
     for tool, more in (("recap", {}), ("find_matches", FLAG), ("visits", {"x": 0.0, "y": 0.0})):
         reply = asked(memory, tmp_path, tool, start=BEGIN + 100, end=BEGIN + 150, **more)
         assert not ahead_notes(reply)
-
-
-def test_a_step_back_is_named_and_changes_no_duration(tmp_path: Path) -> None:
-    memory = recorded(tmp_path, shown=lambda t: t - 30.0 * (t >= 100))
-    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 160)
-    assert reply["duration_s"] == 160.0
-    [note, of_path] = [each for each in reply["notes"] if "set back" in each]
-    assert note.startswith("the clock was set back by 29.9 s or more at ")
-    assert of_path.endswith("the path there is that from before")
-
-
-def test_trust_sums_up_the_steps_of_the_clock(tmp_path: Path) -> None:
-    doubts = asked(set_ahead(tmp_path), tmp_path, "memory_status")["doubts"]
-    assert doubts.endswith("the clock was set 8 s ahead")
 
 
 def test_bins_have_their_times_in_unix_seconds_too(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory import queries
-from ros2_memory.counts.column_numbers import numbers_in
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import fields
@@ -105,9 +104,3 @@ def test_a_window_with_too_many_messages_to_read_says_so(
     answer = asked(tmp_path, driven, "pose.covariance")
     assert answer.extremes == ()
     assert fields.TOO_MANY in answer.notes
-
-
-@pytest.mark.parametrize("summary", [{"bytes": 921_600}, {"numbers": 2_000_000}])
-def test_a_summary_of_many_numbers_has_no_extremes(summary: JsonValue) -> None:
-    assert [*numbers_in(summary)] == []
-    assert [*numbers_in({"bytes": 1, "rate": 2})] == [2.0, 1.0]

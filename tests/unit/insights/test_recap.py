@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -30,10 +31,10 @@ from tests.support.bags import (
     log_entry,
     make,
     odom,
-    stamp,
     tf,
     transform,
     write_mcap,
+    write_splits,
 )
 from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
@@ -47,6 +48,10 @@ BEGIN = 1_784_000_000 * S
 def over(memory: Memory, begin: float, end: float) -> Recap:
     """Of so many seconds after BEGIN."""
     return recap(memory, Call(), TimeRange(start_s=BEGIN / S + begin, end_s=BEGIN / S + end))
+
+
+def shown(folder: Path, answer: object) -> Any:
+    return json.loads(Replies(folder, 24_000).answer(answer).text)  # type: ignore[arg-type]
 
 
 def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
@@ -97,8 +102,7 @@ def _drive(
             leg += 1
         x = places[leg] + (time - edges[leg]) * legs[leg][1]
         messages.append(odom(BEGIN + round(time * S), x, 0.0, 0.0))
-    for nth, at in enumerate(range(0, len(messages), 365)):
-        write_mcap(bag_dir / "rec" / f"rec_{nth}.mcap", messages[at : at + 365])
+    write_splits(bag_dir, messages, 7.3)
     return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
 
 
@@ -110,7 +114,7 @@ def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> N
     [stop] = [each for each in answer.events if each.kind == "stop"]
     assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
     assert ((stop.end or 0) - BEGIN) / S == pytest.approx(ended, abs=0.0201)
-    reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    reply = shown(tmp_path, answer)
     assert reply["shortest_stop_s"] == 3.0
     assert reply["stood_s"] == pytest.approx(8.0, abs=0.0401)
     assert reply["events"][0]["duration_s"] == reply["stood_s"]
@@ -228,11 +232,9 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
         odom(BEGIN + nth * S // hz, draw.gauss(0, noise), draw.gauss(0, noise), 0.0)
         for nth in range(300 * hz)
     ]
-    for nth, at in enumerate(range(0, len(messages), 60 * hz)):
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[at : at + 60 * hz])
+    write_splits(tmp_path, messages, 60)
     memory = memory_of(tmp_path, recalls=recalls)
-    answer = over(memory, 0, 300)
-    reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    reply = shown(tmp_path, over(memory, 0, 300))
     assert reply["stood_s"] is None
     assert any("too noisy, or too few" in note for note in reply["notes"])
 
@@ -252,17 +254,8 @@ def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_pa
 def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
     tmp_path: Path, recalls: bool
 ) -> None:
-    write_mcap(
-        tmp_path / "rec" / "rec_0.mcap",
-        [odom(BEGIN + nth * S // 10, math.nan, 0.0, 0.0) for nth in range(100)],
-    )
-    write_mcap(
-        tmp_path / "rec" / "rec_1.mcap",
-        [
-            odom(BEGIN + nth * S // 10, math.nan if 150 <= nth < 180 else nth * 0.05, 0.0, 0.0)
-            for nth in range(100, 300)
-        ],
-    )
+    along = [math.nan if nth < 100 or 150 <= nth < 180 else nth * 0.05 for nth in range(300)]
+    write_splits(tmp_path, [odom(BEGIN + n * S // 10, x, 0.0, 0.0) for n, x in enumerate(along)])
     memory = memory_of(tmp_path, recalls=recalls)
     none = over(memory, 0, 9.95)
     assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
@@ -278,39 +271,21 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
     summary = trajectory_summary(
         memory, Call(), TimeRange(start_s=BEGIN / S + 10, end_s=BEGIN / S + 30)
     )
-    shown = json.loads(Replies(tmp_path, 24_000).answer(summary).text)["notes"]
-    assert {note for note in some.notes if "pose" in note} <= set(shown)
+    of_summary = shown(tmp_path, summary)["notes"]
+    assert {note for note in some.notes if "pose" in note} <= set(of_summary)
 
 
 def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
-    for nth, at in enumerate((0, 100)):
-        write_mcap(
-            tmp_path / f"bag_{nth}.mcap",
-            [odom(BEGIN + (at + t) * S, 0.1 * t, 0.0, 0.0) for t in range(10)],
-        )
+    seconds = [*range(10), *range(100, 110)]
+    write_splits(tmp_path, [odom(BEGIN + t * S, 0.1 * t, 0.0, 0.0) for t in seconds])
     answer = over(memory_of(tmp_path), 0, 120)
     [gap] = [each for each in answer.events if each.kind == "gap"]
     assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
 
 
 def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> None:
-    def log(at: int, level: int, msg: str) -> object:
-        return make(
-            "rcl_interfaces/msg/Log",
-            stamp=stamp(at),
-            level=level,
-            name="planner",
-            msg=msg,
-            file="",
-            function="",
-            line=0,
-        )
-
     said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
-    messages = [
-        Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + at * S, log(BEGIN, level, msg))
-        for at, level, msg in said
-    ]
+    messages = [log_entry(BEGIN + at * S, level, "planner", msg) for at, level, msg in said]
     write_mcap(tmp_path / "bag.mcap", messages)
     answer = over(memory_of(tmp_path), 0, 10)
     assert times(answer.events, "error") == [
@@ -338,14 +313,8 @@ def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") 
 def test_every_boolean_of_a_status_message_is_followed(
     tmp_path: Path, recalls: bool, flag: str
 ) -> None:
-    for bag in range(4):
-        write_mcap(
-            tmp_path / f"bag_{bag}.mcap",
-            [
-                _status(at, *([flag] if 13 <= at < 26 else []))
-                for at in (bag * 10 + nth * 0.5 for nth in range(20))
-            ],
-        )
+    times_s = [nth * 0.5 for nth in range(80)]
+    write_splits(tmp_path, [_status(at, *([flag] if 13 <= at < 26 else [])) for at in times_s])
     memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 40)
     assert times(answer.events, "flip") == [
@@ -393,17 +362,7 @@ def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path, recalls: 
 
 
 def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
-    log = make(
-        "rcl_interfaces/msg/Log",
-        stamp=stamp(BEGIN),
-        level=40,
-        name="planner",
-        msg="no path " * 40,
-        file="",
-        function="",
-        line=0,
-    )
-    write_mcap(tmp_path / "bag.mcap", [Msg("/rosout", "rcl_interfaces/msg/Log", BEGIN + S, log)])
+    write_mcap(tmp_path / "bag.mcap", [log_entry(BEGIN + S, 40, "planner", "no path " * 40)])
     [event] = over(memory_of(tmp_path), 0, 10).events
     assert event.text.startswith("error: planner: no path no path")
     assert event.text.endswith("…")
@@ -420,9 +379,7 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
         detections(BEGIN + round(at * S), [label], topic=f"/vision/{label}") for at, label in rows
     ]
     messages += [odom(BEGIN + n * S, 0.1 * n, 0.0, 0.0) for n in range(66)]
-    messages.sort(key=lambda each: each.log_time)
-    for nth in range(0, len(messages), 100):
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth : nth + 100])
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 65)
     assert answer.throughout == ("table",)
@@ -439,8 +396,7 @@ def test_a_thing_that_several_detectors_see_is_reported_once(tmp_path: Path) -> 
         detections(BEGIN + at * S, ["cup"] if at in {3, 4} else [], topic="/vision/other")
         for at in range(10)
     ]
-    messages = sorted([*one, *other], key=lambda each: each.log_time)
-    write_mcap(tmp_path / "bag.mcap", messages)
+    write_splits(tmp_path, [*one, *other])
     [event] = over(memory_of(tmp_path), 0, 10).events
     assert (event.text, event.start, event.end) == ("cup in view", BEGIN + 2 * S, BEGIN + 4 * S)
 
@@ -450,18 +406,16 @@ def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
     things = [
         detections(BEGIN + at * S, [f"thing {at // 5}"] if at % 5 == 0 else []) for at in range(100)
     ]
-    messages = sorted([*blinking, *things], key=lambda each: each.log_time)
-    write_mcap(tmp_path / "bag.mcap", messages)
+    write_splits(tmp_path, [*blinking, *things], 100)
     answer = over(memory_of(tmp_path), 0, 100)
     assert len(answer.events) == MOST_EVENTS
     assert len(times(answer.events, "flip")) == 19
     assert dict(answer.counts) == {"on/off changes": 19, "sightings": 20}
     assert any("left out, because there are too many: 14 sightings" in n for n in answer.notes)
     assert [each.start for each in answer.events] == sorted(each.start for each in answer.events)
-    reply = Replies(tmp_path, 24_000).answer(answer).text
-    assert len(reply) < 3_500
-    keys = {"timestamp", "ago_s", "text", "duration_s", "score"}
-    assert set(json.loads(reply)["events"][0]) == keys
+    reply = shown(tmp_path, answer)
+    assert len(json.dumps(reply)) < 3_700
+    assert {*reply["events"][0]} == {"timestamp", "ago_s", "text", "duration_s", "score"}
 
 
 def test_a_stop_a_hair_below_0_is_reported_without_a_sign(tmp_path: Path) -> None:
@@ -478,8 +432,7 @@ def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> Non
         for at in range(20)
     ]
     flips = [boolean(BEGIN + at * S, 3 <= at < 7) for at in range(20)]
-    messages = sorted([*stood, *seen, *flips], key=lambda each: each.log_time)
-    write_mcap(tmp_path / "bag.mcap", messages)
+    write_splits(tmp_path, [*stood, *seen, *flips], 20)
     answer = {each.text: each.goes_on for each in over(memory_of(tmp_path), 0, 30).events}
     assert answer == {
         "stood at x 1.00, y 2.00": True,
@@ -517,8 +470,7 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
         messages.append(odom(at, x, 0.0))
         if step % 10 == 0:
             messages.append(tf(at, transform(at, "map", "odom", (-2.0 * nth, nth + 1.0, 0.0))))
-    for nth in range(6):
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages[nth * 110 : (nth + 1) * 110])
+    write_splits(tmp_path, messages)
     memory = in_places(memory_of(tmp_path))
     memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 200)
@@ -555,11 +507,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
             messages.append(detections(BEGIN + step * S // 10, [label]))
         if step in {180, 450, 460}:
             messages.append(log_entry(BEGIN + step * S // 10, 40, "base", "stuck"))
-    for nth in range(7):
-        write_mcap(
-            tmp_path / "rec" / f"rec_{nth}.mcap",
-            [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth],
-        )
+    write_splits(tmp_path, messages)
     memory = in_places(memory_of(tmp_path), "odom")
     memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
@@ -590,15 +538,14 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
 def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
     tmp_path: Path, recalls: bool
 ) -> None:
-    for nth in range(3):
-        messages = []
-        for second in range(nth * 10, nth * 10 + 10):
-            at = BEGIN + second * S
-            cup = 0.62 if second == 14 else 0.3
-            messages.append(detections(at, ["cup"], score=cup, topic="/front/detections"))
-            messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
-            messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", messages)
+    messages = []
+    for second in range(30):
+        at = BEGIN + second * S
+        cup = 0.62 if second == 14 else 0.3
+        messages.append(detections(at, ["cup"], score=cup, topic="/front/detections"))
+        messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
+        messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, recalls=recalls)
 
     def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
@@ -631,9 +578,7 @@ def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
         x += (0.05 if 12 <= seconds < 15 else 0.0 if seconds >= 30 else 0.5) / 20
         if step % 20 == 0:
             messages.append(boolean(at, int(seconds) in {11, 12, 13}, topic="/blocked"))
-    for nth in range(4):
-        inside = [each for each in messages if (each.log_time - BEGIN) // (10 * S) == nth]
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", inside)
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, recalls=recalls)
     answer = over(memory, 0, 40)
     [drop] = [each for each in answer.events if each.kind == "drop"]

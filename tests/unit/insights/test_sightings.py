@@ -109,47 +109,6 @@ def seconds(memory: Memory, value: str, topic: str, **given: object) -> list[tup
     return [((each.first - BEGIN) / S, (each.last - BEGIN) / S) for each in answer.sightings]
 
 
-def test_a_message_is_decoded_once_for_a_question(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory = spoken(tmp_path, *[(at, "cup" if at % 3 else f"mug{at}") for at in range(30)])
-    exact, decoded = memory.extractor.exact, list[str]()
-
-    def counted(message: object, type_name: str) -> JsonValue:
-        decoded.append(type_name)
-        return exact(message, type_name)
-
-    monkeypatch.setattr(memory.extractor, "exact", counted)
-    first = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=100)
-    once = len(decoded)
-    again = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=100)
-    assert again == first
-    assert len(again.sightings) == 10
-    assert len(decoded) - once <= len(again.sightings)
-    assert len(find_matches(memory, Call(), OBJECTS, "contains", "mug", limit=100).sightings) == 10
-
-
-def test_positions_are_compared_without_decoding_messages_one_by_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_mcap(
-        tmp_path / "rec_0" / "rec_0_0.mcap",
-        [odom(BEGIN + at * S, float(at // 10 % 2), 0.0) for at in range(60)],
-    )
-    memory = memory_of(tmp_path, limits=QuerySettings(now="latest"))
-
-    def ask(**given: object) -> list[tuple[int, int, int]]:
-        near: JsonValue = {"x": 1.0, "y": 0.0}
-        found = find_matches(memory, Call(), "/odom", "near_position", near, **given)  # type: ignore[arg-type]
-        return [(each.first, each.last, each.messages) for each in found.sightings]
-
-    expected = [(BEGIN + at * S, BEGIN + (at + 9) * S, 10) for at in (50, 30, 10)]
-    monkeypatch.delattr(ReverseSearch, "matches")
-    assert ask() == expected
-    assert ask(limit=1, oldest_first=True) == expected[-1:]
-    assert ask(start_s=BEGIN / S + 15) == [*expected[:2], (BEGIN + 15 * S, BEGIN + 19 * S, 5)]
-
-
 @each_way
 def test_detections_of_a_low_score_count_only_where_none_is_asked_for(
     tmp_path: Path, recalls: bool

@@ -19,9 +19,7 @@ from ros2_memory.bag_dir.state_files import (
     append_losses,
 )
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.status import memory_status
-from ros2_memory.queries import topic_range
 from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
@@ -152,20 +150,7 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
     )
 
 
-@pytest.mark.parametrize(("start", "lost"), [(0, 4), (12, 0)])
-def test_an_answer_notes_what_was_lost_in_its_window_alone(
-    tmp_path: Path, start: int, lost: int
-) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
-    append_losses(tmp_path, [Loss("/odom", BEGIN + 10 * S, BEGIN + 11 * S, 4, "stamps")])
-    begin = (BEGIN + start * S) / S
-    found = topic_range(memory, Call(), "/odom", TimeRange(begin, begin + 15))
-    notes = [note for note in found.notes if "lost" in note]
-    assert [note[: note.find(" by")] for note in notes] == ["4 messages missing"][: bool(lost)]
-    assert all(note.endswith(": /odom (4)") for note in notes)
-
-
-def test_a_comparison_says_in_which_window_messages_are_missing(tmp_path: Path) -> None:
+def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
     memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
     append_losses(
         tmp_path,
@@ -175,20 +160,17 @@ def test_a_comparison_says_in_which_window_messages_are_missing(tmp_path: Path) 
         ],
     )
     begin = BEGIN / S
+    for start, lost in ((0, 1), (12, 0), (25, 6)):
+        window = {"start": begin + start, "end": begin + start + 15}
+        found = asked(memory, tmp_path, "get_topic_in_range", topic="/odom", **window)
+        notes = [note for note in found.get("notes", ()) if "lost" in note]
+        assert [int(note[0]) for note in notes] == [lost] * bool(lost)
     asks = {"start": begin, "end": begin + 20, "with_start": begin + 21, "with_end": begin + 45}
     notes = asked(memory, tmp_path, "compare", **asks)["notes"]
     assert "from start to end: 1 message lost before it was recorded: /odom (1)" in notes
     assert (
         "from with_start to with_end: 6 messages lost before they were recorded: /odom (6)" in notes
     )
-
-
-def test_a_recorder_that_waits_says_for_what(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
-    beating(tmp_path, RecorderState.WAITING, 59, waiting_for="no /clock")
-    told = shown(memory, tmp_path)
-    assert told["recorder"] == "waiting"
-    assert told["doubts"] == "the recorder waits: no /clock"
 
 
 def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:
@@ -250,18 +232,19 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("state", "at", "doubts"),
+    ("state", "at", "more", "doubts"),
     [
-        (RecorderState.RECORDING, -100, "the recorder died"),
-        (RecorderState.PAUSED, 59, "the recorder is paused: it gives no reason"),
-        (RecorderState.STOPPED, 59, "no loss or fault was found"),
+        (RecorderState.RECORDING, -100, {}, "the recorder died"),
+        (RecorderState.PAUSED, 59, {}, "the recorder is paused: it gives no reason"),
+        (RecorderState.WAITING, 59, {"waiting_for": "no clock"}, "the recorder waits: no clock"),
+        (RecorderState.STOPPED, 59, {}, "no loss or fault was found"),
     ],
 )
 def test_a_recorder_that_does_not_record_is_reported(
-    tmp_path: Path, state: RecorderState, at: float, doubts: str
+    tmp_path: Path, state: RecorderState, at: float, more: dict[str, str], doubts: str
 ) -> None:
     memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
-    beating(tmp_path, state, at)
+    beating(tmp_path, state, at, **more)
     assert shown(memory, tmp_path)["doubts"] == doubts
 
 

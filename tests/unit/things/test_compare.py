@@ -8,21 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.insights.compare import differ
-from ros2_memory.results import (
-    ComparedMover,
-    ComparedThing,
-    ComparedThings,
-    Comparison,
-    FarFromOther,
-    MoverSeen,
-    Pair,
-    StandstillPlace,
-    ThingStay,
-)
-from ros2_memory.tools.reply_json import as_json
-from ros2_memory.tools.reply_size import to_json_text
-from tests.support.bags import Msg, log_entry
+from tests.support.bags import Msg, log_entry, write_splits
 from tests.support.memories import asked, memory_of, replied
 from tests.unit.things.test_find import (
     AWAY,
@@ -31,7 +17,6 @@ from tests.unit.things.test_find import (
     NAMED,
     looked,
     scene,
-    write,
 )
 
 if TYPE_CHECKING:
@@ -48,7 +33,7 @@ LATER = {"start": BEGIN + 60, "end": BEGIN + 89}
 
 
 def compared(bag_dir: Path, messages: Sequence[Msg], **given: object) -> Any:
-    write(bag_dir, messages)
+    write_splits(bag_dir, messages)
     return ask(bag_dir, **{**EARLIER, **LATER, **given})
 
 
@@ -288,8 +273,8 @@ def test_standstills_are_compared_by_place_and_length(tmp_path: Path) -> None:
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
     stood = [scene(at, HERE, [BOOK], in_map=False) for at in range(30)]
     later = [scene(at, (3.0, 0.0, 0.0), [BOOK], in_map=False) for at in range(60, 90)]
-    write(tmp_path / "two", [each for one in stood for each in one], name="first")
-    write(tmp_path / "two", [each for one in later for each in one], name="second")
+    write_splits(tmp_path / "two", [each for one in stood for each in one], name="first")
+    write_splits(tmp_path / "two", [each for one in later for each in one], name="second")
     reply = ask(tmp_path / "two", **EARLIER, **LATER)
     assert not reply.keys() & {"stood_at", "farthest_apart"}
     assert any("changes with every start" in note for note in reply["notes"])
@@ -298,7 +283,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     [book] = reply["things"]["not_comparable"]
     assert labels(reply) == {"not_comparable": ["book"]}
     assert (book["was"]["last_seen"], book["is"]["first_seen"]) == (BEGIN + 29, BEGIN + 60)
-    write(tmp_path / "one", [each for one in (*stood, *later) for each in one])
+    write_splits(tmp_path / "one", [each for one in (*stood, *later) for each in one])
     reply = ask(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
@@ -312,7 +297,7 @@ def test_of_odometry_that_began_anew_only_what_one_window_saw_was_not_looked_at(
     first = [scene(at, HERE, [BOOK, ("book", 3.5, 1.5), person], in_map=False) for at in range(30)]
     second = [scene(at, HERE, [BOOK, MUG, person], in_map=False) for at in range(60, 90)]
     for name, some in (("first", first), ("second", second)):
-        write(tmp_path, [each for one in some for each in one], name=name)
+        write_splits(tmp_path, [each for one in some for each in one], name=name)
     reply = ask(tmp_path, **EARLIER, **LATER)
     assert labels(reply) == {
         "not_comparable": ["book"],
@@ -359,44 +344,6 @@ def test_what_moves_by_itself_is_told_where_it_was_last(tmp_path: Path) -> None:
     assert away["things"] == {}
 
 
-def test_a_comparison_is_cut_to_6_kb_however_much_differs(tmp_path: Path) -> None:
-    at, name, pair = (
-        BEGIN * S + 565_926_123,
-        ("upstairs living room", "upstairs"),
-        Pair(100000.12, 34.56),
-    )
-    stay = ThingStay(at, at, (-112.34, -113.45, 1.0), 1000, name)
-    thing = ComparedThing("l" * 99, stay, stay, at, 1000)
-    seen = MoverSeen(3, 10_000, (-112.34, -113.45, 1.0), name, at)
-    point = FarFromOther((-112.34, -113.45), name, 12.3, at)
-    many = tuple((f"{nth} {'x' * 120}", pair) for nth in range(20))
-    things = (thing,) * 20
-    answer = Comparison(
-        oldest=at - 86_400 * S,
-        newest=at,
-        lengths=pair,
-        recorded=pair,
-        frame_id="map",
-        things=ComparedThings(
-            things, things, things, things, 100, (ComparedMover("p" * 99, seen, seen),) * 20
-        ),
-        way=tuple((each, pair) for each in ("distance_m", "max_speed", "stood_s", "standstills")),
-        places=many,
-        errors=many,
-        silences=many,
-        way_frame_id="odom",
-        stood=(StandstillPlace(point.place, name, pair, (at, at)),) * 20,
-        farthest=(point, point),
-        notes=("a note " * 50,) * 3,
-    )
-    reply = as_json(answer, tmp_path)
-    assert isinstance(reply, dict)
-    assert 3_000 < len(to_json_text(reply)) <= 6_000
-    cut: Any = reply
-    assert (cut["stood_at_total"], cut["things"]["movers_total"], cut["errors_total"]) == (20,) * 3
-    assert len(cut["things"]["moved"]) == 2 * len(cut["stood_at"]) > 0
-
-
 def test_a_window_that_is_none_is_refused_by_its_name(tmp_path: Path) -> None:
     reply = compared(tmp_path, looked(0, 10, HERE), with_start=BEGIN + 9, with_end=BEGIN)
     assert reply["error"] == "invalid_arguments"
@@ -436,7 +383,7 @@ def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
         log_entry((BEGIN + 61 + nth) * S, 40, "drive", f"{nth} {'broken ' * 40}")
         for nth in range(20)
     ]
-    write(tmp_path, messages)
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, limits=NAMED)
     text = replied(memory, tmp_path, "compare", {**EARLIER, **LATER}).text
     reply = ask(tmp_path, **EARLIER, **LATER)
@@ -447,18 +394,3 @@ def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
         assert len(things[kind]) == shown
         assert 20 < things[f"{kind}_total"] <= 24
     assert reply["errors_total"] == 20
-
-
-@pytest.mark.parametrize(
-    ("one", "two", "least", "differs"),
-    [
-        (100.0, 109.0, 0.5, False),
-        (100.0, 112.0, 0.5, True),
-        (0.2, 0.6, 0.5, False),
-        (0.0, 1.0, 0.5, True),
-    ],
-)
-def test_numbers_differ_by_a_tenth_and_by_more_than_noise(
-    one: float, two: float, least: float, *, differs: bool
-) -> None:
-    assert differ(one, two, least) is differ(two, one, least) is differs

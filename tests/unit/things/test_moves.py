@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.sights import fixes_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.things.localisation import poorly_localised
-from ros2_memory.things.moves import Sightings, stays_in, visits_of
-from tests.support.bags import Msg, header, make, point, quaternion
+from ros2_memory.things.moves import Sightings, stays_in
+from tests.support.bags import Msg, header, make, point, quaternion, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
 from tests.support.sights import Message, sights_of_messages
-from tests.unit.things.test_find import BEGIN, NAMED, S, scene, write
+from tests.unit.things.test_find import BEGIN, NAMED, S, scene
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -73,7 +73,7 @@ class Home:
 
 
 def found(bag_dir: Path, home: Home) -> dict[str, Any]:
-    write(bag_dir, home.messages)
+    write_splits(bag_dir, home.messages)
     reply = ask(bag_dir, "find_things")
     assert reply["labels"] == dict.fromkeys(sorted(LABELS), 1)
     return {each["label"]: each for each in reply["things"]}
@@ -174,21 +174,6 @@ def test_nearly_all_small_moves_are_found_and_none_is_made_up(noise: dict[str, A
     assert right >= 0.99 * 40 * len(LABELS)
 
 
-def test_a_thing_that_came_back_has_three_stays() -> None:
-    draw = np.random.default_rng(1)
-    there, away = [(0.0, 0.0)] * 4, [(400.0, 0.0)] * 3
-    [stay] = stays_in([sightings(draw, [*there, *away, *there])])
-    assert stay.tolist() == [0] * 8 + [1] * 6 + [2] * 8
-
-
-def test_a_thing_that_is_moved_while_it_is_watched_has_two_stays() -> None:
-    draw = np.random.default_rng(1)
-    seen = sightings(draw, [(0.0, 0.0)] * 20 + [(300.0, 0.0)] * 4)
-    begin = np.arange(len(seen.n)) * 10 * S
-    [stay] = stays_in([seen._replace(first=begin, last=begin + 9 * S)])
-    assert stay.tolist() == [0] * 40 + [1] * 8
-
-
 def test_one_far_look_moves_nothing() -> None:
     draw = np.random.default_rng(1)
     seen = sightings(draw, [(0.0, 0.0)] * 6 + [(500.0, 0.0)])
@@ -213,11 +198,6 @@ def test_stays_do_not_depend_on_where_the_map_begins(
     turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     other = seen._replace(xy=seen.xy @ turned + np.array(off), side=seen.side @ turned)
     assert stays_in([seen])[0].tolist() == stays_in([other])[0].tolist()
-
-
-def test_a_visit_ends_with_a_pause() -> None:
-    first = np.array([0, 10, 75, 200, 210]) * S
-    assert visits_of(first, first + 9 * S).tolist() == [0, 0, 0, 1, 1]
 
 
 # -- while localisation was poor -----------------------------------------------------------------
@@ -250,7 +230,7 @@ def test_what_is_seen_before_the_map_jumps_moves_nothing(tmp_path: Path) -> None
     for start in (34, 38):
         folder = tmp_path / str(start)
         slipped = [*seen_off(0, start, 0.0), *seen_off(start, start + 4, 0.5)]
-        write(folder, [*slipped, *seen_off(start + 4, start + 6, 0.0)])
+        write_splits(folder, [*slipped, *seen_off(start + 4, start + 6, 0.0)])
         reply = ask(folder, "find_things")
         assert {each["place"]["y"] for each in reply["things"]} == {0.5, -1.0}
         assert not any("moved" in each for each in reply["things"])
@@ -261,7 +241,7 @@ def test_what_is_seen_with_a_large_covariance_moves_nothing(
     tmp_path: Path, sigma_m: float, is_poor: bool
 ) -> None:
     good, later = seen_off(0, 30, 0.0), seen_off(90, 120, 0.4)
-    write(tmp_path, [amcl(0, 0.1), *good, amcl(89.9, sigma_m), *later])
+    write_splits(tmp_path, [amcl(0, 0.1), *good, amcl(89.9, sigma_m), *later])
     reply = ask(tmp_path, "find_things")
     for thing in reply["things"]:
         assert ("moved" in thing) == (not is_poor)
@@ -294,7 +274,7 @@ NOT_SAID: Final = np.full(30, math.nan)
 
 
 def test_a_thing_that_was_only_seen_while_localisation_was_poor_is_listed(tmp_path: Path) -> None:
-    write(tmp_path, [amcl(0, 2.0), *seen_off(0, 30, 0.0)])
+    write_splits(tmp_path, [amcl(0, 2.0), *seen_off(0, 30, 0.0)])
     reply = ask(tmp_path, "find_things", label="mug")
     [mug] = reply["things"]
     assert (mug["place"]["y"], mug["count"]) == (0.5, 30)
@@ -305,7 +285,7 @@ def test_a_thing_that_was_only_seen_while_localisation_was_poor_is_listed(tmp_pa
 
 def test_what_is_far_off_while_localisation_is_poor_is_no_second_thing(tmp_path: Path) -> None:
     far = seen_off(90, 120, 3.0)
-    write(tmp_path, [amcl(0, 0.1), *seen_off(0, 30, 0.0), amcl(89.9, 2.0), *far])
+    write_splits(tmp_path, [amcl(0, 0.1), *seen_off(0, 30, 0.0), amcl(89.9, 2.0), *far])
     reply = ask(tmp_path, "find_things", label="mug")
     [mug] = reply["things"]
     assert (mug["place"]["y"], mug["last_seen"]) == (0.5, BEGIN + 29)

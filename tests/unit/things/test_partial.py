@@ -19,8 +19,9 @@ from ros2_memory.storage.cache import ByteLru
 from ros2_memory.things import known
 from ros2_memory.things.find import find_things
 from ros2_memory.things.instances import Estimate, estimate
+from tests.support.bags import write_splits
 from tests.support.memories import memory_of, with_store
-from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked, write
+from tests.unit.things.test_find import BEGIN, HERE, NAMED, looked
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
@@ -49,7 +50,7 @@ def fresh(tmp_path: Path) -> Callable[[], Memory]:
     None knows what another has read.
     """
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
-    write(tmp_path, [message for some in moments for message in some])
+    write_splits(tmp_path, [message for some in moments for message in some])
     stored = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).columns
     assert stored is not None
     return lambda: replace(
@@ -100,7 +101,7 @@ def test_a_count_says_since_when_it_counted(fresh: Callable[[], Memory]) -> None
 def crowded(tmp_path: Path) -> Memory:
     """A memory of eight bags, each with a thing of its own."""
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
-    write(tmp_path, [message for some in moments for message in some])
+    write_splits(tmp_path, [message for some in moments for message in some])
     return with_store(memory_of(tmp_path, limits=NAMED), tmp_path)
 
 

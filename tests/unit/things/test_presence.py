@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import CELL_MM, Hit, Look, Sights
+from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
@@ -45,10 +46,9 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     assert not {*cells.cell[found.looks[found.fair]]} & {*cells.cell[left_out]}
     assert [*stays_at(cells, found)] == [*stays_at(cells, whole)]
     for _, stay in stays_at(cells, found):
-        for after in (0, cells.last[len(cells.last) // 2]):
-            assert chance_of_missing(cells, found, stay, after) == chance_of_missing(
-                cells, whole, stay, after
-            )
+        for after in (0, int(cells.last[len(cells.last) // 2])):
+            by = stay, after, (after + 1, MAX_NS)
+            assert chance_of_missing(cells, found, *by) == chance_of_missing(cells, whole, *by)
 
 
 @given(_looks, _unplaced, _looks, st.lists(st.booleans(), min_size=120, max_size=120))

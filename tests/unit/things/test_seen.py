@@ -17,8 +17,9 @@ from ros2_memory.history.view import View
 from ros2_memory.things import placing
 from ros2_memory.things.find import find_things
 from ros2_memory.things.seen import SIGHTS_NS, Watching
+from tests.support.bags import write_splits
 from tests.support.column_worlds import EVERYTHING, World, store_file
-from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked, write
+from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,7 +74,7 @@ def stored(bag_dir: Path) -> int:
 def test_sights_are_the_same_however_a_history_is_cut(tmp_path: Path) -> None:
     found = []
     for split_s in (3.0, 10.0, 47.0, 5000.0):
-        write(tmp_path / f"{split_s}", day(), split_s)
+        write_splits(tmp_path / f"{split_s}", day(), split_s)
         found.append(sights_in(World.of(tmp_path / f"{split_s}").memory))
     for other in found[1:]:
         assert other.labels == found[0].labels == ("cup", "mug")
@@ -84,7 +85,7 @@ def test_sights_are_the_same_however_a_history_is_cut(tmp_path: Path) -> None:
 def test_another_process_finds_stored_sights_and_reads_no_messages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    write(tmp_path, day())
+    write_splits(tmp_path, day())
     plain = things_in(World.of(tmp_path).memory)
     world = made_in(tmp_path)
     assert {thing.label for thing in plain} == {"cup", "mug"}
@@ -93,7 +94,7 @@ def test_another_process_finds_stored_sights_and_reads_no_messages(
 
 
 def test_sights_go_with_the_parts_that_they_follow_from(tmp_path: Path) -> None:
-    write(tmp_path, day())
+    write_splits(tmp_path, day())
     world = made_in(tmp_path)
     assert stored(tmp_path) == 2
     first = [path for path in world.store.paths() if path.endswith(("_0.mcap", "_1.mcap"))]
@@ -104,11 +105,11 @@ def test_sights_go_with_the_parts_that_they_follow_from(tmp_path: Path) -> None:
 
 
 def test_sights_are_made_again_where_a_late_bag_comes_beside_their_parts(tmp_path: Path) -> None:
-    write(tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5)))
+    write_splits(tmp_path, looked(0, 20, HERE, ("mug", 3.0, 0.5)))
     world = made_in(tmp_path)
     assert [thing.label for thing in things_in(world.memory)] == ["mug"]
     late = looked(30, 50, HERE, ("vase", 2.0, -1.5))
-    write(tmp_path, [message for message in late if message.log_time >= BEGIN * 10**9])
+    write_splits(tmp_path, [message for message in late if message.log_time >= BEGIN * 10**9])
     assert {thing.label for thing in things_in(another(world))} == {"mug", "vase"}
     world.fill()
     make(world.memory)
@@ -123,6 +124,6 @@ def test_a_bag_of_odd_times_has_the_sights_of_its_messages_alone(
         *looked(0, 10, HERE, ("mug", 3.0, 0.5)),
         *looked(apart_s + 20, apart_s + 30, HERE, ("cup", 2.0, 0.0)),
     ]
-    write(tmp_path, odd, split_s=10.0**10)
+    write_splits(tmp_path, odd, split_s=10.0**10)
     world = World.of(tmp_path)
     assert sights_in(world.memory).labels == ("cup", "mug")
