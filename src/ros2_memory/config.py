@@ -55,7 +55,7 @@ from ros2_memory.config_sources import (
     parse_overrides,
 )
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.things.labels import plain, singular
+from ros2_memory.things.labels import singular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -170,7 +170,7 @@ def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[s
     known: dict[str, tuple[str, str]] = {}
     for name, spellings in labels.items():
         for each in (name, *spellings):
-            key = singular(plain(each))
+            key = singular(each)
             if not key:
                 raise ValueError(f"must not contain an empty spelling, as under {name!r}")
             first, other = known.setdefault(key, (each, name))

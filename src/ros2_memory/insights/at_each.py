@@ -164,15 +164,12 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     over = timedelta(days=ends <= begins)
     # The hours of the day before may go on after midnight.
     days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
-    spans = [
-        TimeWindow(*(ns_from_unix(_moment(*at)) for at in ends_of_day))
-        for ends_of_day in (((day, begins), (day + over, ends)) for day in days)
-    ]
+    spans = [TimeWindow(_moment(day, begins), _moment(day + over, ends)) for day in days]
     return [part for span in spans if not (part := window.intersect(span)).empty]
 
 
-def _moment(day: date, at: time) -> float:
-    """Returns a local time of a day in Unix seconds; of one that clocks skip, when they do."""
+def _moment(day: date, at: time) -> Ns:
+    """Returns a local time of a day; of one that clocks skip, when they do."""
     local = datetime.combine(day, at)
     # By the time before clocks are put forward, what is skipped is later than by that after.
     low, high = local.replace(fold=1).timestamp(), local.timestamp()
@@ -181,4 +178,4 @@ def _moment(day: date, at: time) -> float:
         ahead = datetime.fromtimestamp(middle).astimezone().utcoffset()
         is_before = ahead == datetime.fromtimestamp(low).astimezone().utcoffset()
         low, high = (middle, high) if is_before else (low, middle)
-    return high
+    return ns_from_unix(high)

@@ -17,7 +17,6 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns.shown import Kept, nowhere
-from ros2_memory.columns.stored import StoredTable, joined_stored
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
@@ -26,7 +25,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -43,8 +42,6 @@ NOT_MET: Final = 0
 UNKNOWN: Final = 2
 """The message cannot be decoded."""
 
-_MOST_TOGETHER: Final = 64
-"""Parts whose columns are tested at once."""
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
 
@@ -104,7 +101,16 @@ class Matching:
         """
         waiting: Block | None = None
         try:
-            for block in self._blocks(topic, window):
+            for rows in scan(
+                self._view,
+                topic,
+                window,
+                newest_first=True,
+                may_match=self._test.may_match,
+                may_not_match=True,
+                may_be_empty=True,
+            ):
+                block = self._block(topic, rows, window)
                 if waiting is None or block.last < waiting.first:
                     if waiting is not None:
                         yield waiting
@@ -120,56 +126,27 @@ class Matching:
         if waiting is not None:
             yield waiting
 
-    def _blocks(self, topic: str, window: TimeWindow) -> Iterator[Block]:
-        """Yields a block for each table, the newest first; of parts that are alike one for many."""
-        most = 1
-        together: list[Rows] = []
-        scanned = scan(
-            self._view,
-            topic,
-            window,
-            newest_first=True,
-            may_match=self._test.may_match,
-            may_not_match=True,
-            may_be_empty=True,
-        )
-        try:
-            for rows in scanned:
-                if together and not (len(together) < most and _follows(rows, together[-1])):
-                    yield self._block(topic, together[::-1], window)
-                    # Who goes on reads many.
-                    most, together = min(2 * most, _MOST_TOGETHER), []
-                together.append(rows)
-        except QueryTimeoutError:
-            if together:
-                yield self._block(topic, together[::-1], window)
-            raise
-        if together:
-            yield self._block(topic, together[::-1], window)
-
-    def _block(self, topic: str, parts: Sequence[Rows], window: TimeWindow) -> Block:
-        stored = [rows.table for rows in parts if isinstance(rows.table, StoredTable)]
-        table = parts[0].table if len(parts) == 1 else joined_stored(stored)
-        truth = self._test.truth(table) if parts[0].may_match else nowhere(len(table))
+    def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
+        truth = self._test.truth(rows.table) if rows.may_match else nowhere(len(rows.table))
         self.ruled_out |= truth.is_none
-        first, last = max(parts[0].first, window.start), min(parts[-1].last, window.stop - 1)
-        tested = partial(self._tested, topic, parts, truth)
+        first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
+        tested = partial(self._tested, topic, rows, truth)
         return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
-    def _tested(self, topic: str, parts: Sequence[Rows], truth: Kept) -> Tested:
+    def _tested(self, topic: str, rows: Rows, truth: Kept) -> Tested:
         """Tests the rows that count: by columns, and by messages where these leave it open."""
-        counting = np.concatenate([rows.mask() for rows in parts])
+        counting = rows.mask()
         self.ruled_out |= not truth.perhaps[counting].all()
-        times = np.concatenate([rows.times for rows in parts])
-        sources = self._sources(topic, parts)
+        source = self._numbers_of(topic)[rows.recording, rows.table.channel.type]
+        sources = np.full(len(rows), source)
         found = truth.surely[counting].astype(np.uint8)
         undecided = np.flatnonzero(truth.unsure[counting])
         if undecided.size:
             # Messages that lie close together are read at once.
-            edges = np.flatnonzero(np.diff(times[undecided]) > _TOGETHER_NS) + 1
+            edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
             for some in np.split(undecided, edges):
-                found[some] = self._read(topic, times[some], sources[some])
-        return Tested(times, found, sources)
+                found[some] = self._read(topic, rows.times[some], sources[some])
+        return Tested(rows.times, found, sources)
 
     def _read(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
         """Returns what the messages at some log times, which ascend, are found to be."""
@@ -186,12 +163,6 @@ class Matching:
         wanted = zip(times.tolist(), sources.tolist(), strict=True)
         return [read[key].pop() if read[key] else NOT_MET for key in wanted]
 
-    def _sources(self, topic: str, parts: Sequence[Rows]) -> IntArray:
-        """Returns for each of some rows the number of its recording and type."""
-        numbers = self._numbers_of(topic)
-        of = [numbers[rows.recording, rows.table.channel.type] for rows in parts]
-        return np.repeat(of, [*map(len, parts)])
-
     def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
         if topic not in self._numbers:
@@ -200,19 +171,6 @@ class Matching:
             sources = product(recordings, sorted(timeline.types_of(topic)))
             self._numbers[topic] = {source: nth for nth, source in enumerate(sources)}
         return self._numbers[topic]
-
-
-def _follows(older: Rows, newer: Rows) -> bool:
-    """Returns whether some rows end before others begin, and have the same columns."""
-    one, other = older.table, newer.table
-    return (
-        older.last < newer.first
-        and older.may_match == newer.may_match
-        and isinstance(one, StoredTable)
-        and isinstance(other, StoredTable)
-        and one.channel is other.channel
-        and one.left_out == other.left_out
-    )
 
 
 def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
@@ -236,60 +194,6 @@ def _of(topic: str, tested: Tested) -> Block:
     return Block(topic, first, last, has_match=bool(tested.met.any()), tested=lambda: tested)
 
 
-class Runs(NamedTuple):
-    """Consecutive matches in a block, in order.
-
-    Attributes:
-        firsts: log time of the first match of each.
-        lasts: of the last.
-        counts: how many matches.
-        ends: of the next message of the block that is none; `MAX_NS` without one.
-        goes_back: whether an earlier match may belong to the first run.
-        goes_on: whether a later match may belong to the last run.
-        is_blank: whether it has neither a match nor a message that surely is none.
-    """
-
-    firsts: IntArray
-    lasts: IntArray
-    counts: IntArray
-    ends: IntArray
-    goes_back: bool
-    goes_on: bool
-    is_blank: bool
-
-
-def runs_of(tested: Tested, silence_ns: Ns, *, apart: bool = False) -> Runs:
-    """Returns the runs of matches in some messages, of which there is at least one.
-
-    A run ends with a message that does not match, and where none comes for longer than
-    `silence_ns`. With `apart` each match is a run of its own.
-    """
-    times, met = tested.times, tested.met
-    begins = np.empty(times.size, np.bool_)
-    begins[0], begins[1:] = False, np.diff(times) > silence_ns
-    # Of two matches, this differs where a message that is none, or a silence, lies between them.
-    ends = np.cumsum((met == NOT_MET) | begins)
-    rows = np.flatnonzero(met == MET)
-    blank = not rows.size and int(ends[-1]) == 0
-    if not rows.size:
-        none = np.empty(0, np.int64)
-        return Runs(none, none, none, none, goes_back=False, goes_on=False, is_blank=blank)
-    new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
-    starts = np.flatnonzero(new)
-    stops = np.r_[starts[1:], rows.size]
-    others = np.flatnonzero(met == NOT_MET)
-    after = np.searchsorted(others, rows[stops - 1])
-    return Runs(
-        times[rows[starts]],
-        times[rows[stops - 1]],
-        stops - starts,
-        np.append(times[others], MAX_NS)[after],
-        goes_back=not apart and int(ends[rows[0]]) == 0,
-        goes_on=not apart and ends[rows[-1]] == ends[-1],
-        is_blank=False,
-    )
-
-
 @dataclass(frozen=True, slots=True)
 class Run:
     """Consecutive matches on one topic.
@@ -309,6 +213,52 @@ class Run:
     messages: int
     until: Ns | None
     begun: bool = True
+
+
+class Runs(NamedTuple):
+    """Consecutive matches in a block.
+
+    Attributes:
+        found: the newest first.
+        goes_back: whether an earlier match may belong to the oldest.
+        goes_on: whether a later match may belong to the newest.
+        is_blank: whether it has neither a match nor a message that surely is none.
+    """
+
+    found: list[Run]
+    goes_back: bool = False
+    goes_on: bool = False
+    is_blank: bool = False
+
+
+def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> Runs:
+    """Returns the runs of matches in some messages, of which there is at least one.
+
+    A run ends with a message that does not match, and where none comes for longer than
+    `SILENCE_NS`. With `apart` each match is a run of its own. The next block begins at `after`.
+    """
+    times, met = tested.times, tested.met
+    begins = np.diff(times, prepend=times[0]) > SILENCE_NS
+    # Of two matches, this differs where a message that is none, or a silence, lies between them.
+    ends = np.cumsum((met == NOT_MET) | begins)
+    rows = np.flatnonzero(met == MET)
+    if not rows.size:
+        return Runs([], is_blank=int(ends[-1]) == 0)
+    new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
+    starts = np.flatnonzero(new)
+    stops = np.r_[starts[1:], rows.size]
+    others = np.flatnonzero(met == NOT_MET)
+    until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
+    columns = times[rows[starts]], times[rows[stops - 1]], stops - starts, np.minimum(until, after)
+    found = [
+        Run(topic, first, last, messages, None if end == MAX_NS else end)
+        for first, last, messages, end in zip(*(each.tolist() for each in columns), strict=True)
+    ]
+    return Runs(
+        found[::-1],
+        goes_back=not apart and int(ends[rows[0]]) == 0,
+        goes_on=not apart and ends[rows[-1]] == ends[-1],
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -349,19 +299,18 @@ class _OfTopic:
         tested = block.tested()
         if not tested.times.size:
             return
-        runs = runs_of(tested, SILENCE_NS, apart=self._apart)
         after, self._begins = self._begins, int(tested.times[0])
+        runs = runs_of(self._topic, tested, after, apart=self._apart)
         is_near = after - int(tested.times[-1]) <= SILENCE_NS
         if runs.is_blank:
             self._is_open = self._is_open and is_near
             return
-        found = self._listed(runs, after)
         if self._is_open and is_near and runs.goes_on:
-            newer, older = self.runs.pop(), found.pop(0)
+            newer, older = self.runs.pop(), runs.found.pop(0)
             messages = newer.messages + older.messages
             self.runs.append(replace(newer, first=older.first, messages=messages))
-        self.runs += found
-        self._is_open = bool(runs.counts.size) and runs.goes_back
+        self.runs += runs.found
+        self._is_open = runs.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that was not searched.
@@ -376,15 +325,6 @@ class _OfTopic:
         if not self._is_open:
             return self.runs
         return [*self.runs[:-1], replace(self.runs[-1], begun=False)]
-
-    def _listed(self, runs: Runs, after: Ns) -> list[Run]:
-        """Returns the runs of a block, the newest first; `after` is when the next block begins."""
-        ends = np.minimum(runs.ends, after).tolist()
-        rows = zip(runs.firsts.tolist(), runs.lasts.tolist(), runs.counts.tolist(), strict=True)
-        return [
-            Run(self._topic, *row, until=None if end == MAX_NS else end)
-            for row, end in zip(rows, ends, strict=True)
-        ][::-1]
 
 
 def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | None) -> Found:

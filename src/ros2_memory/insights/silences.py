@@ -130,14 +130,12 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
     if not found:
         return ()
     longest = sorted(found, key=lambda each: each.start - each.end)[:MAX_NAMED]
-    names = [_described(each) for each in sorted(longest, key=lambda each: each.start)]
+    names = [
+        f"{each.topic} {unix_text(each.start)} to {unix_text(each.end)} "
+        f"({local_text(each.start)} to {local_text(each.end)})"
+        for each in sorted(longest, key=lambda each: each.start)
+    ]
     return (f"silent while the robot was on, so not searched: {listed(names, len(found))}",)
-
-
-def _described(silence: Silence) -> str:
-    times = f"{unix_text(silence.start)} to {unix_text(silence.end)}"
-    first, last = local_text(silence.start), local_text(silence.end)
-    return f"{silence.topic} {times} ({first} to {last})"
 
 
 def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import takewhile
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import length_in
@@ -265,27 +266,21 @@ def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wal
     if kept is None:
         return Budget(used, None, None, None)
     foreign = memory.foreign(snapshot)
-    foreign_files = frozenset[str]() if foreign is None else foreign.files
-    foreign_bytes = None if foreign is None else foreign.total_bytes
-    used -= 0 if foreign is None else foreign.bag_bytes
     state = state_bytes_in(memory.index.bag_dir)
-    used += state
+    used += state - (0 if foreign is None else foreign.bag_bytes)
+    per_day = None
     recording = heartbeat is not None and heartbeat.state is RecorderState.RECORDING
-    if heartbeat is None or not (recording and heartbeat.is_live(wall)):
-        return Budget(used, kept.max_total_bytes, None, kept.max_age_ns, foreign_bytes, state)
-    grown, since = 0, latest
-    if latest is not None:
-        for bag in reversed(snapshot.bags):
-            if bag.end < latest - _GROWTH_NS:
-                break
-            if bag.file in foreign_files:
-                continue
-            grown += bag.size
-            since = min(bag.start, latest if since is None else since)
-    if heartbeat.counted_bytes is not None:
-        used, state = heartbeat.counted_bytes, heartbeat.state_bytes
-    span = 0 if latest is None or since is None else latest - since
-    per_day = grown * _GROWTH_NS // span if span >= _LEAST_GROWTH_NS else None
+    if heartbeat is not None and recording and heartbeat.is_live(wall):
+        if heartbeat.counted_bytes is not None:
+            used, state = heartbeat.counted_bytes, heartbeat.state_bytes
+        since = latest or 0
+        recent = takewhile(lambda bag: bag.end >= since - _GROWTH_NS, reversed(snapshot.bags))
+        others = frozenset[str]() if foreign is None else foreign.files
+        own = [bag for bag in recent if bag.file not in others]
+        span = since - min((bag.start for bag in own), default=since)
+        if span >= _LEAST_GROWTH_NS:
+            per_day = sum(bag.size for bag in own) * _GROWTH_NS // span
+    foreign_bytes = None if foreign is None else foreign.total_bytes
     return Budget(used, kept.max_total_bytes, per_day, kept.max_age_ns, foreign_bytes, state)
 
 

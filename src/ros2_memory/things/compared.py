@@ -109,10 +109,10 @@ class ThingsBetween:
         if before is None and after is not None:
             end = min(self.earlier.stop, self.later.start)
             window = self.earlier.start, end
-            _, _, crossed = estimate.missing(instance, after.stay, window)
+            _, crossed = estimate.missing(instance, after.stay, window)
             return "not_looked_at" if crossed is None else "appeared", thing
         if before is not None and after is None:
-            _, looks, crossed = estimate.missing(instance, self._last_there(instance, before))
+            looks, crossed = estimate.missing(instance, self._last_there(instance, before))
             if crossed is None or crossed >= self.later.stop:
                 return "not_looked_at", thing
             return "missed", replace(thing, missed=crossed, looks=looks)

@@ -21,7 +21,7 @@ from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
 from ros2_memory.places.where import Where, parse_where, places_asked
-from ros2_memory.results import StillThere, Thing, Things, ThingStay, UsualPlace
+from ros2_memory.results import StillThere, Thing, Things, UsualPlace
 from ros2_memory.things.instances import (
     Instance,
     Mover,
@@ -242,7 +242,13 @@ class _Finder:
     ) -> Thing:
         last, newest = parts[-1]
         frame = self.known.frames[instance.epoch]
-        stays = [self._stay(frame, group) for group in _by_place(parts)]
+        # The stays at one place in a row, as one.
+        stays = [
+            self.known.stay(
+                np.concatenate([rows for _, rows in group]), group[-1][0].at, frame, self.places
+            )
+            for group in _by_place(parts)
+        ]
         every = np.concatenate([rows for _, rows in parts])
         labels = self._labels(every)
         result, rows = self.known.estimate, np.concatenate([stay.spots for stay in instance.stays])
@@ -285,7 +291,7 @@ class _Finder:
             count=int(self.known.estimate.counts[rows].sum()),
             best=best,
             median=median,
-            robot=self._robot(newest),
+            robot=self.known.estimate.seen_from(newest),
             still_there=None,
         )
 
@@ -361,12 +367,6 @@ class _Finder:
             replace(one, inside=places_at(self.places, frame, *one.place[:2])) for one in found
         )
 
-    def _stay(self, frame: str, parts: Sequence[tuple[PlacedStay, Ints]]) -> ThingStay:
-        """Returns the stays at one place in a row, as one."""
-        last, _ = parts[-1]
-        rows = np.concatenate([rows for _, rows in parts])
-        return self.known.stay(rows, last.at, frame, self.places)
-
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
         """Returns the best score of some spots, and their median to 0.05, the width of a bin.
 
@@ -390,14 +390,6 @@ class _Finder:
         median = int(known.max()) / 1000 if len(known) else (middle + 0.5) / SCORE_BINS
         return best / 1000, min(median, best / 1000)
 
-    def _robot(self, spots: Ints) -> tuple[float, float, float] | None:
-        """Returns the pose (m, rad) from which most messages saw some spots."""
-        pose = self.known.estimate.seen_from(spots)
-        if pose is None:
-            return None
-        x, y, yaw = pose
-        return x / _MM, y / _MM, math.radians((yaw + 180) % 360 - 180)
-
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
         """Returns the state of a thing since it was last seen in the window, by all sightings."""
         spots, looked = self.known.estimate.sights.spots[rows], self.known.estimate.cells.last
@@ -413,7 +405,7 @@ class _Finder:
         if stay is instance.stays[-1]:
             looks, missed = instance.looks, instance.missed_by
         else:
-            _, looks, missed = by_all.estimate.missing(instance, stay)
+            looks, missed = by_all.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
         if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):

@@ -36,10 +36,10 @@ from ros2_memory.things.presence import (
     Cells,
     Evidence,
     Stay,
-    chance_of_missing,
     evidence_at,
     field_of_view,
     in_ranges,
+    looks_without,
     stays_at,
 )
 from ros2_memory.things.synonyms import with_synonyms
@@ -113,12 +113,10 @@ class Instance:
     key: str
     epoch: int
     stays: list[PlacedStay]
-    chance: float = 1.0
-    """How likely it is that it is still there, and was missed since; 1 without a look."""
     looks: int = 0
     """Detector messages since it was last seen, from where it would have been."""
     missed_by: Ns | None = None
-    """When that chance fell below 1 %; None where it did not."""
+    """When the chance that all of these missed it fell below 1 %; None where it did not."""
     labels: Mapping[str, int] = field(default_factory=dict)
     """How often it was seen under each name, the commonest first."""
 
@@ -198,7 +196,7 @@ class Estimate:
         return x, y, z
 
     def seen_from(self, spots: Ints) -> tuple[float, float, float] | None:
-        """Returns the pose (mm, degrees) from which most messages saw some spots; None if unknown.
+        """Returns the pose (m, rad) from which most messages saw some spots; None if unknown.
 
         That is the mean pose in one cell; of two with equal numbers, in the one that saw it later.
         """
@@ -216,16 +214,16 @@ class Estimate:
             float((column[looks] * n).sum() / n.sum())
             for column in (self.cells.x, self.cells.y, self.cells.yaw)
         )
-        return x, y, yaw
+        return x / 1000, y / 1000, math.radians((yaw + 180) % 360 - 180)
 
     def missing(
         self, instance: Instance, stay: PlacedStay, window: tuple[Ns, Ns] | None = None
-    ) -> tuple[float, int, Ns | None]:
-        """Returns `chance_of_missing` a thing after one of its stays, or in a window before it."""
+    ) -> tuple[int, Ns | None]:
+        """Returns `looks_without` a thing after one of its stays, or in a window before it."""
         evidence = self.evidence[instance.key, instance.epoch, stay.place]
         seen_to = stay.last if window is None else MAX_NS
         window = window or (stay.last + 1, MAX_NS)
-        return chance_of_missing(self.cells, evidence, stay.stay, seen_to, window)
+        return looks_without(self.cells, evidence, stay.stay, seen_to, window)
 
     def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
@@ -310,7 +308,7 @@ def estimate(
         evidence=evidence,
     )
     for each in instances:
-        each.chance, each.looks, each.missed_by = found.missing(each, each.stays[-1])
+        each.looks, each.missed_by = found.missing(each, each.stays[-1])
     return found
 
 
@@ -622,35 +620,23 @@ def _was_moved_a_little(last: PlacedStay, stay: PlacedStay) -> bool:
 
 def _split(stays: Sequence[PlacedStay], seen: _Seen, go_on: Callable[[], None]) -> list[PlacedStay]:
     """Splits stays that have another one of the same label between two sightings."""
-    found = []
+    spots, found = seen.sights.spots, []
     for stay in stays:
         go_on()
-        others = [
-            (each.firm_first, each.firm_last)
-            for each in stays
-            if each.place != stay.place
-            and stay.firm_first < each.firm_first
-            and each.firm_last < stay.firm_last
-        ]
-        found += _split_at(stay, others, seen)
+        order = stay.spots[np.argsort(spots[stay.spots, Spot.FIRST], kind="stable")]
+        first, last = spots[order, Spot.FIRST], spots[order, Spot.LAST]
+        cuts = set()
+        for each in stays:
+            inside = stay.firm_first < each.firm_first and each.firm_last < stay.firm_last
+            if each.place != stay.place and inside:
+                before, after = last < each.firm_first, first > each.firm_last
+                # Nothing of the stay was seen during the other one.
+                if (before | after).all() and before.any() and after.any():
+                    cuts.add(int(after.argmax()))
+        whole = stay.stay._replace(firm_first=-1, firm_last=-1)
+        parts = np.split(order, sorted(cuts)) if cuts else ()
+        found += [_placed(seen, stay.place, whole, part) for part in parts] or [stay]
     return found
-
-
-def _split_at(stay: PlacedStay, others: Sequence[tuple[Ns, Ns]], seen: _Seen) -> list[PlacedStay]:
-    spots = seen.sights.spots
-    order = stay.spots[np.argsort(spots[stay.spots, Spot.FIRST], kind="stable")]
-    first, last = spots[order, Spot.FIRST], spots[order, Spot.LAST]
-    cuts = set()
-    for start, stop in others:
-        before, after = last < start, first > stop
-        # Nothing of the stay was seen during the other one.
-        if (before | after).all() and before.any() and after.any():
-            cuts.add(int(after.argmax()))
-    if not cuts:
-        return [stay]
-    whole = stay.stay._replace(firm_first=-1, firm_last=-1)
-    parts = np.split(order, sorted(cuts))
-    return [_placed(seen, stay.place, whole, part) for part in parts]
 
 
 def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:

@@ -67,9 +67,9 @@ def plain(label: str) -> str:
     return _SPACING.sub(" ", label).strip().casefold()
 
 
-def singular(name: str) -> str:
-    """Returns a plain name with its last word in the singular, as far as simple rules know it."""
-    before, space, word = name.rpartition(" ")
+def singular(label: str) -> str:
+    """Returns a label as `plain`, its last word in the singular, as far as simple rules know it."""
+    before, space, word = plain(label).rpartition(" ")
     return before + space + _singular(word)
 
 
@@ -108,14 +108,14 @@ class Labels:
         self._keys: dict[str, str] = {}
         self._shown: dict[str, str] = {}
         for name, variants in (spellings or {}).items():
-            key = singular(plain(name))
+            key = singular(name)
             self._shown[key] = name
             for each in (name, *variants):
-                self._keys[singular(plain(each))] = key
+                self._keys[singular(each)] = key
 
     def key(self, label: str) -> str:
         """Returns the key of a label."""
-        own = singular(plain(label))
+        own = singular(label)
         return self._keys.get(own, own)
 
     def are_apart(self, one: str, other: str) -> bool:

@@ -102,7 +102,11 @@ class Placer:
             QueryTimeoutError: the deadline has passed.
         """
         by_topic: dict[str, list[Rows]] = defaultdict(list)
-        for topic, rows in sorted(found, key=_place_of):
+        # However they are stored.
+        order = sorted(
+            found, key=lambda each: (each[1].first, each[1].last, str(each[1].recording))
+        )
+        for topic, rows in order:
             by_topic[topic].append(rows)
         detected: dict[str, Detected] = {}
         for topic, some in by_topic.items():
@@ -221,12 +225,6 @@ def is_named_for_detections(type_name: str) -> bool:
     """Returns whether a type is one of a detector by its name."""
     name = type_name.rpartition("/")[2].casefold()
     return any(word in name for word in _OF_DETECTORS)
-
-
-def _place_of(found: tuple[str, Rows]) -> tuple[Ns, Ns, str]:
-    """Returns what orders tables, however they are stored."""
-    _, rows = found
-    return rows.first, rows.last, str(rows.recording)
 
 
 def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from dataclasses import dataclass
 from itertools import groupby, pairwise
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -151,18 +150,12 @@ class Cells:
         return np.hypot(dx, dy), bearing
 
 
-@dataclass(frozen=True, slots=True)
-class FieldOfView:
+class FieldOfView(NamedTuple):
     """The distances (mm) and directions (degrees) at which a detector sees nearly all it sees."""
 
     most_mm: float
     least_deg: float
     most_deg: float
-
-    def covers(self, away: Floats, bearing: Floats) -> Flags:
-        """Returns which of some places lie inside."""
-        inside: Flags = (bearing >= self.least_deg) & (bearing <= self.most_deg)
-        return inside & (away <= self.most_mm)
 
 
 def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
@@ -269,7 +262,8 @@ def evidence_at(
     away, bearing = cells.seen_at(seeing, places[of, 0], places[of, 1])
     covered = np.zeros(len(seeing), bool)
     for topic, each in view.items():
-        covered |= (cells.topic[seeing] == topic) & each.covers(away, bearing)
+        inside = (bearing >= each.least_deg) & (bearing <= each.most_deg) & (away <= each.most_mm)
+        covered |= inside & (cells.topic[seeing] == topic)
     fair[fair] = covered
     return Evidence(looks, cell, hits, blind, times, fair)
 
@@ -378,16 +372,17 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
         yield place, Stay(first_slice, last_slice, firm_first, firm_last, hit_count, count, left)
 
 
-def chance_of_missing(
+def looks_without(
     cells: Cells, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
-) -> tuple[float, int, Ns | None]:
-    """Returns how likely it is that a thing was missed in a window [start, stop).
+) -> tuple[int, Ns | None]:
+    """Returns how many messages of a window [start, stop) could have had a thing, and have not.
+
+    And when the chance that all of them missed it fell below 1 %; None where it did not.
 
     `evidence` is that for this place.
 
     By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
-    cell's own rate is known as well as its messages make it (a uniform prior). With the number of
-    messages of these looks, and when the chance fell below 1 %; None where it did not.
+    cell's own rate is known as well as its messages make it (a uniform prior).
     """
     looks, hits, cell = _number(evidence.looks), evidence.hits, evidence.cell
     own, last = cells.slice[looks], cells.last[looks]
@@ -425,7 +420,7 @@ def chance_of_missing(
         messages += n
         if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
             crossed = ended
-    return math.exp(chance), messages, crossed
+    return messages, crossed
 
 
 def _present(by_slice: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]:

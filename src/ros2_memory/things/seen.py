@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from hashlib import blake2b
-from itertools import accumulate, pairwise
+from itertools import accumulate, chain, pairwise
 from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -28,7 +28,7 @@ from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.units import Rows
@@ -209,10 +209,28 @@ class Watching:
         """Yields the stretches of a window in which there may be messages, the newest first."""
         if not self._topics:
             return
-        bags = _Bags(self._view, self._topics, self._needed, window)
-        for number in bags.stretches:
-            self._view.bags.check_deadline()
-            yield self._around(_window(number), *bags.around(_window(number).widened(AROUND_NS)))
+        whole = window.widened(AROUND_NS)
+        parts = _Parts.of(self._view, self._needed, whole)
+        every = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
+        for number in sorted({*chain.from_iterable(every)}, reverse=True):
+            stretch = _window(number)
+            if not stretch.intersect(window).empty:
+                self._view.bags.check_deadline()
+                near = stretch.widened(AROUND_NS).intersect(whole)
+                bags = self._bags_in(near)
+                yield self._around(stretch, bags, parts and parts.around(near, bags))
+
+    def _bags_in(self, window: TimeWindow) -> list[BagFile]:
+        """Returns the bags in a window.
+
+        Without those of carried messages that nothing is seen by: they reach over all of the
+        history.
+        """
+        return [
+            bag
+            for bag in self._view.timeline.overlapping(window)
+            if not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
+        ]
 
     def in_bag(self, bag: BagFile) -> list[SessionSights]:
         """Returns the sights of the messages of one bag that count, in each stretch.
@@ -360,83 +378,27 @@ class Watching:
                 yield topic, rows
 
 
-class _Spans(NamedTuple):
-    """Spans of log times (inclusive), in order of the first ones; `latest` is the latest so far."""
-
-    firsts: Ints
-    lasts: Ints
-    latest: Ints
-
-    @classmethod
-    def of(cls, spans: Sequence[tuple[Ns, Ns]]) -> _Spans:
-        firsts, lasts = np.array(spans, np.int64).reshape(-1, 2).T.copy()
-        return cls(firsts, lasts, np.maximum.accumulate(lasts))
-
-    def reaching_into(self, window: TimeWindow) -> Ints:
-        """Returns the positions of those that do."""
-        begin = int(np.searchsorted(self.latest, window.start))
-        end = int(np.searchsorted(self.firsts, window.stop))
-        found: Ints = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
-        return found
-
-
-class _Bags:
-    """The bags of a view in a window, and what is stored of them.
-
-    Without those of carried messages that nothing is seen by: they reach over all of the history.
-
-    Args:
-        view: has the bags.
-        topics: those that may have detections.
-        needed: all topics on which sights depend.
-        window: the window.
-    """
-
-    def __init__(
-        self, view: View, topics: Sequence[str], needed: Sequence[str], window: TimeWindow
-    ) -> None:
-        around = window.widened(AROUND_NS)
-        self._bags = [
-            bag
-            for bag in view.timeline.overlapping(around)
-            if not is_carried(bag.file) or any(map(bag.summary.of, needed))
-        ]
-        self._spans = _Spans.of([(bag.start, bag.end) for bag in self._bags])
-        self._parts = _Parts.of(view, needed, around, self._bags)
-        first, last = self._spans.firsts // SIGHTS_NS, self._spans.lasts // SIGHTS_NS
-        long = np.flatnonzero(last - first > 1)
-        more = [_numbers_of(view, topics, self._bags[nth]) for nth in long.tolist()]
-        every = np.concatenate([first, last, *(np.array([*some], np.int64) for some in more)])
-        numbers: list[int] = np.unique(every)[::-1].tolist()
-        self.stretches = [nth for nth in numbers if not _window(nth).intersect(window).empty]
-        """The numbers of the stretches in which there may be messages, the newest first."""
-
-    def around(self, window: TimeWindow) -> tuple[list[BagFile], tuple[int, ...] | None]:
-        """Returns the bags that reach into a window, and the parts; see `_Around`."""
-        here = self._spans.reaching_into(window)
-        bags = [self._bags[nth] for nth in here.tolist()]
-        return bags, None if self._parts is None else self._parts.around(window, here)
-
-
 class _Parts(NamedTuple):
     """The parts of some topics in a window, as arrays.
 
     Attributes:
-        is_merged: of each bag, whether it is in parts.
-        spans: when the parts are.
+        merged: the bags that are in parts.
+        firsts: of each part, the first log time, ascending.
+        lasts: likewise the last one.
+        latest: the latest of the parts so far.
         numbers: of the parts.
         all_count: whether all rows of the part do.
     """
 
-    is_merged: Flags
-    spans: _Spans
+    merged: frozenset[str]
+    firsts: Ints
+    lasts: Ints
+    latest: Ints
     numbers: Ints
     all_count: Flags
 
     @classmethod
-    def of(
-        cls, view: View, topics: Sequence[str], window: TimeWindow, bags: Sequence[BagFile]
-    ) -> _Parts | None:
+    def of(cls, view: View, topics: Sequence[str], window: TimeWindow) -> _Parts | None:
         """Returns the parts of some topics, and which bags are in parts.
 
         None without a store, and where it failed meanwhile.
@@ -450,13 +412,13 @@ class _Parts(NamedTuple):
         coverage = scanner.coverage(view.timeline)
         if coverage is None:
             return None
-        merged = {
+        merged = frozenset(
             bag.file
             for part in coverage.segments
             if window.overlaps(part.segment.bags[0].start, part.segment.latest)
             for bag, number in zip(part.segment.bags, part.numbers.tolist(), strict=True)
             if number >= 0 and number not in unmerged
-        }
+        )
         heads = [
             head
             for topic in {*topics}
@@ -466,20 +428,20 @@ class _Parts(NamedTuple):
         if scanner.store.failures != failures:
             return None
         heads.sort(key=lambda head: head.first)
-        return cls(
-            np.array([bag.file in merged for bag in bags], np.bool_),
-            _Spans.of([(head.first, head.last) for head in heads]),
-            np.array([head.number for head in heads], np.int64),
-            coverage.counts([head.bags for head in heads]) == [head.bags.size for head in heads],
+        firsts, lasts, numbers = (
+            np.array([getattr(head, name) for head in heads], np.int64)
+            for name in ("first", "last", "number")
         )
+        counting = coverage.counts([head.bags for head in heads])
+        all_count = counting == [head.bags.size for head in heads]
+        return cls(merged, firsts, lasts, np.maximum.accumulate(lasts), numbers, all_count)
 
-    def around(self, window: TimeWindow, bags: Ints) -> tuple[int, ...] | None:
-        """Returns the parts in a window; None where not all rows of its bags are there, or count.
-
-        `bags` are the positions of the bags.
-        """
-        here = self.spans.reaching_into(window)
-        if not (self.is_merged[bags].all() and self.all_count[here].all()):
+    def around(self, window: TimeWindow, bags: Sequence[BagFile]) -> tuple[int, ...] | None:
+        """Returns the parts in a window; None where not all rows of its bags count or are there."""
+        begin = int(np.searchsorted(self.latest, window.start))
+        end = int(np.searchsorted(self.firsts, window.stop))
+        here = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
+        if not (self.merged.issuperset(bag.file for bag in bags) and self.all_count[here].all()):
             return None
         return tuple(np.sort(self.numbers[here]).tolist())
 
@@ -490,7 +452,7 @@ def _window(number: int) -> TimeWindow:
     return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
 
 
-def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Sequence[int]:
+def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Iterable[int]:
     """Returns the numbers of the stretches in which a bag may have messages of some topics."""
     numbers = range(bag.start // SIGHTS_NS, bag.end // SIGHTS_NS + 1)
     if len(numbers) <= _MANY:

@@ -261,7 +261,11 @@ class Triggers:
             return
         record.begun = [each for each in record.begun if abs(firing.at - each) < HOUR_NS]
         if len(record.begun) >= rule.max_per_hour:
-            self._refuse(rule.name, record, _TOO_OFTEN.format(rule.max_per_hour))
+            reason = (
+                f"it fires more often than it may begin moments (max_per_hour: "
+                f"{rule.max_per_hour}): narrow its condition, or raise for_s"
+            )
+            self._refuse(rule.name, record, reason)
             return
         if newest is not None and not newest.stored:
             self._store(rule.name, record, snapshot)
@@ -327,12 +331,6 @@ def _judge(name: str, record: RuleRecord) -> None:
     if longest is not None and record.always_since is None:
         _log.warning("trigger_matches_always", rule=name, since_ns=longest)
     record.always_since = longest
-
-
-_TOO_OFTEN: Final = (
-    "it fires more often than it may begin moments (max_per_hour: {}): narrow its condition, or "
-    "raise for_s"
-)
 
 
 def _joins(start: Ns, end: Ns, other_start: Ns, other_end: Ns) -> bool:

@@ -13,7 +13,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.errors import NoDataReason
-from ros2_memory.tools.arguments import MOST_TIMES
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, replied, with_store
@@ -93,14 +92,6 @@ def test_what_is_nowhere_is_an_error_as_for_one_moment(memory: Memory, tmp_path:
         memory, tmp_path, "get_position_at", {"timestamps": [T0], "topic": "/vision/*"}
     )
     assert json.loads(refused.text)["error"]
-
-
-def test_twenty_positions_are_a_small_reply(memory: Memory, tmp_path: Path) -> None:
-    times = [T0 + at for at in range(10)] + [T0 + 20 + at for at in range(10)]
-    assert len(times) == MOST_TIMES
-    reply = replied(memory, tmp_path, "get_position_at", {"timestamps": times})
-    assert len(json.loads(reply.text)["results"]) == MOST_TIMES
-    assert len(reply.text) < 1_800
 
 
 def test_all_of_them_are_of_one_snapshot(memory: Memory, tmp_path: Path) -> None:

@@ -62,18 +62,12 @@ def test_without_fields_and_of_what_is_no_number_there_are_none(tmp_path: Path) 
     assert asked(tmp_path, [boolean(BEGIN, data=True)], "value").extremes == ()
 
 
-def test_a_full_path_in_the_message_has_extremes_as_the_values_own_field_has(
-    tmp_path: Path,
-) -> None:
-    driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(3)]
-    [own, full] = asked(tmp_path, driven, "position.x", "pose.pose.position.x").extremes
-    assert full.field == "pose.pose.position.x"
-    assert (full.least, full.most) == (own.least, own.most) == (0.0, 2.0)
-
-
 def test_fields_that_only_the_messages_have_have_extremes(tmp_path: Path) -> None:
     driven = [odom(BEGIN + n * S, n, 0.0, 0.0) for n in range(3)]
-    second, w = asked(tmp_path, driven, "header.stamp.sec", "pose.pose.orientation.w").extremes
+    paths = "position.x", "pose.pose.position.x", "header.stamp.sec", "pose.pose.orientation.w"
+    own, full, second, w = asked(tmp_path, driven, *paths).extremes
+    assert full.field == "pose.pose.position.x"
+    assert (full.least, full.most) == (own.least, own.most) == (0.0, 2.0)
     assert (second.least, second.most) == (BEGIN // S, BEGIN // S + 2)
     assert (w.least, w.most, w.most_at) == (1.0, 1.0, BEGIN)
 

@@ -152,17 +152,6 @@ def test_more_days_than_a_reply_has_room_for_are_refused(tmp_path: Path) -> None
     assert "between takes at most 31 days: ask about a shorter window" in reply["detail"]
 
 
-def test_hours_are_local_also_where_clocks_are_changed(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patched:
-        patched.setenv("TZ", "Europe/Berlin")
-        time.tzset()
-        begin, end = (datetime(2026, 3, day).astimezone().timestamp() for day in (28, 31))
-        window = TimeWindow(round(begin) * S, round(end) * S)
-        found = hours_of_days(window, *_as_hours("22:00-04:00"))  # type: ignore[misc]
-    time.tzset()
-    assert [(each.stop - each.start) // (3600 * S) for each in found] == [4, 5, 6, 2]
-
-
 def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> None:
     draw = Random("noise")
     for day in range(3):
@@ -189,27 +178,30 @@ def test_that_positions_are_noisy_is_said_once_in_a_reply(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("hours", "begins", "ends"),
+    ("days", "hours", "expected"),
     [
-        ("02:30-03:30", "03:00", "03:30"),
-        ("01:30-02:15", "01:30", "03:00"),
-        ("02:10-02:50", None, None),
-        ("22:00-24:00", "22:00", "00:00"),
-        ("00:00 - 24:00", "00:00", "00:00"),
-        ("03:00-02:30", "03:00", "00:00"),
+        ((28, 31), "22:00-04:00", ["00:00-04:00", "22:00-04:00", "22:00-04:00", "22:00-00:00"]),
+        ((29, 30), "02:30-03:30", ["03:00-03:30"]),
+        ((29, 30), "01:30-02:15", ["01:30-03:00"]),
+        ((29, 30), "02:10-02:50", []),
+        ((29, 30), "03:00-02:30", ["00:00-03:00", "03:00-00:00"]),
+        ((29, 30), "22:00-24:00", ["22:00-00:00"]),
+        ((29, 30), "00:00 - 24:00", ["00:00-00:00"]),
     ],
 )
-def test_hours_that_clocks_skip_are_left_out_of_those_asked_for(
-    hours: str, begins: str | None, ends: str | None
+def test_hours_are_local_and_those_that_clocks_skip_are_left_out(
+    days: tuple[int, int], hours: str, expected: list[str]
 ) -> None:
     with pytest.MonkeyPatch.context() as patched:
         patched.setenv("TZ", "Europe/Berlin")
         time.tzset()
-        day = [int(datetime(2026, 3, at).timestamp()) for at in (29, 30)]  # noqa: DTZ001
-        found = hours_of_days(TimeWindow(day[0] * S, day[1] * S), *_as_hours(hours))  # type: ignore[misc]
+        begin, end = (int(datetime(2026, 3, at).timestamp()) for at in days)  # noqa: DTZ001
+        found = hours_of_days(TimeWindow(begin * S, end * S), *_as_hours(hours))  # type: ignore[misc]
         shown = [
-            [time.strftime("%H:%M", time.localtime(at // S)) for at in (each.start, each.stop)]
+            "-".join(
+                time.strftime("%H:%M", time.localtime(at // S)) for at in (each.start, each.stop)
+            )
             for each in found
         ]
     time.tzset()
-    assert shown[-1:] == ([] if begins is None else [[begins, ends]])
+    assert shown == expected

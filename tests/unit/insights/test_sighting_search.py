@@ -85,7 +85,7 @@ def asked(
     )
 
 
-@settings(deadline=None, max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
+@settings(deadline=None, max_examples=examples(30), suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]), limit=st.integers(1, 6))
 def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit: int) -> None:
     draw = Random(seed)

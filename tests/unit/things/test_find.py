@@ -29,7 +29,7 @@ from tests.support.examples import examples
 from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 
@@ -351,10 +351,31 @@ def test_two_labels_that_a_detector_gives_to_one_thing_are_one_row(
         assert (reply["labels"], "notes" in reply) == ({short: 1}, False)
 
 
-def test_labels_that_the_owner_lists_apart_are_two_things(tmp_path: Path) -> None:
-    write_splits(tmp_path, alternating("mug", "coffee mug"))
-    apart = QuerySettings(labels={"mug": [], "coffee mug": []})
-    assert ask(tmp_path, apart)["labels"] == {"coffee mug": 1, "mug": 1}
+MUG, COFFEE_MUG = ("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("messages", "apart", "labels"),
+    [
+        (lambda: alternating("mug", "coffee mug"), ["mug", "coffee mug"], ["coffee mug", "mug"]),
+        (lambda: alternating("coffee mug", "dog bed"), [], ["coffee mug", "dog bed"]),
+        (lambda: alternating("coffee mug", "mugshot"), [], ["coffee mug", "mugshot"]),
+        (lambda: alternating("coffee mug", "cup"), [], ["coffee mug", "cup"]),
+        (lambda: looked(0, 20, HERE, MUG, COFFEE_MUG), [], ["coffee mug", "mug"]),
+        (
+            lambda: looked(0, 30, HERE, MUG) + looked(30, 60, HERE, COFFEE_MUG),
+            [],
+            ["coffee mug", "mug"],
+        ),
+    ],
+    ids=["declared", "bed", "mugshot", "cup", "in one message", "one after the other"],
+)
+def test_labels_of_two_things_stay_two(
+    tmp_path: Path, messages: Callable[[], list[Msg]], apart: list[str], labels: list[str]
+) -> None:
+    write_splits(tmp_path, messages())
+    limits = QuerySettings(labels={each: [] for each in apart})
+    assert ask(tmp_path, limits)["labels"] == dict.fromkeys(labels, 1)
 
 
 def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> None:
@@ -372,24 +393,6 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
         [thing] = [thing for thing in reply["things"] if thing["label"] == each]
         assert "moved" not in thing
     assert ask(tmp_path / "moved", PLAIN)["labels"] == {"mug": 1}
-
-
-@pytest.mark.parametrize("other", ["dog bed", "mugshot", "cup"])
-def test_labels_that_end_in_another_word_are_two_things(tmp_path: Path, other: str) -> None:
-    write_splits(tmp_path, alternating("coffee mug", other))
-    assert ask(tmp_path, PLAIN)["labels"] == dict.fromkeys(sorted(["coffee mug", other]), 1)
-
-
-def test_labels_that_one_message_has_both_of_are_two_things(tmp_path: Path) -> None:
-    both = [("mug", 3.0, 0.5), ("coffee mug", 3.1, 0.5)]
-    write_splits(tmp_path, looked(0, 20, HERE, *both) + looked(20, 30, HERE, both[0]))
-    assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
-
-
-def test_a_thing_that_another_took_the_place_of_is_another_thing(tmp_path: Path) -> None:
-    mug, other = ("mug", 3.0, 0.5), ("coffee mug", 3.0, 0.5)
-    write_splits(tmp_path, looked(0, 30, HERE, mug) + looked(30, 60, HERE, other))
-    assert ask(tmp_path, PLAIN)["labels"] == {"coffee mug": 1, "mug": 1}
 
 
 def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -> None:
@@ -595,43 +598,23 @@ def test_scores_are_those_of_the_detections_that_count(tmp_path: Path) -> None:
 def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
     seen = (("table", 3.0, 0.5), ("mug", 3.3, 0.9), ("mug", 5.0, -1.0), ("plate", 2.6, 0.5))
     write_splits(tmp_path, looked(0, 30, HERE, *seen))
-    by_label = ask(tmp_path, near={"label": "Tables", "radius_m": 0.6})
-    assert {(each["label"], each["near_m"]) for each in by_label["things"]} == {
-        ("mug", 0.5),
-        ("plate", 0.4),
-    }
-    assert by_label["labels"] == {"mug": 1, "plate": 1}
-    mugs = ask(tmp_path, label="mug", near="table")
-    assert [each["near_m"] for each in mugs["things"]] == [0.5]
-    by_point = ask(tmp_path, near={"x": 3.0, "y": 0.5, "radius_m": 0.45})
-    assert {each["label"]: each["near_m"] for each in by_point["things"]} == {
-        "table": 0.0,
-        "plate": 0.4,
-    }
-    assert ask(tmp_path, near='{"x": 5.0, "y": -1.0, "radius_m": 0.2}')["total"] == 1
 
+    def near(what: object, **given: Any) -> list[tuple[str, float]]:
+        reply = ask(tmp_path, near=what, **given)
+        assert reply["total"] == len(reply["things"]) == sum(reply.get("labels", {}).values())
+        return sorted((each["label"], each["near_m"]) for each in reply["things"])
 
-def test_a_thing_is_not_near_itself_but_near_another_of_its_label(tmp_path: Path) -> None:
-    write_splits(
-        tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5), ("mug", 3.7, 0.5), ("cup", 5.0, 1.0))
-    )
-    assert ask(tmp_path, label="cup", near={"label": "cup", "radius_m": 9})["total"] == 0
-    mugs = ask(tmp_path, label="mug", near="mug")
-    assert [each["near_m"] for each in mugs["things"]] == [0.7, 0.7]
-
-
-def test_what_is_near_a_thing_in_another_place_counts_where_it_is(tmp_path: Path) -> None:
-    write_splits(tmp_path, looked(0, 30, HERE, ("table", 3.0, 0.5), ("mug", 3.3, 0.5)))
-    where = {"x": 3.4, "y": 0.5, "radius_m": 0.2}
-    found = ask(tmp_path, near="table", where=where)
-    assert [each["label"] for each in found["things"]] == ["mug"]
-
-
-def test_near_what_is_not_there_is_nothing_and_a_note_says_so(tmp_path: Path) -> None:
-    write_splits(tmp_path, looked(0, 30, HERE, ("mug", 3.0, 0.5)))
-    reply = ask(tmp_path, near="sofa")
-    assert reply["total"] == 0
-    assert 'near: there is no thing "sofa" in this window' in reply["notes"]
+    assert near({"label": "Tables", "radius_m": 0.6}) == [("mug", 0.5), ("plate", 0.4)]
+    assert near("table", label="mug") == [("mug", 0.5)]
+    assert near({"x": 3.0, "y": 0.5, "radius_m": 0.45}) == [("plate", 0.4), ("table", 0.0)]
+    assert near('{"x": 5.0, "y": -1.0, "radius_m": 0.2}') == [("mug", 0.0)]
+    # No thing is near itself, but near another of its label; and where it is counts.
+    assert near({"label": "plate", "radius_m": 9}, label="plate") == []
+    assert near({"label": "mug", "radius_m": 9}, label="mug") == [("mug", 2.55), ("mug", 2.55)]
+    there = {"x": 3.4, "y": 0.9, "radius_m": 0.2}
+    assert near("table", where=there) == [("mug", 0.5)]
+    assert near("sofa") == []
+    assert 'near: there is no thing "sofa" in this window' in ask(tmp_path, near="sofa")["notes"]
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,6 @@ def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None
     assert mug.looks == 2
     [mug] = estimate(whole([*there, twice, often]), LABELS).instances
     assert mug.missed_by == 117 * 10**9
-    assert mug.chance < 0.01
 
 
 def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_always_seen() -> None:
@@ -53,7 +52,6 @@ def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_alwa
     empty = bag_of(*[(HERE, [])] * 12, start=100)
     [mug] = estimate(whole([*rarely, empty]), LABELS).instances
     assert mug.missed_by is None
-    assert 0.01 < mug.chance < 0.2
 
 
 def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:

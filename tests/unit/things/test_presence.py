@@ -12,8 +12,8 @@ from ros2_memory.things.presence import (
     Cells,
     Evidence,
     FieldOfView,
-    chance_of_missing,
     evidence_at,
+    looks_without,
     stays_at,
 )
 from tests.support.sights import no_sights
@@ -48,7 +48,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     for _, stay in stays_at(cells, found):
         for after in (0, int(cells.last[len(cells.last) // 2])):
             by = stay, after, (after + 1, MAX_NS)
-            assert chance_of_missing(cells, found, *by) == chance_of_missing(cells, whole, *by)
+            assert looks_without(cells, found, *by) == looks_without(cells, whole, *by)
 
 
 @given(_looks, _unplaced, _looks, st.lists(st.booleans(), min_size=120, max_size=120))
