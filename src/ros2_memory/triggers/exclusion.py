@@ -13,7 +13,7 @@ All other times are unknown, and so are spans in which the clock was set back.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import chain, pairwise
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.bag_dir.state_files import ConditionInterval, Excluded
@@ -108,9 +108,7 @@ def excluded_intervals(
     free: list[Spans] = []
     for at, each in enumerate(recordings):
         known: Spans = []
-        for run, following in pairwise([*each.heard, None]):
-            if run is None:  # `pairwise` ends before it
-                continue
+        for run, following in zip(each.heard, [*each.heard[1:], None], strict=False):
             stop = _valid_until(run, following, each, rule.stale)
             if following is None and stop >= each.stop < MAX_NS:
                 stop = each.stop

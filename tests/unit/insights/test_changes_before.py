@@ -17,7 +17,7 @@ from tests.support.bags import (
     odom,
     tf,
     transform,
-    write_mcap,
+    write_splits,
 )
 from tests.support.memories import asked, each_way, memory_of, replied
 
@@ -42,16 +42,6 @@ def driving(until: float, stops: float, hz: int = 10) -> list[Msg]:
 def commanded(until: float, stops: float, hz: int = 10) -> list[Msg]:
     times = [nth / hz for nth in range(round(until * hz))]
     return [command(at(t), 0.4 if t < stops else 0.0) for t in times]
-
-
-def write(folder: Path, messages: list[Msg], split_s: float = 20.0) -> None:
-    """In bags of some seconds."""
-    ordered = sorted(messages, key=lambda each: each.log_time)
-    splits: dict[int, list[Msg]] = {}
-    for each in ordered:
-        splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
-    for nth, split in splits.items():
-        write_mcap(folder / "rec" / f"rec_{nth}.mcap", split)
 
 
 def before(folder: Path, around: float, *, recalls: bool = False, **given: float) -> dict[str, Any]:
@@ -79,7 +69,7 @@ ALL = [
 
 @each_way
 def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool) -> None:
-    write(tmp_path, ALL)
+    write_splits(tmp_path, ALL)
     reply = before(tmp_path, 43.0, recalls=recalls)
     assert told(reply) == [
         ("/cmd_vel went to zero while a goal was active", 0.0),
@@ -100,7 +90,7 @@ def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool)
 
 @each_way
 def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recalls: bool) -> None:
-    write(tmp_path, ALL)
+    write_splits(tmp_path, ALL)
     memory = memory_of(tmp_path, recalls=recalls)
     reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
@@ -115,7 +105,7 @@ def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recall
 
 
 def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: Path) -> None:
-    write(tmp_path, ALL)
+    write_splits(tmp_path, ALL)
     reply = asked(memory_of(tmp_path), tmp_path, "recap", start=BEGIN / S + 44, end=BEGIN / S + 58)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert "/bumper became true" in [each["text"] for each in stop["before"]]
@@ -131,7 +121,7 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
         *(diagnostics(at(t), motor=(0, "ok")) for t in range(40)),
         log_entry(at(3), 20, "motor", "on"),
     ]
-    write(tmp_path, calm)
+    write_splits(tmp_path, calm)
     reply = before(tmp_path, 20.0, recalls=recalls)
     assert reply["before"] == []
     assert reply["looked_at"] == ["/bumper", "/diagnostics", "/rosout"]
@@ -144,7 +134,7 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
 
 
 def test_that_no_such_topic_is_recorded_is_another_answer(tmp_path: Path) -> None:
-    write(tmp_path, [*driving(40, 20), *(detections(at(t), ["cup"]) for t in range(40))])
+    write_splits(tmp_path, [*driving(40, 20), *(detections(at(t), ["cup"]) for t in range(40))])
     reply = before(tmp_path, 20.0)
     assert (reply["before"], reply["looked_at"]) == ([], [])
     assert reply["recorded_topics"] == 2
@@ -153,13 +143,13 @@ def test_that_no_such_topic_is_recorded_is_another_answer(tmp_path: Path) -> Non
 
 def test_a_command_that_ends_without_a_goal_is_no_change(tmp_path: Path) -> None:
     done = [goals(at(5), {1: RUNNING}), goals(at(18), {1: SUCCEEDED})]
-    write(tmp_path, [*driving(40, 20), *commanded(40, 20), *done])
+    write_splits(tmp_path, [*driving(40, 20), *commanded(40, 20), *done])
     assert told(before(tmp_path, 20.0)) == [("/drive goal succeeded", 2.0)]
 
 
 def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path) -> None:
     trembling = [battery(at(t), 0.209 - t * 0.0002 + 0.008 * (-1) ** t) for t in range(60)]
-    write(tmp_path, [*trembling, boolean(at(59), True)])
+    write_splits(tmp_path, [*trembling, boolean(at(59), True)])
     reply = before(tmp_path, 60.0, seconds_before=60)
     below = [each for each in reply["before"] if "fell below" in each["text"]]
     assert [each["text"] for each in below] == ["/battery_state fell below 20%"]
@@ -167,7 +157,7 @@ def test_a_charge_that_trembles_about_a_limit_falls_below_it_once(tmp_path: Path
 
 def test_goals_are_accepted_and_end(tmp_path: Path) -> None:
     statuses = [(5, {1: RUNNING}), (10, {1: ABORTED, 2: 1}), (11, {1: ABORTED, 2: RUNNING})]
-    write(tmp_path, [*driving(20, 20), *(goals(at(t), each) for t, each in statuses)])
+    write_splits(tmp_path, [*driving(20, 20), *(goals(at(t), each) for t, each in statuses)])
     assert told(before(tmp_path, 12.0)) == [
         ("/drive goal aborted", 2.0),
         ("/drive goal accepted", 2.0),
@@ -178,14 +168,14 @@ def test_goals_are_accepted_and_end(tmp_path: Path) -> None:
 def test_a_state_is_known_by_the_message_long_before(tmp_path: Path, recalls: bool) -> None:
     """A latched topic has a message whenever it changes, and no other."""
     docked = [boolean(at(0), True, "/docked"), boolean(at(300), False, "/docked")]
-    write(tmp_path, [*driving(320, 310, hz=2), *docked])
+    write_splits(tmp_path, [*driving(320, 310, hz=2), *docked])
     reply = before(tmp_path, 304.0, recalls=recalls)
     assert told(reply) == [("/docked became false", 4.0)]
     assert reply["state"] == {"/docked": False}
 
 
 def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
-    write(tmp_path, ALL)
+    write_splits(tmp_path, ALL)
     assert told(before(tmp_path, 43.0, seconds_before=1)) == [
         ("/cmd_vel went to zero while a goal was active", 0.0),
         ("/bumper became true", 0.4),
@@ -197,7 +187,7 @@ def test_how_far_back_can_be_asked(tmp_path: Path) -> None:
 
 def test_a_warning_that_is_repeated_is_listed_once(tmp_path: Path) -> None:
     late = [log_entry(at(20 + nth / 2), 30, "control", f"late by {nth} ms") for nth in range(30)]
-    write(tmp_path, [*driving(60, 50), *late])
+    write_splits(tmp_path, [*driving(60, 50), *late])
     assert told(before(tmp_path, 30.0)) == [
         ("warning of control: late by 0 ms (22 times in 10 s)", 0.0)
     ]
@@ -207,7 +197,7 @@ def test_places_of_the_robot_are_in_the_map(tmp_path: Path) -> None:
     placed = [
         tf(at(t / 2), transform(at(t / 2), "map", "odom", (10.0, 0.0, 0.0))) for t in range(80)
     ]
-    write(tmp_path, [*driving(40, 20), *placed])
+    write_splits(tmp_path, [*driving(40, 20), *placed])
     robot = before(tmp_path, 30.0)["robot"]
     assert (robot["x"], robot["frame_id"]) == (pytest.approx(18.0, abs=0.01), "map")
 
@@ -235,7 +225,7 @@ def test_a_recap_of_many_stops_is_short(tmp_path: Path) -> None:
     for nth in range(40):
         for text in ("far", "the planner failed to find a way around " * 4):
             messages.append(log_entry(at(12 * nth + 6) + len(text), 40, "x" * 40, text))
-    write(tmp_path, messages)
+    write_splits(tmp_path, messages)
     stops, size = recap_of(tmp_path, 480)
     assert size < 6_000
     listed = [change for each in stops for change in each.get("before", ())]
@@ -249,7 +239,7 @@ def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: P
         messages.append(goals(at(12 * nth + 1), {nth + 1: RUNNING}, topic))
         messages.append(goals(at(12 * nth + 6), {nth + 1: SUCCEEDED}, topic))
     messages.append(log_entry(at(12 * 22 + 5), 40, "motor", "81 C"))
-    write(tmp_path, messages)
+    write_splits(tmp_path, messages)
     stops, _ = recap_of(tmp_path, 24 * 12)
     assert len([each for each in stops if "81 C" in str(each.get("before"))]) == 1
     assert any("before" not in each for each in stops)
@@ -259,7 +249,7 @@ def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: P
 def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path, recalls: bool) -> None:
     late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
     late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
-    write(tmp_path, [*driving(60, 40), *late])
+    write_splits(tmp_path, [*driving(60, 40), *late])
     reply = before(tmp_path, 40.0, recalls=recalls)
     assert told(reply) == [("warning of a: late", 0.0)]
     assert [(each["text"], each["s_after"]) for each in reply["after"]] == [

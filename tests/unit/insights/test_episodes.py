@@ -10,7 +10,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.history import held_values
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
-from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap, write_splits
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
 
@@ -34,13 +34,9 @@ def written(folder: Path, *, stored: bool = False) -> Memory:
     said += [text((BEGIN + at) * S, words, "/action") for at, words in ACTIONS]
     beats = [odom((BEGIN + at) * S, at / 100, 0.0) for at in range(0, 321, 2)]
     beats += [boolean((BEGIN + at) * S, data=at >= 100, topic="/docked") for at in range(0, 320, 2)]
-    rows = sorted([*said, *beats], key=lambda each: each.log_time)
     later = [odom((BEGIN + at) * S, 0.0, 0.0) for at in range(900, 940, 2)]
     later.insert(5, text((BEGIN + 909) * S, "rest", "/task"))
-    for nth, start in enumerate((0, 100, 200, 300)):
-        begin, end = (BEGIN + start) * S, (BEGIN + start + 100) * S
-        split = [row for row in rows if begin <= row.log_time < end]
-        write_mcap(folder / "a" / f"a_{nth}.mcap", split)
+    write_splits(folder, [*said, *beats], 100, "a")
     write_mcap(folder / "c" / "c_0.mcap", later)
     memory = memory_of(folder)
     return with_store(memory, folder) if stored else memory

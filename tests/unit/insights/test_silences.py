@@ -8,7 +8,7 @@ import pytest
 
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.timebase import local_text
-from tests.support.bags import Msg, boolean, detections, odom, write_mcap
+from tests.support.bags import boolean, detections, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
@@ -24,23 +24,15 @@ SPLITS, SPLIT = 30, 10
 BLIND = range(10, 19)
 
 
-def _split(number: int) -> list[Msg]:
-    begin = (BEGIN + number * SPLIT) * S
-    messages = [odom(begin + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLIT)]
-    if number == 25:
-        messages.append(boolean(begin + S, data=True))
-    if number not in BLIND:
-        messages += [
-            detections(begin + at * S + 1, ["cup"] if number < 5 else [], topic=SEEN)
-            for at in range(SPLIT)
-        ]
-    return sorted(messages, key=lambda each: each.log_time)
-
-
 @pytest.fixture(params=[False, True], ids=["without catalogue", "with catalogue"])
 def memory(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
-    for number in range(SPLITS):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", _split(number))
+    messages = [odom(BEGIN * S + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLITS * SPLIT)]
+    messages.append(boolean((BEGIN + 251) * S, data=True))
+    for at in range(SPLITS * SPLIT):
+        if at // SPLIT not in BLIND:
+            seen = ["cup"] if at < 50 else []
+            messages.append(detections((BEGIN + at) * S + 1, seen, topic=SEEN))
+    write_splits(tmp_path, messages)
     clock = SettableClock((BEGIN + SPLITS * SPLIT + 5) * S)
     found = memory_of(tmp_path, clock=clock)
     return with_store(found, tmp_path) if request.param else found
@@ -129,19 +121,12 @@ def test_what_was_searched_without_the_silence_does_not_name_it(
 
 def test_several_topics_that_fall_silent_together_are_one_event(tmp_path: Path) -> None:
     names = [f"/sensor_{number}" for number in range(5)]
-    for number in range(SPLITS):
-        begin = (BEGIN + number * SPLIT) * S
-        messages = [odom(begin + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLIT)]
-        messages += [boolean(begin + at * S, data=True, topic="/a") for at in range(SPLIT)]
-        if number not in BLIND:
-            for offset, name in enumerate(names):
-                messages += [
-                    boolean(begin + at * S + offset, data=True, topic=name) for at in range(SPLIT)
-                ]
-        write_mcap(
-            tmp_path / "rec" / f"rec_{number}.mcap",
-            sorted(messages, key=lambda each: each.log_time),
-        )
+    messages = [odom(BEGIN * S + at * S // 2, 0.0, 0.0, 0.0) for at in range(2 * SPLITS * SPLIT)]
+    for second in range(SPLITS * SPLIT):
+        heard = ["/a", *names] if second // SPLIT not in BLIND else ["/a"]
+        at = (BEGIN + second) * S
+        messages += [boolean(at + nth, data=True, topic=name) for nth, name in enumerate(heard)]
+    write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 400) * S))
     reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 300)
     [event] = [each for each in reply["events"] if "silent" in each["text"]]

@@ -30,6 +30,7 @@ from tests.support.log_lines import with_checks
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 
@@ -38,9 +39,20 @@ DAY = 86_400 * S
 BEGIN = 1_784_000_000 * S
 
 
-def remembering(folder: Path, messages: list[Msg], *, seconds: float = 60) -> Memory:
+DRIVEN = [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)]
+FLAGS = [boolean(BEGIN + t * 60 * S, True) for t in range(61)]
+
+
+def remembering(
+    folder: Path,
+    messages: Sequence[Msg] = DRIVEN,
+    *,
+    seconds: float = 60,
+    kept: RetentionLimits | None = None,
+) -> Memory:
     write_mcap(folder / "bag.mcap", sorted(messages, key=lambda each: each.log_time))
-    return memory_of(folder, clock=SettableClock(BEGIN + round(seconds * S)))
+    clock = SettableClock(BEGIN + round(seconds * S))
+    return memory_of(folder, clock=clock, limits=QuerySettings(kept=kept))
 
 
 def beating(folder: Path, state: RecorderState, at: float, **more: Any) -> None:
@@ -67,7 +79,7 @@ def shown(memory: Memory, folder: Path) -> dict[str, Any]:
 
 
 def test_a_memory_that_records_well_is_to_be_trusted(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    memory = remembering(tmp_path)
     beating(tmp_path, RecorderState.RECORDING, 59)
     told = shown(memory, tmp_path)
     assert told["doubts"] == "no loss or fault was found"
@@ -118,7 +130,7 @@ def test_where_another_program_records_the_status_says_so(tmp_path: Path) -> Non
 def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole(
     tmp_path: Path,
 ) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    memory = remembering(tmp_path)
     beating(tmp_path, RecorderState.RECORDING, 59, lost={"/odom": 7})
     append_losses(
         tmp_path,
@@ -151,7 +163,7 @@ def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Pat
 
 
 def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN + t * S, 0.0, 0.0, 0.0) for t in range(50)])
+    memory = remembering(tmp_path)
     append_losses(
         tmp_path,
         [
@@ -174,7 +186,7 @@ def test_a_window_has_what_is_missing_in_it_and_a_comparison_says_in_which(tmp_p
 
 
 def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    memory = remembering(tmp_path)
     beating(tmp_path, RecorderState.RECORDING, 59, age_held="72 bags stay")
     told = shown(memory, tmp_path)
     assert told["notes"] == ["72 bags stay"]
@@ -186,7 +198,7 @@ def test_age_that_is_held_is_reported_while_the_recorder_lives(tmp_path: Path) -
 
 
 def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    memory = remembering(tmp_path)
     beating(tmp_path, RecorderState.RECORDING, 59, held_back="1 split is not served")
     SCREENED.write(tmp_path, ScreenState(excluded=[Excluded(0, 10**9)]))
     told = shown(memory, tmp_path)
@@ -200,7 +212,7 @@ def test_splits_that_are_held_back_and_stretches_that_were_excluded(tmp_path: Pa
 def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
     now: Literal["wall", "latest"], told: tuple[str | None, bool | None], tmp_path: Path
 ) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=1e6)
+    memory = remembering(tmp_path, seconds=1e6)
     memory = replace(memory, limits=replace(memory.limits, now=now))
     beating(tmp_path, RecorderState.RECORDING, 1)
     reply = shown(memory, tmp_path)
@@ -211,7 +223,7 @@ def test_a_heartbeat_that_was_copied_with_bags_to_replay_is_no_recorder_of_them(
 def test_a_recorder_that_is_started_beside_a_server_of_bags_to_replay_is_shown(
     tmp_path: Path,
 ) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=60)
+    memory = remembering(tmp_path, seconds=60)
     memory = replace(memory, limits=QuerySettings(now="latest"))
     assert shown(memory, tmp_path)["recorder"] is None
     beating(tmp_path, RecorderState.RECORDING, 59)
@@ -222,7 +234,7 @@ def test_a_recorder_that_is_started_beside_a_server_of_bags_to_replay_is_shown(
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    memory = remembering(tmp_path)
     missing = tuple(f"/gone_{n:02}" for n in range(30))
     beating(tmp_path, RecorderState.RECORDING, 59, restarts=3, missing=missing)
     told = shown(memory, tmp_path)
@@ -243,7 +255,7 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(tmp_path: Path) -> 
 def test_a_recorder_that_does_not_record_is_reported(
     tmp_path: Path, state: RecorderState, at: float, more: dict[str, str], doubts: str
 ) -> None:
-    memory = remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)])
+    memory = remembering(tmp_path)
     beating(tmp_path, state, at, **more)
     assert shown(memory, tmp_path)["doubts"] == doubts
 
@@ -290,7 +302,7 @@ def test_what_was_recorded_before_a_long_gap_did_not_fall_silent(
 
 def test_damaged_files_are_counted_and_reported(tmp_path: Path) -> None:
     (tmp_path / "bad.mcap").write_bytes(b"no bag at all, whatever its name says")
-    told = shown(remembering(tmp_path, [odom(BEGIN, 0.0, 0.0, 0.0)], seconds=9e6), tmp_path)
+    told = shown(remembering(tmp_path, seconds=9e6), tmp_path)
     assert told["damaged"] == 1
     assert "1 damaged bag file" in told["doubts"]
 
@@ -308,9 +320,7 @@ def test_an_empty_memory_has_a_status_too(tmp_path: Path) -> None:
 
 
 def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [boolean(BEGIN + t * S, True) for t in range(60)])
-    kept = RetentionLimits(max_total_bytes=10**6, max_age_ns=7 * DAY)
-    memory = replace(memory, limits=replace(memory.limits, kept=kept))
+    memory = remembering(tmp_path, kept=RetentionLimits(10**6, 7 * DAY))
     beating(tmp_path, RecorderState.RECORDING, 59, counted_bytes=4_900_000, state_bytes=4_700_000)
     budget = shown(memory, tmp_path)["budget"]
     assert (budget["used_gb"], budget["state_gb"]) == (0.0049, 0.0047)
@@ -320,9 +330,8 @@ def test_what_a_live_recorder_counts_is_what_the_budget_has(tmp_path: Path) -> N
 
 
 def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [boolean(BEGIN + t, True) for t in range(2)])
-    kept = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)
-    memory = replace(memory, limits=replace(memory.limits, kept=kept))
+    kept = RetentionLimits(10**9, 7 * DAY)
+    memory = remembering(tmp_path, [boolean(BEGIN + t, True) for t in range(2)], kept=kept)
     beating(tmp_path, RecorderState.RECORDING, 1)
     answer = memory_status(memory, Call())
     assert answer.budget.used > 0
@@ -330,7 +339,7 @@ def test_some_messages_at_once_show_no_growth(tmp_path: Path) -> None:
 
 
 def test_the_budget_says_when_it_is_full_and_how_far_back_it_will_reach(tmp_path: Path) -> None:
-    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
+    memory = remembering(tmp_path, FLAGS)
     size = (tmp_path / "bag.mcap").stat().st_size
     beating(tmp_path, RecorderState.RECORDING, 59)
     beside = (tmp_path / "recorder.json").stat().st_size
@@ -361,9 +370,7 @@ SOUND = "no loss or fault was found"
 def test_no_growth_is_predicted_of_bags_that_nobody_writes(
     tmp_path: Path, state: RecorderState | None, at: float
 ) -> None:
-    memory = remembering(tmp_path, [boolean(BEGIN + t * 60 * S, True) for t in range(61)])
-    budget = RetentionLimits(max_total_bytes=10**9, max_age_ns=7 * DAY)
-    memory = replace(memory, limits=replace(memory.limits, kept=budget))
+    memory = remembering(tmp_path, FLAGS, kept=RetentionLimits(10**9, 7 * DAY))
     if state is not None:
         beating(tmp_path, state, at)
     told = shown(memory, tmp_path)["budget"]

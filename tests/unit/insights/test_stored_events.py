@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.columns.stated import StatedColumns
-from tests.support.bags import boolean, command, detections, log_entry, write_mcap
+from tests.support.bags import boolean, command, detections, log_entry, write_splits
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -27,11 +27,7 @@ def written(folder: Path) -> Memory:
     rows += [detections((BEGIN + 5 * nth) * S, labels) for nth, labels in enumerate(seen)]
     rows += [command((BEGIN + at) * S, float(at % 60 < 40)) for at in range(1200)]
     rows += [log_entry((BEGIN + at) * S, 40, "arm", "stuck") for at in (100, 900)]
-    rows.sort(key=lambda row: row.log_time)
-    for nth, since in enumerate(range(0, 1200, 60)):
-        begin, stop = (BEGIN + since) * S, (BEGIN + since + 60) * S
-        split = [row for row in rows if begin <= row.log_time < stop]
-        write_mcap(folder / "rec" / f"rec_{nth}.mcap", split)
+    write_splits(folder, rows, 60)
     return memory_of(folder)
 
 

@@ -271,10 +271,10 @@ def test_standstills_are_compared_by_place_and_length(tmp_path: Path) -> None:
 
 
 def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> None:
-    stood = [scene(at, HERE, [BOOK], in_map=False) for at in range(30)]
-    later = [scene(at, (3.0, 0.0, 0.0), [BOOK], in_map=False) for at in range(60, 90)]
-    write_splits(tmp_path / "two", [each for one in stood for each in one], name="first")
-    write_splits(tmp_path / "two", [each for one in later for each in one], name="second")
+    stood = looked(0, 30, HERE, BOOK, in_map=False)
+    later = looked(60, 90, (3.0, 0.0, 0.0), BOOK, in_map=False)
+    write_splits(tmp_path / "two", stood, name="first")
+    write_splits(tmp_path / "two", later, name="second")
     reply = ask(tmp_path / "two", **EARLIER, **LATER)
     assert not reply.keys() & {"stood_at", "farthest_apart"}
     assert any("changes with every start" in note for note in reply["notes"])
@@ -283,7 +283,7 @@ def test_odometry_that_began_anew_has_no_places_to_compare(tmp_path: Path) -> No
     [book] = reply["things"]["not_comparable"]
     assert labels(reply) == {"not_comparable": ["book"]}
     assert (book["was"]["last_seen"], book["is"]["first_seen"]) == (BEGIN + 29, BEGIN + 60)
-    write_splits(tmp_path / "one", [each for one in (*stood, *later) for each in one])
+    write_splits(tmp_path / "one", [*stood, *later])
     reply = ask(tmp_path / "one", **EARLIER, **LATER)
     assert len(reply["stood_at"]) == 2
     assert reply["frame_id"] == "odom"
@@ -294,10 +294,9 @@ def test_of_odometry_that_began_anew_only_what_one_window_saw_was_not_looked_at(
     tmp_path: Path,
 ) -> None:
     person = ("person", 3.0, 0.5)
-    first = [scene(at, HERE, [BOOK, ("book", 3.5, 1.5), person], in_map=False) for at in range(30)]
-    second = [scene(at, HERE, [BOOK, MUG, person], in_map=False) for at in range(60, 90)]
-    for name, some in (("first", first), ("second", second)):
-        write_splits(tmp_path, [each for one in some for each in one], name=name)
+    first = looked(0, 30, HERE, BOOK, ("book", 3.5, 1.5), person, in_map=False)
+    write_splits(tmp_path, first, name="first")
+    write_splits(tmp_path, looked(60, 90, HERE, BOOK, MUG, person, in_map=False), name="second")
     reply = ask(tmp_path, **EARLIER, **LATER)
     assert labels(reply) == {
         "not_comparable": ["book"],

@@ -93,8 +93,10 @@ HERE = (1.0, 0.0, 0.0)
 AWAY = (1.0, 0.0, math.pi)
 
 
-def looked(start: int, stop: int, robot: tuple[float, float, float], *seen: Seen) -> list[Msg]:
-    return [message for at in range(start, stop) for message in scene(at, robot, seen)]
+def looked(
+    start: int, stop: int, robot: tuple[float, float, float], *seen: Seen, **more: Any
+) -> list[Msg]:
+    return [message for at in range(start, stop) for message in scene(at, robot, seen, **more)]
 
 
 def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: object) -> Any:
@@ -396,10 +398,8 @@ def test_a_label_that_is_given_to_two_things_makes_them_none(tmp_path: Path) -> 
 
 
 def test_what_is_left_out_for_its_score_is_said_with_the_limit(tmp_path: Path) -> None:
-    messages = [
-        message for at in range(20) for message in scene(at, HERE, [("mug", 3.0, 0.5)], score=0.3)
-    ]
-    write_splits(tmp_path, messages + looked(20, 40, HERE, ("cup", 3.0, 0.5)))
+    low = looked(0, 20, HERE, ("mug", 3.0, 0.5), score=0.3)
+    write_splits(tmp_path, low + looked(20, 40, HERE, ("cup", 3.0, 0.5)))
     strict = QuerySettings(min_score=0.5)
     reply = ask(tmp_path, strict)
     assert reply["labels"] == {"cup": 1}
@@ -427,11 +427,8 @@ def test_labels_without_a_place_are_named(tmp_path: Path) -> None:
 
 def test_without_a_map_each_run_of_odometry_has_its_own_places(tmp_path: Path) -> None:
     for run in range(2):
-        messages = [
-            message
-            for at in range(run * 100, run * 100 + 20)
-            for message in scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False)
-        ]
+        begin = run * 100
+        messages = looked(begin, begin + 20, HERE, ("mug", 3.0, 0.5), in_map=False)
         write_splits(tmp_path, messages, name=f"run{run}")
     reply = ask(tmp_path, label="mug")
     assert reply["frame_id"] == "odom"
@@ -480,8 +477,7 @@ def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
 
 
 def test_a_place_in_a_frame_in_which_nothing_is_known_is_named(tmp_path: Path) -> None:
-    scenes = (scene(at, HERE, [("mug", 3.0, 0.5)], in_map=False) for at in range(10))
-    write_splits(tmp_path, [message for one in scenes for message in one])
+    write_splits(tmp_path, looked(0, 10, HERE, ("mug", 3.0, 0.5), in_map=False))
     reply = ask(tmp_path, where="kitchen")
     assert reply["things"] == []
     assert (

@@ -56,6 +56,11 @@ def heard_by(past: Past, *, latched: bool, nth: int = 0) -> RecordingConditions:
     return RecordingConditions(past.start, end, heard, (), f"rec_{nth}", f"rec_{nth - 1}")
 
 
+def heard_in(*pasts: Past) -> list[RecordingConditions]:
+    """Recordings of a latched topic, each of which took over from the one before it."""
+    return [heard_by(past, latched=True, nth=nth) for nth, past in enumerate(pasts)]
+
+
 def knows(past: Past, time: int, *, latched: bool) -> bool | None:
     """What a recording itself knows at a time."""
     said = [each for each in past.said if each[0] <= time]
@@ -142,14 +147,12 @@ def test_nothing_stays_while_it_holds_or_is_not_known(
 
 def test_a_condition_that_holds_later_says_nothing_of_when_the_next_recording_began() -> None:
     """Two recordings overlap, the condition begins to hold in both, and the first one ends."""
-    one, other = Past(0, 30, ((0, False), (20, True))), Past(10, 40, ((12, False), (20, True)))
-    both = [heard_by(past, latched=True, nth=nth) for nth, past in enumerate((one, other))]
+    both = heard_in(Past(0, 30, ((0, False), (20, True))), Past(10, 40, ((12, False), (20, True))))
     assert excluded_intervals(rule(margin=2), both) == [Excluded(18, 43, held=True)]
 
 
 def test_what_was_known_before_a_clock_was_set_back_is_not_known_after_it() -> None:
-    before, after = Past(0, 600, ((0, False),)), Past(400, 700, ((450, False),))
-    one, other = (heard_by(past, latched=True, nth=nth) for nth, past in enumerate((before, after)))
+    one, other = heard_in(Past(0, 600, ((0, False),)), Past(400, 700, ((450, False),)))
     assert excluded_intervals(rule(), [one, other]) == []
     found = excluded_intervals(rule(), [one, other._replace(previous=None)])
     assert found == [Excluded(400, 450, held=False)]
@@ -158,8 +161,7 @@ def test_what_was_known_before_a_clock_was_set_back_is_not_known_after_it() -> N
 def test_a_condition_that_held_goes_on_after_a_restart_whose_clock_was_set_back() -> None:
     """To a time inside of the recording before, in which it did not hold yet."""
     before = Past(0, 600, ((0, False), (450, True)))
-    after = Past(400, 700, ((420, True), (430, False)))
-    one, other = (heard_by(past, latched=True, nth=nth) for nth, past in enumerate((before, after)))
+    one, other = heard_in(before, Past(400, 700, ((420, True), (430, False))))
     found = excluded_intervals(rule(), [one, other._replace(previous=None)])
     assert Excluded(400, 430, held=True) in found
     stepped = one._replace(unclear=[(500, 520)])

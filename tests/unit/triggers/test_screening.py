@@ -6,6 +6,7 @@ import errno
 import itertools
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
 import structlog
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from ros2_memory.triggers.exclusion import ExclusionRule
 
 VOLATILE = McapLayout(latched=frozenset())
+FULL = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
 def halves(begin: int, stop: int) -> list[float]:
@@ -235,11 +237,8 @@ class TestFaults:
         name = bags.begin(0)
         split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
 
-        def full(*_: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         with monkeypatch.context() as patched:
-            patched.setattr(McapWriter, "cut", full)
+            patched.setattr(McapWriter, "cut", FULL)
             bags.end()
             assert bags.served() == []
             problem = bags.screening.problem() or ""
@@ -302,11 +301,8 @@ class TestFaults:
         split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
         before = split.read_bytes()
 
-        def full(*_: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         with monkeypatch.context() as patched:
-            patched.setattr(SCREENED, "write", full)
+            patched.setattr(SCREENED, "write", FULL)
             with pytest.raises(OSError, match="No space"):
                 bags.end()
             with pytest.raises(RecorderError, match=r"screened\.json: No space"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from dataclasses import replace
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
 
@@ -228,8 +229,7 @@ class TestQuotas:
         assert (one.fired, other.fired) == (10, 1)
         assert 0 < one.moments < 10
         assert one.moments + one.refused == 10
-        assert one.problem is not None
-        assert "max_gb of the rule noisy" in one.problem
+        assert "max_gb of the rule noisy" in (one.problem or "")
         assert len(robot.logged("trigger_not_kept")) == 1
         assert (other.moments, other.refused, other.problem) == (1, 0, None)
         kept = [sum(each.files.values()) for each in robot.moments() if each.moment.rule == "noisy"]
@@ -277,9 +277,7 @@ class TestRetention:
         robot.look()
         robot.look()
         assert robot.logged("needed_bags_deleted")
-        problem = robot.record().problem
-        assert problem is not None
-        assert "were deleted to make room" in problem
+        assert "were deleted to make room" in (robot.record().problem or "")
 
 
 class TestFaults:
@@ -291,9 +289,7 @@ class TestFaults:
         robot.split(seconds(0, 10, {6}))
         robot.clock.at = T0 + 30 * S
 
-        def full(*_: object, **__: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
+        full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
         with monkeypatch.context() as broken:
             broken.setattr(saved_moments, "make_moment_folder", full)
             broken.setattr(json_files, "write_durably", full)
@@ -329,9 +325,7 @@ class TestFaults:
     ) -> None:
         robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
 
-        def failing(_: Path) -> None:
-            raise OSError(errno.EIO, "Input/output error")
-
+        failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
         monkeypatch.setattr(TRIGGERS, "read", failing)
         robot.house = robot.new_house()
         name = robot.begin(T0)
@@ -360,9 +354,7 @@ class TestFaults:
         robot.begin(T0)
         robot.split(seconds(0, 10))
         robot.close_all()
-        problem = robot.record().problem
-        assert problem is not None
-        assert f"'{field}'" in problem
+        assert f"'{field}'" in (robot.record().problem or "")
 
     def test_messages_that_cannot_be_decoded_are_named(self, tmp_path: Path) -> None:
         robot = watched(tmp_path)
@@ -370,9 +362,7 @@ class TestFaults:
         robot.split(seconds(0, 3), layout=McapLayout(definitions=False))
         robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
         robot.close_all()
-        problem = robot.record().problem
-        assert problem is not None
-        assert "/bumper" in problem
+        assert "/bumper" in (robot.record().problem or "")
 
     def test_a_kill_between_moment_and_state_doubles_nothing(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -382,16 +372,10 @@ class TestFaults:
         robot.split(seconds(0, 30, {6, 9, 20}))
         robot.clock.at = T0 + 60 * S
 
-        class KilledError(BaseException):
-            pass
-
-        def killed(*_: object, **__: object) -> None:
-            raise KilledError
-
         robot.beat(state=RecorderState.STOPPED)
         with monkeypatch.context() as broken:
-            broken.setattr(TRIGGERS, "write", killed)
-            with pytest.raises(KilledError):
+            broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
+            with pytest.raises(SystemExit):
                 robot.look()
         assert len(robot.moments()) == 2
         robot.house = robot.new_house()
