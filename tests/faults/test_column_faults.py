@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.columns import database, fill
+from ros2_memory.columns import database
 from ros2_memory.columns.writing import LongBag
-from ros2_memory.core.large_reads import LARGE_BYTES
 from tests.support.column_worlds import World, check_all, store_file
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts
-from tests.unit.columns.test_fill import T0, S, in_groups, write_bag, write_long_bag
+from tests.unit.columns.test_fill import T0, S, decode_in_groups, write_bag, write_long_bag
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -60,22 +59,18 @@ class StatementCounter:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def fill_up(bag_dir: Path, kill_at: int = 0, small_bytes: int = 0) -> int:
-    """Stores everything, of long bags group by group; returns how many statements that took.
-
-    Bags of more than `small_bytes` are no small ones, which are decoded together.
-    """
+def fill_up(bag_dir: Path, kill_at: int = 0) -> int:
+    """Stores everything, of long bags group by group; returns how many statements that took."""
     counter = StatementCounter(kill_at)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_connect", counter.connect)
-        patch.setattr(fill, "LARGE_BYTES", small_bytes)
-        patch.setattr(fill, "decoded", in_groups)
+        decode_in_groups(patch)
         World.of(bag_dir).fill()
     return counter.count
 
 
-def started(bag_dir: Path, kill_at: int = 0, small_bytes: int = 0) -> BaseProcess:
-    process = SPAWNED.Process(target=fill_up, args=(bag_dir, kill_at, small_bytes), daemon=True)
+def started(bag_dir: Path, kill_at: int = 0) -> BaseProcess:
+    process = SPAWNED.Process(target=fill_up, args=(bag_dir, kill_at), daemon=True)
     process.start()
     return process
 
@@ -129,13 +124,13 @@ def assert_whole(bag_dir: Path) -> None:
         assert size < 0 or kinds == 1, path
 
 
-@pytest.mark.parametrize(("small_bytes", "first"), [(0, 0), (LARGE_BYTES, 70)])
+@pytest.mark.parametrize("first", [0, 70])
 def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_answers(
-    tmp_path: Path, small_bytes: int, first: int
+    tmp_path: Path, first: int
 ) -> None:
     whole = tmp_path / "whole"
     write_bags(whole, first)
-    statements = fill_up(whole, 0, small_bytes)
+    statements = fill_up(whole)
     assert check_all(World.of(whole)) == ROWS
     right = answers(World.of(whole).unstored())
     draw = random.Random()
@@ -143,7 +138,7 @@ def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_an
         kill_at = draw.randint(1, statements)
         bag_dir = tmp_path / f"killed at {kill_at} of {statements}"
         write_bags(bag_dir, first)
-        process = started(bag_dir, kill_at, small_bytes)
+        process = started(bag_dir, kill_at)
         process.join()
         assert process.exitcode == -signal.SIGKILL
         if store_file(bag_dir).exists():
@@ -151,7 +146,7 @@ def test_a_kill_at_any_statement_leaves_bags_whole_or_not_at_all_and_the_same_an
             assert check_all(killed) == ROWS
             assert_same_answers(killed, right)
             assert_whole(bag_dir)
-        fill_up(bag_dir, 0, small_bytes)
+        fill_up(bag_dir)
         world = World.of(bag_dir)
         assert len(world.stored()) == 13
         assert_whole(bag_dir)
@@ -187,7 +182,7 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
     with pytest.MonkeyPatch.context() as patch:
         whole = LongBag.end
         patch.setattr(LongBag, "end", end)
-        patch.setattr(fill, "decoded", in_groups)
+        decode_in_groups(patch)
         assert filling.fill_alone() == 1
     assert found == [set()]
     assert asking.stored() == filling.stored() != set()

@@ -202,6 +202,11 @@ class Database:
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
+    def give_up(self, error: Exception) -> None:
+        """Sets the database aside, as what was read of it turned out to be damaged."""
+        with self._lock:
+            self._failed(error)
+
     def write_again(self) -> None:
         """Finds out whether the disk works again, if it failed and nothing waits to be written.
 
@@ -521,8 +526,7 @@ def _connect_and_check(path: Path) -> sqlite3.Connection:
         except sqlite3.DatabaseError as error:
             if connection is not None:
                 connection.close()
-            # Operational errors are those of the moment or of the disk, not of the content.
-            if isinstance(error, sqlite3.OperationalError):
+            if is_transient(error):
                 raise
             _set_aside(path, f"it is damaged: {error}")
             continue
@@ -547,7 +551,10 @@ def _connect(target: str) -> sqlite3.Connection:
 
 
 def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
-    """Creates the tables of a new database; returns how an old one is of another version."""
+    """Creates the tables of a new database; returns how an old one is of another version.
+
+    One that lacks a table turns out damaged where that is asked.
+    """
     connection.execute("PRAGMA journal_mode = WAL")
     connection.execute("PRAGMA synchronous = NORMAL")
     connection.execute("BEGIN IMMEDIATE")
@@ -560,18 +567,8 @@ def _create_or_compare_tables(connection: sqlite3.Connection) -> str | None:
     connection.execute("COMMIT")
     if declared and version != FORMAT:
         return f"it is of version {version}, and this program needs {FORMAT}"
-    # SQLite keeps the statement that declared a table; tables of its own are named sqlite_*.
-    names = "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL AND name NOT GLOB 'sqlite_*'"
-    statements = [str(sql) for (sql,) in connection.execute(names).fetchall()]
-    if declared and _without_spacing(statements) != _without_spacing(STATEMENTS.split(";")):
-        return "its tables are not those of this version"
     connection.execute(_FIRST_ROWS).fetchall()
     return None
-
-
-def _without_spacing(statements: Sequence[str]) -> set[str]:
-    """Returns the statements with single spaces between words, without empty ones."""
-    return {" ".join(each.split()) for each in statements} - {""}
 
 
 def _is_used_elsewhere(connection: sqlite3.Connection) -> bool:

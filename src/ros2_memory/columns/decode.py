@@ -7,10 +7,8 @@ decoder message by message (`objects.py`), into the same columns. No message is 
 from __future__ import annotations
 
 import zlib
-from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -28,7 +26,6 @@ from ros2_memory.storage.base import (
     Batch,
     Channel,
     Definition,
-    IntArray,
     Schema,
     or_errors,
     unless_error,
@@ -75,21 +72,7 @@ class _Kind(NamedTuple):
     is_hashed: bool
 
 
-class Piece(NamedTuple):
-    """Messages of a channel that are not decoded yet, and how they are."""
-
-    kind: _Kind
-    batch: Batch
-
-
-class BagRows(NamedTuple):
-    """A table, and which of some bags each of its rows is of, by their order."""
-
-    table: Table
-    bags: IntArray
-
-
-def pieces(
+def decoded(
     reader: BagReader,
     path: Path,
     window: TimeWindow = _EVERYTHING,
@@ -97,11 +80,14 @@ def pieces(
     topics: Collection[str] | None = None,
     hashed: Callable[[Channel], bool] = lambda _: False,
     columns: bool = True,
-) -> Iterator[Piece]:
-    """Yields the messages of a bag, not decoded yet.
+    skip_undecodable: bool = False,
+) -> Iterator[list[Table]]:
+    """Yields the messages of a bag as tables, in groups.
 
-    Lazy: nothing is opened before the first item is requested. In memory is one buffer of the
-    reader.
+    In one group there is one table for each topic, type and definition with messages; a bag that
+    decompresses to less than `GROUP_BYTES` is one group. Tables of later groups may overlap earlier
+    ones in time, as the chunks of the file do. Lazy: nothing is opened before the first group is
+    requested. In memory are one group and one buffer of the reader.
 
     Args:
         reader: reads the bag.
@@ -111,6 +97,8 @@ def pieces(
         hashed: of which channels the payloads are hashed.
         columns: whether there are columns; else only the times of all messages, also of those that
             cannot be decoded.
+        skip_undecodable: whether a message that cannot be decoded has no row. Else its topic has
+            rows alone in this group: the bag has to be asked about each of them.
 
     Raises:
         BagVanishedError: the file is not there.
@@ -118,7 +106,7 @@ def pieces(
             read.
     """
 
-    def found() -> Iterator[Piece | BagError]:
+    def found() -> Iterator[list[Table] | BagError]:
         channels = [
             channel
             for channel in reader.channels(path)
@@ -134,87 +122,22 @@ def pieces(
             if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
                 bare.discard(channel.topic)
         wanted = {channel.topic for channel in channels}
+        group = _Group(reader, skip_undecodable)
         for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
                 yield batch
             elif batch.sizes.size:
-                yield Piece(kinds.read(batch), batch)
+                if group.is_full_before(batch):
+                    yield group.tables()
+                    group = _Group(reader, skip_undecodable)
+                group.add(kinds.read(batch), batch)
             del batch  # and its buffer, before the next is read
-
-    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-    return map(unless_error, found())
-
-
-def decoded(
-    reader: BagReader,
-    read: Iterator[Piece],
-    *,
-    skip_undecodable: bool = False,
-) -> Iterator[list[Table]]:
-    """Yields the messages of a bag as tables, in groups.
-
-    In one group there is one table for each topic, type and definition with messages; a bag that
-    decompresses to less than `GROUP_BYTES` is one group. Tables of later groups may overlap earlier
-    ones in time, as the chunks of the file do. In memory are one group and one buffer of the
-    reader.
-
-    Args:
-        reader: reads the bag.
-        read: its `pieces`; what they raise is raised here.
-        skip_undecodable: whether a message that cannot be decoded has no row. Else its topic has
-            rows alone in this group: the bag has to be asked about each of them.
-    """
-
-    def found() -> Iterator[list[Table] | BagError]:
-        group = _Group(reader, skip_undecodable)
-        for piece in or_errors(read):
-            if isinstance(piece, BagError):
-                yield piece
-                continue
-            if group.is_full_before(piece.batch):
-                yield group.tables()
-                group = _Group(reader, skip_undecodable)
-            group.add(piece)
-            del piece  # and its buffer, before the next is read
         tables = group.tables()
         if tables:
             yield tables
 
+    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
     return map(unless_error, found())
-
-
-def decoded_together(reader: BagReader, bags: Sequence[Sequence[Piece]]) -> list[BagRows]:
-    """Returns all messages of small bags as tables that have rows of many of them.
-
-    Numpy takes longer to be called than to go through the messages of one topic in a bag of 10 s.
-    Messages that cannot be decoded have rows, too, as of `decoded`.
-
-    Args:
-        reader: decodes what cannot be walked.
-        bags: all messages of each. Times that are equal are in this order.
-    """
-    buffers = {id(piece.batch.buffer): piece.batch.buffer for read in bags for piece in read}
-    ends = accumulate(map(len, buffers.values()), initial=0)
-    begins = dict(zip(buffers, ends, strict=False))
-    whole = b"".join(buffers.values())
-    alike: dict[object, list[_Own]] = defaultdict(list)
-    for nth, read in enumerate(bags):
-        # All messages of a topic in a bag are of the first channel, and have columns, or none has.
-        firsts: dict[object, Channel] = {}
-        kinds: dict[object, _Kind] = {}
-        for kind, batch in read:
-            topic = _topic_of(batch)
-            firsts.setdefault(topic, batch.channel)
-            if topic not in kinds or kind.plan is None:
-                kinds[topic] = kind
-        for _, batch in read:
-            topic = _topic_of(batch)
-            channel, kind = firsts[topic], kinds[topic]
-            starts = batch.starts + begins[id(batch.buffer)]
-            moved = replace(batch, channel=channel, buffer=whole, starts=starts)
-            key = (topic, channel.latched, kind.plan is None, kind.is_hashed)
-            alike[key].append(_Own(nth, kind, moved))
-    return [rows for own in alike.values() for rows in _together(reader, own)]
 
 
 @dataclass(slots=True)
@@ -303,15 +226,15 @@ class _Group:
             size = sum(part.memory_bytes for parts in self._parts.values() for part in parts)
         return size > GROUP_BYTES
 
-    def add(self, piece: Piece) -> None:
-        """Decodes a piece."""
-        batch = piece.batch
+    def add(self, kind: _Kind, batch: Batch) -> None:
+        """Decodes a batch."""
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._bytes += len(batch.buffer)
-        parts = self._parts.setdefault(_topic_of(batch), [])
+        channel = batch.channel
+        parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
         for some in _parts_of(batch):
-            self._add(parts, _table(piece.kind, some, self.reader, skip=self.skip_undecodable))
+            self._add(parts, _table(kind, some, self.reader, skip=self.skip_undecodable))
 
     def _add(self, parts: list[Table], table: Table) -> None:
         """Adds a table to those of its topic, of which all have columns or none has."""
@@ -343,54 +266,10 @@ def _parts_of(batch: Batch) -> Iterator[Batch]:
         yield batch.taken(rows)
 
 
-class _Own(NamedTuple):
-    """Messages of one bag among those of others."""
-
-    bag: int
-    kind: _Kind
-    batch: Batch
-
-
-def _topic_of(batch: Batch) -> tuple[Schema, str, str]:
-    channel = batch.channel
-    return channel.schema, channel.encoding, channel.topic
-
-
-def _together(reader: BagReader, own: Sequence[_Own]) -> Iterator[BagRows]:
-    """Yields messages of one topic and kind in some bags, which lie in one buffer."""
-    first = own[0]
-    batches = [entry.batch for entry in own]
-    of = np.repeat([entry.bag for entry in own], [batch.sizes.size for batch in batches])
-    times = np.concatenate([batch.log_times for batch in batches])
-    order: IntArray = np.arange(times.size)
-    if not (times[1:] > times[:-1]).all():
-        order = np.lexsort((np.concatenate([batch.places for batch in batches]), of, times))
-    whole = Batch(
-        first.batch.channel,
-        times[order],
-        np.concatenate([batch.publish_times for batch in batches])[order],
-        np.arange(times.size),
-        first.batch.buffer,
-        np.concatenate([batch.starts for batch in batches])[order],
-        np.concatenate([batch.sizes for batch in batches])[order],
-    )
-    bags = {entry.bag for entry in own}
-    try:
-        table = _table(first.kind, whole, None if len(bags) > 1 else reader)
-    except NotWalkedError:
-        for bag in sorted(bags):
-            yield from _together(reader, [entry for entry in own if entry.bag == bag])
-    else:
-        yield BagRows(table, of[order])
-
-
-def _table(kind: _Kind, batch: Batch, reader: BagReader | None, *, skip: bool = False) -> Table:
+def _table(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) -> Table:
     """Returns the messages of a batch as a table; what cannot be walked the reader decodes.
 
     With `skip` without those that it cannot decode.
-
-    Raises:
-        NotWalkedError: there is a message that cannot be walked, and no reader.
     """
     order = order_of(batch.log_times, batch.places)
     if order is not None:
@@ -414,8 +293,7 @@ def _table(kind: _Kind, batch: Batch, reader: BagReader | None, *, skip: bool = 
     try:
         return _with_columns(table, walked(kind.plan, batch))
     except NotWalkedError:
-        if reader is None:
-            raise
+        pass
     try:
         return joined([*_one_by_one(reader, kind.plan, batch, table, skip=skip)])
     except UndecodableError as error:

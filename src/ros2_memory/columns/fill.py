@@ -5,20 +5,18 @@ from __future__ import annotations
 import os
 import time
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple
-
-import numpy as np
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.decode import BagRows, Piece, decoded, decoded_together, pieces
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore
 from ros2_memory.columns.writing import PART_NS, DecodedBags, ReadBag
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import united
@@ -84,24 +82,6 @@ class Batch(NamedTuple):
 
     bags: Sequence[BagFile]
     whole: bool
-
-
-@dataclass(slots=True)
-class _Found:
-    """Bags of one batch while they are read: the last small ones are decoded together."""
-
-    small: list[tuple[ReadBag, list[Piece]]] = field(default_factory=list)
-    small_bytes: int = 0
-    bags: list[ReadBag] = field(default_factory=list)
-    tables: list[BagRows] = field(default_factory=list)
-    table_bytes: int = 0
-
-    def add(self, bags: Sequence[ReadBag], tables: Sequence[BagRows]) -> None:
-        """Adds bags that were decoded; the tables name them by their order."""
-        before = len(self.bags)
-        self.bags += bags
-        self.tables += [BagRows(table, own + before) for table, own in tables]
-        self.table_bytes += sum(table.memory_bytes for table, _ in tables)
 
 
 class Filling:
@@ -194,16 +174,15 @@ class Filling:
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         bags, whole = batch
-        found = _Found()
+        found = DecodedBags([], [])
         done = 0
         for bag in sorted(bags, key=in_time):
             done += self._read(bag, found, hashed=self._is_shared(bag, timeline))
             self._large.release()
-            if found.table_bytes > _MOST_HELD:
-                done += self._put(DecodedBags(found.bags, found.tables), whole=whole)
-                found = _Found(found.small, found.small_bytes)
-        self._decode(found)
-        return done + self._put(DecodedBags(found.bags, found.tables), whole=whole)
+            if sum(table.memory_bytes for table, _ in found.tables) > _MOST_HELD:
+                done += self._put(found, whole=whole)
+                found = DecodedBags([], [])
+        return done + self._put(found, whole=whole)
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -270,64 +249,27 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _read(self, bag: BagFile, found: _Found, *, hashed: bool) -> bool:
-        """Adds a bag to what was found, a small one undecoded; or returns whether it is stored."""
+    def _read(self, bag: BagFile, found: DecodedBags, *, hashed: bool) -> bool:
+        """Adds a bag to what was found; stores a long one, and returns whether it is stored."""
         if not self._is_settled(bag):
             return False
         try:
             if self._is_renewed(bag):
                 return True
-            current = partial(self._is_settled, bag)
-            to_store = ReadBag(self._key(bag), bag, hashed, current)
+            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._is_settled, bag))
             # A latched message may come again later, in another recording.
-            read = pieces(self._reader, bag.path, hashed=lambda each: hashed or each.latched)
-            begin, size = _first_pieces(read)
-            if size > LARGE_BYTES or bag.end - bag.start > LONG_NS:
-                groups = decoded(self._reader, chain(_popped(begin), read))
-                return self._add_large(to_store, groups, found)
-            if found.small_bytes + size > LARGE_BYTES:
-                self._decode(found)
-            found.small.append((to_store, begin))
-            found.small_bytes += size
-        except Exception as error:  # noqa: BLE001 - the next bag may be whole
-            self._not_stored(bag, error)
-        return False
-
-    def _add_large(self, to_store: ReadBag, groups: Iterator[list[Table]], found: _Found) -> bool:
-        """Adds a bag of one group to what was found; stores another, and returns whether it did."""
-        bag = to_store.bag
-        first = next(groups, [])
-        second = next(groups, None)
-        if second is None and bag.end - bag.start <= LONG_NS:
-            self._decode(found)  # bags stay in order
-            own = [BagRows(table, np.zeros(len(table), np.int64)) for table in first]
-            found.add([to_store], own)
-            return False
-        begin = [first] if second is None else [first, second]
-        del first, second
-        return self._put_long(to_store, self._released_groups(begin, groups))
-
-    def _decode(self, found: _Found) -> None:
-        """Decodes the small bags together; where that fails, each alone."""
-        small, found.small, found.small_bytes = found.small, [], 0
-        try:
-            tables = decoded_together(self._reader, [begin for _, begin in small])
-            found.add([to_store for to_store, _ in small], tables)
-        except Exception as error:  # noqa: BLE001 - of one of them
-            if len(small) == 1:
-                self._not_stored(small[0][0].bag, error)
-                return
-            for alone in small:
-                found.small = [alone]
-                self._decode(found)
-
-    def _not_stored(self, bag: BagFile, error: Exception) -> None:
-        """Refuses a bag that cannot be read or decoded. Called where the error is caught."""
-        if isinstance(error, BagError):
+            groups = decoded(self._reader, bag.path, hashed=lambda each: hashed or each.latched)
+            begin = [*islice(groups, 2)]
+            if len(begin) > 1 or bag.end - bag.start > LONG_NS:
+                return self._put_long(to_store, self._released_groups(begin, groups))
+            found.add(to_store, begin[0] if begin else [])
+        except BagError as error:
             self._refuse(bag, error.reason)
-        else:
-            log.exception("bag_not_stored", path=str(bag.path))  # noqa: LOG004 - caught above
+        except Exception as error:
+            # The next bag may be whole.
+            log.exception("bag_not_stored", path=str(bag.path))
             self._refuse(bag, type(error).__name__)
+        return False
 
     def _put(self, decoded: DecodedBags, *, whole: bool) -> int:
         """Stores bags in parts together; each alone where the database refuses that."""
@@ -440,26 +382,6 @@ class Filling:
 
     def _key(self, bag: BagFile) -> BagKey:
         return BagKey.of(bag, self._bag_dir)
-
-
-def _first_pieces(read: Iterator[Piece]) -> tuple[list[Piece], int]:
-    """Returns the pieces until they are no small bag's, or all, and the bytes of their buffers."""
-    found: list[Piece] = []
-    size = 0
-    for piece in read:
-        if not found or piece.batch.buffer is not found[-1].batch.buffer:
-            size += len(piece.batch.buffer)
-        found.append(piece)
-        if size > LARGE_BYTES:
-            break
-    return found, size
-
-
-def _popped(found: list[Piece]) -> Iterator[Piece]:
-    """Yields pieces; each is freed before the next."""
-    found.reverse()
-    while found:
-        yield found.pop()
 
 
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:

@@ -8,34 +8,37 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import threading
 from collections import deque
+from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.pack import compressed, decompressed
+from ros2_memory.columns.pack import compressed, decompressed, pack, unpack
+from ros2_memory.columns.steps import EXACT, METRES
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import IntArray
     from ros2_memory.storage.cache import ByteLru
 
     Array: TypeAlias = NDArray[np.generic[object]]
-    Floats: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
-    Vectors: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 
 _MOST_WAITING: Final = 1_024
 """Fragments that wait to be stored; of more the oldest are made again."""
 
 _KEY_BYTES: Final = 400
 """About how much memory it takes to remember a fragment, besides its own."""
+_FEW: Final = 256
+"""Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
+_TUPLE, _BYTES, _ARRAY = -1, -2, -3
 
 log = get_logger(__name__)
 
@@ -51,67 +54,96 @@ class Sized(Protocol):
 T = TypeVar("T", bound=Sized)
 
 
-class Fragment(NamedTuple):
-    """A fragment as it is stored: JSON in one line, and arrays by their names."""
-
-    head: str
-    arrays: Mapping[str, Array]
-
-    def floats(self, name: str) -> Floats:
-        """Returns an array of numbers; raises `LookupError` without it, as the others do."""
-        return cast("Floats", self.arrays[name])
-
-    def vectors(self, name: str) -> Vectors:
-        """Returns an array of rows of numbers."""
-        return cast("Vectors", self.arrays[name])
-
-    def integers(self, name: str) -> IntArray:
-        """Returns an array of integers."""
-        return cast("IntArray", self.arrays[name])
-
-    def marks(self, name: str) -> NDArray[np.bool_]:
-        """Returns an array of booleans."""
-        return cast("NDArray[np.bool_]", self.arrays[name])
-
-    def to_bytes(self) -> bytes:
-        """Returns it as bytes: the head, a line of JSON on what the arrays are, and these."""
-        kinds = [[name, array.dtype.str, *array.shape] for name, array in self.arrays.items()]
-        lines = f"{self.head}\n{json.dumps(kinds)}\n"
-        values = (np.ascontiguousarray(array).tobytes() for array in self.arrays.values())
-        return compressed(b"".join((lines.encode(), *values)))
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> Fragment:
-        """Returns the fragment that was stored so.
-
-        Raises:
-            ValueError: the bytes are no fragment.
-        """
-        head, kinds, values = decompressed(data).split(b"\n", 2)
-        arrays: dict[str, Array] = {}
-        at = 0
-        for name, kind, *shape in json.loads(kinds):
-            array = np.frombuffer(values, kind, math.prod(shape), at)
-            arrays[name] = array.reshape(shape)
-            at += array.nbytes
-        return cls(head.decode(), arrays)
-
-
 class Kind(NamedTuple, Generic[T]):
-    """A kind of fragments: what tells it apart from others in the file, and how it is stored.
+    """A kind of fragments: what tells it apart from others in the file, and what it consists of.
 
     Attributes:
         name: of the kind.
-        store: returns what is stored.
-        load: returns what was stored.
+        classes: dataclasses and named tuples that it has in it, besides arrays, tuples, mappings,
+            and values of JSON. Their order is what the file knows them by.
         join: returns fewer fragments that say the same as those of a stretch of the clock, in
             order. Without it these stay as they are.
     """
 
     name: str
-    store: Callable[[T], Fragment]
-    load: Callable[[Fragment], T]
+    classes: tuple[type, ...]
     join: Callable[[Sequence[T]], Sequence[T]] = lambda found: found
+
+
+def to_bytes(made: object, classes: Sequence[type]) -> bytes:
+    """Returns a fragment as it is stored: a line of JSON, and the bytes of arrays one by one.
+
+    Each list in it begins with what it is: the number of a class, or a number below 0.
+    """
+    numbers = {one: nth for nth, one in enumerate(classes)}
+    data: list[bytes] = []
+
+    def plain(one: object) -> object:
+        if isinstance(one, bytes):
+            data.append(one)
+            return [_BYTES, len(one)]
+        if isinstance(one, np.ndarray):
+            codec, least, packed = _packed(one)
+            data.append(packed)
+            return [_ARRAY, len(packed), codec, least, one.dtype.str, *one.shape]
+        if type(one) in numbers:
+            values = [getattr(one, each.name) for each in fields(one)] if is_dataclass(one) else one
+            return [numbers[type(one)], *map(plain, cast("Iterable[object]", values))]
+        if isinstance(one, tuple | list):
+            return [_TUPLE, *map(plain, one)]
+        return {key: plain(each) for key, each in one.items()} if isinstance(one, dict) else one
+
+    head = json.dumps(plain(made))
+    return compressed(b"".join((head.encode(), b"\n", *data)))
+
+
+def from_bytes(data: bytes, classes: Sequence[type]) -> object:
+    """Returns the fragment that was stored so.
+
+    Raises:
+        ValueError, TypeError, LookupError, struct.error: the bytes are none.
+    """
+    head, values = decompressed(data).split(b"\n", 1)
+    words: dict[str, str] = {}
+    at = 0
+
+    def made(one: object) -> object:
+        nonlocal at
+        if isinstance(one, str):
+            return words.setdefault(one, one)  # equal ones are one object: there are thousands
+        if isinstance(one, dict):
+            return {key: made(each) for key, each in one.items()}
+        if not isinstance(one, list):
+            return one
+        what, *rest = one
+        if what >= 0:
+            return classes[what](*map(made, rest))
+        if what == _TUPLE:
+            return tuple(map(made, rest))
+        own = values[at : at + rest[0]]
+        at += rest[0]
+        return own if what == _BYTES else _unpacked(own, *rest[1:])
+
+    return made(json.loads(head))
+
+
+def _packed(array: Array) -> tuple[str, float | None, bytes]:
+    """Returns the codec of an array, its least value, and its bytes. Nothing of it changes."""
+    if array.size >= _FEW:
+        flat = array.reshape(-1, order="F")
+        for step in (METRES, EXACT):
+            found = pack(flat, step)
+            again = unpack(found.codec, found.count, found.zone.least, found.data)
+            if cast("Array", again).tobytes() == flat.tobytes():
+                return found.codec, found.zone.least, found.data
+    return "", None, array.tobytes()
+
+
+def _unpacked(data: bytes, codec: str, least: float | None, dtype: str, *shape: int) -> Array:
+    if not codec:
+        return np.frombuffer(data, dtype).reshape(shape)
+    flat = cast("Array", unpack(codec, math.prod(shape), least, data))
+    return np.ascontiguousarray(flat.reshape(shape, order="F"))
 
 
 class FragmentKey(NamedTuple):
@@ -140,32 +172,8 @@ class Joined(NamedTuple, Generic[T]):
 
 
 def joining(kind: Kind[T]) -> Kind[Joined[T]]:
-    """Returns how the joined fragments of a kind are stored: each array of all in one."""
-
-    def store(joined: Joined[T]) -> Fragment:
-        every = [kind.store(one) for one in joined.found]
-        rows = [
-            (one.head, {name: len(array) for name, array in one.arrays.items()}) for one in every
-        ]
-        arrays: dict[str, list[Array]] = {}
-        for one in every:
-            for name, array in one.arrays.items():
-                arrays.setdefault(name, []).append(array)
-        whole = {name: np.concatenate(several) for name, several in arrays.items()}
-        return Fragment(json.dumps(rows), whole)
-
-    def load(fragment: Fragment) -> Joined[T]:
-        found: list[T] = []
-        ends = dict.fromkeys(fragment.arrays, 0)
-        for head, lengths in json.loads(fragment.head):
-            arrays = {}
-            for name, length in lengths.items():
-                arrays[name] = fragment.arrays[name][ends[name] : ends[name] + length]
-                ends[name] += length
-            found.append(kind.load(Fragment(head, arrays)))
-        return Joined(found)
-
-    return Kind(f"{kind.name}-joined", store, load)
+    """Returns the kind of the joined fragments of a kind."""
+    return Kind(f"{kind.name}-joined", (*kind.classes, Joined))
 
 
 class Fragments(Generic[T]):
@@ -212,7 +220,7 @@ class Fragments(Generic[T]):
             waiting = [*self._waiting]
             self._waiting.clear()
         if self._store is not None and waiting:
-            made = [(key, self._kind.store(made).to_bytes()) for key, made in waiting]
+            made = [(key, to_bytes(made, self._kind.classes)) for key, made in waiting]
             self._store.put_fragments(self._name, made)
 
     def _remember(self, key: FragmentKey, made: T) -> None:
@@ -220,7 +228,7 @@ class Fragments(Generic[T]):
 
     def _loaded(self, data: bytes) -> T | None:
         try:
-            return self._kind.load(Fragment.from_bytes(data))
-        except (ValueError, TypeError, LookupError) as error:
+            return cast("T", from_bytes(data, self._kind.classes))
+        except (ValueError, TypeError, LookupError, struct.error) as error:
             log.warning("fragment_damaged", kind=self._kind.name, reason=str(error))
             return None

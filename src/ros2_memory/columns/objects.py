@@ -9,7 +9,7 @@ import numpy as np
 
 from ros2_memory.columns.plan import Array, Number, NumberSequence, Plan, Run, Sequence, Text, Time
 from ros2_memory.columns.table import MAX_RANGED_BYTES, Elements, Numbers, Texts
-from ros2_memory.columns.walk import Level, add_ranges, add_sequence
+from ros2_memory.columns.walk import Level, add_array, add_sequence
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
@@ -45,11 +45,8 @@ def _add_fixed(level: Level, entry: Number | Time | Array, messages: Values[obje
             _values(values, "nanosec"), np.int64
         )
     elif isinstance(entry, Array):
-        level.columns[f"{entry.path}.length"] = np.full(len(values), entry.length, np.uint32)
-        if entry.is_ranged:
-            arrays = np.array([_numbers(value) for value in values])
-            table = arrays.reshape(len(values), entry.length)
-            add_ranges(level.columns, entry.path, table, is_bool=entry.is_bool)
+        arrays = np.array([_numbers(value) for value in values]) if entry.is_ranged else None
+        add_array(level.columns, entry, len(values), arrays)
     else:
         if entry.nth is not None:
             values = [_numbers(value)[entry.nth] for value in values]

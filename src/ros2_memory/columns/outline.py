@@ -7,12 +7,11 @@ while filling, and is there also where a column was dropped.
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
-from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.columns.fragments import Kind
 from ros2_memory.columns.table import IN_PART, SPACES, Numbers, Table, Texts, letters_of
 
 if TYPE_CHECKING:
@@ -163,22 +162,4 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
     return Totals(len(numbers), total, *spans)
 
 
-def _fragment(outline: Outline) -> Fragment:
-    texts = {path: (one.words, one.size) for path, one in outline.letters.items()}
-    arrays = {path: one.has for path, one in outline.letters.items()}
-    head = json.dumps({"numbers": outline.paths, "texts": texts})
-    numbers = {"sizes": outline.sizes, "sums": outline.sums, "times": outline.times}
-    return Fragment(head, {**arrays, **{f"#{name}": some for name, some in numbers.items()}})
-
-
-def _outline(fragment: Fragment) -> Outline:
-    head = json.loads(fragment.head)
-    letters = {
-        path: Letters(tuple(words), fragment.arrays[path].astype(np.uint8, copy=False), size)
-        for path, (words, size) in head["texts"].items()
-    }
-    sizes, times = (fragment.integers(name) for name in ("#sizes", "#times"))
-    return Outline(head["numbers"], sizes, fragment.floats("#sums"), times, letters)
-
-
-OUTLINE: Final = Kind("outline", _fragment, _outline)
+OUTLINE: Final[Kind[Outline]] = Kind("outline", (Outline, Letters))

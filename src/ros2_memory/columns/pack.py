@@ -23,9 +23,7 @@ bytes; `#` are so many planes of as many bytes as numbers: the lowest byte of ev
 next (a plane of high bytes hardly varies, so it compresses to nothing)::
 
     flat    # n               the numbers
-    line    ^ slope # n       what is left of them after a line of that slope, less its least
     delta   ^ slope # n-1     differences of neighbours, less the slope
-    curve   ^ first # n-2     differences of those differences, after the first one
 
 Differences have a sign: 0, -1, 1, -2, 2 are written 0, 1, 2, 3, 4. Sums start anywhere: the least
 of the zone says where. Numbers that are 2**62 apart and more are arranged `plain`: all 8 bytes, and
@@ -45,7 +43,6 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -64,7 +61,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 18
+FORMAT: Final = 19
 """Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
 by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096
@@ -72,7 +69,6 @@ LEVEL: Final = 4
 """Of zstd. A blob of 10 s takes 0.5 ms; level 1 half of that and 7 % more bytes, level 6 0.8 ms and
 1 to 10 % fewer."""
 
-_ARRANGEMENTS: Final = ("flat", "line", "delta", "curve")
 _CONTAINERS: Final = ("<u1", "<u1", "<u2", "<u4", "<u4", "<u8", "<u8", "<u8", "<u8")
 """For each width in bytes the least unsigned integer that numpy has."""
 _FAR_APART: Final = 1 << 62
@@ -81,8 +77,6 @@ _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
 """Steps, as `Step.per_unit`, that values of a relative exactness often have anyway."""
 _SAMPLE: Final = 16
-_LONG_PLANE: Final = 300
-_END_BLOCK: Final = zstandard.COMPRESSOBJ_FLUSH_BLOCK
 
 
 class _Bits(NamedTuple):
@@ -106,7 +100,6 @@ class Packed:
         error: the greatest absolute error of any value once unpacked, as measured; 0.0: exact.
         zone: what is known of the values without unpacking them, before any was rounded.
         data: the bytes, not compressed yet; empty where every value is the zone's least.
-        plane: how many bytes each of the planes has that `data` ends with.
     """
 
     codec: str
@@ -114,7 +107,6 @@ class Packed:
     error: float
     zone: Zone
     data: bytes
-    plane: int = 0
 
 
 def pack(column: Column, step: Step = EXACT) -> Packed:
@@ -166,23 +158,9 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
 
 
-def compressed(data: bytes, plane: int = 0) -> bytes:
-    """Returns the bytes as a zstd frame that states its size.
-
-    Args:
-        data: the bytes.
-        plane: `Packed.plane`. Long planes become blocks of their own, with their own codes: a low
-            byte is noise where a high one hardly varies.
-    """
-    compressor = zstandard.ZstdCompressor(level=LEVEL)
-    if plane < _LONG_PLANE or len(data) < 2 * plane:
-        return compressor.compress(data)
-    blocks = compressor.compressobj(size=len(data))
-    ends = range(len(data) % plane + plane, len(data) + 1, plane)
-    found = []
-    for begin, end in pairwise((0, *ends)):
-        found += [blocks.compress(data[begin:end]), blocks.flush(_END_BLOCK)]
-    return b"".join((*found, blocks.flush()))
+def compressed(data: bytes) -> bytes:
+    """Returns the bytes as a zstd frame that states its size."""
+    return zstandard.compress(data, LEVEL)
 
 
 def is_large(data: bytes) -> bool:
@@ -321,31 +299,20 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 
 
 def _arranged(column: _Whole) -> Packed:
-    """Returns a column arranged so that its numbers have the fewest bits on average."""
+    """Returns a column arranged so that its numbers have the fewer bits on average."""
     flat = column.numbers - _wrapped(column.least)
-    count = len(flat)
-    slope = np.rint((flat[-1:] - flat[:1]) / (count - 1)).astype(np.int64)
-    line = flat - slope * np.arange(count)
-    steps = np.diff(flat)
-    delta, curve = steps - slope, np.diff(steps)
-    around = (flat - flat.mean(), line - line.mean(), delta, curve)
-    which = int(np.argmin([_bits_of(numbers) for numbers in around]))
-    name = _ARRANGEMENTS[which]
-    left: IntArray = (flat, line, delta, curve)[which]
-    head = b""
+    slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
+    delta = np.diff(flat) - slope
+    name, head, left = "flat", b"", flat
     if column.greatest - column.least >= _FAR_APART:
-        name, left = "plain", flat
-    elif name == "line":
-        left = left - left.min()
-    elif name != "flat":
-        left = (left << 1) ^ (left >> 63)
-    if name in {"line", "delta", "curve"}:
-        head = struct.pack("<q", steps[0] if name == "curve" else slope[0])
+        name = "plain"
+    elif _bits_of(delta) < _bits_of(flat - flat.mean()):
+        name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
     greatest = int(left.view(np.uint64).max(initial=0))
     width = 8 if name == "plain" else (greatest.bit_length() + 7) // 8
     data = b"".join((column.head, head, byte_planes(left, width)))
     codec = f"{column.form} {name} {width}"
-    return Packed(codec, count, column.error, column.zone, data, len(left))
+    return Packed(codec, len(flat), column.error, column.zone, data)
 
 
 def _bits_of(numbers: Numbers) -> float:
@@ -362,24 +329,13 @@ def _whole_numbers(arrangement: str, count: int, least: int, data: bytes) -> Int
     name, _, width = arrangement.partition(" ")
     if name in {"plain", "flat"}:
         return np.add(from_planes(data, 0, count, int(width)).astype(np.int64), _wrapped(least))
-    first: int = struct.unpack_from("<q", data)[0]
-    if name == "line":
-        numbers = np.arange(count)
-        numbers *= first
-        numbers += from_planes(data, 8, count, int(width)).astype(np.int64, copy=False)
-    elif name == "delta":
-        numbers = np.zeros(count, np.int64)
-        numbers[1:] = signed(from_planes(data, 8, count - 1, int(width)))
-        numbers[1:] += first
-    elif name == "curve":
-        numbers = np.zeros(count, np.int64)
-        numbers[1] = first
-        numbers[2:] = signed(from_planes(data, 8, count - 2, int(width)))
-        np.cumsum(numbers[1:], out=numbers[1:])
-    else:
+    if name != "delta":
         raise ValueError(f"packed columns are not arranged {name!r}")
-    if name != "line":
-        np.cumsum(numbers, out=numbers)
+    slope: int = struct.unpack_from("<q", data)[0]
+    numbers = np.zeros(count, np.int64)
+    numbers[1:] = signed(from_planes(data, 8, count - 1, int(width)))
+    numbers[1:] += slope
+    np.cumsum(numbers, out=numbers)
     # Differences wrap around, as those of the packed numbers did.
     lowest: IntArray = numbers.min(keepdims=True)
     numbers += np.subtract(_wrapped(least), lowest)

@@ -18,14 +18,12 @@ import numpy as np
 
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.stored import Remembered, StoredTable, Topic, lazy_columns
-from ros2_memory.columns.table import Column, Table, Zone, joined
+from ros2_memory.columns.table import Table, Zone, joined
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from ros2_memory.columns.layout import Layout
-    from ros2_memory.columns.outline import Outline
     from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import IntArray
 
@@ -123,9 +121,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
         len(table),
         tuple(np.unique(bags).tolist()),
         {
-            path: replace(column, data=compressed(column.data, column.plane))
-            if column.data
-            else column
+            path: replace(column, data=compressed(column.data)) if column.data else column
             for path, column in packed.items()
         },
     )
@@ -134,48 +130,3 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
 def _hashes(table: Table) -> IntArray:
     hashes = table.payload_hashes
     return np.full(len(table), UNHASHED) if hashes is None else hashes
-
-
-def part_table(
-    topic: Topic,
-    packed: Callable[[str], Packed | None],
-    load: Callable[[str], Column],
-    outline: Callable[[], Outline | None] = lambda: None,
-    *,
-    messages: int,
-    dropped: Sequence[str] = (),
-    memory: Remembered | None = None,
-    number: int = 0,
-) -> StoredTable:
-    """Returns a part as a table whose columns are loaded when they are first asked for.
-
-    Its times are all 0: `PartUnit` loads the true ones.
-
-    Args:
-        topic: of the part.
-        packed: as of `StoredTable`.
-        load: returns a column by its path.
-        outline: as of `StoredTable`.
-        messages: how many rows it has.
-        dropped: the columns that are beyond the topic's share.
-        memory: as of `StoredTable`.
-        number: of the part.
-    """
-    left_out = topic.layout.left_out
-    if dropped:
-        reason = "beyond the share of the store (store.max_share)"
-        left_out = {**left_out, **dict.fromkeys(dropped, reason)}
-    none = np.zeros(messages, np.int64)
-    return StoredTable(
-        topic.channel,
-        none,
-        none,
-        none,
-        *lazy_columns(topic.layout, load, dropped),
-        left_out,
-        definition=topic.definition,
-        packed=packed,
-        outline=outline,
-        memory=memory,
-        number=number,
-    )

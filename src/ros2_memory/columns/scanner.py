@@ -5,6 +5,7 @@ Of a part that nothing needs not even the times are unpacked.
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import TYPE_CHECKING, Final, TypeVar, cast
@@ -16,9 +17,10 @@ from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
-from ros2_memory.columns.parts import LOG_TIME, part_table
+from ros2_memory.columns.parts import LOG_TIME
+from ros2_memory.columns.stored import StoredTable, lazy_columns
 from ros2_memory.columns.table import Column, Table, Zone, column_bytes
-from ros2_memory.columns.units import GoneError, PartUnit
+from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
@@ -49,6 +51,7 @@ DECODED_BYTES: Final = 8 << 20
 """How much the tables of bags that are not stored may take in memory."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
 """Of windows up to this long, only the parts of the days that they touch are looked up."""
+_DROPPED: Final = "beyond the share of the store (store.max_share)"
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
 
@@ -277,7 +280,7 @@ class Scanner:
 
     def part(
         self, head: PartHead, coverage: Coverage, together: Sequence[PartHead] = ()
-    ) -> PartUnit | None:
+    ) -> Unit | None:
         """Returns a part; None where no row of it counts.
 
         What is known of its columns is read at once for the parts `together` with it.
@@ -298,16 +301,6 @@ class Scanner:
                 raise KeyError(path)
             return self._column(head, path, known, together)
 
-        table = part_table(
-            topic,
-            packed,
-            load,
-            partial(self._outlines.get, _outline_key(head)),
-            messages=head.messages,
-            dropped=head.dropped,
-            memory=self.caches.read,
-            number=head.number,
-        )
         counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
             return None
@@ -321,7 +314,33 @@ class Scanner:
                 raise GoneError
             return bag
 
-        return PartUnit(head, table, integers, counting - offset, bag_of)
+        left_out = topic.layout.left_out
+        if head.dropped:
+            left_out = {**left_out, **dict.fromkeys(head.dropped, _DROPPED)}
+        none = np.zeros(head.messages, np.int64)  # `Unit` loads the true times
+        table = StoredTable(
+            topic.channel,
+            none,
+            none,
+            none,
+            *lazy_columns(topic.layout, load, head.dropped),
+            left_out,
+            definition=topic.definition,
+            packed=packed,
+            outline=partial(self._outlines.get, _outline_key(head)),
+            memory=self.caches.read,
+            number=head.number,
+        )
+        return Unit(
+            head.number,
+            table,
+            (head.first, head.last),
+            load=integers,
+            counting=counting - offset,
+            bag_of=bag_of,
+            part=head.number if head.is_whole else None,
+            all_count=counting.size == head.bags.size,
+        )
 
     def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
         """Returns what is known of a column of a part; None where it has no such one.
@@ -353,19 +372,30 @@ class Scanner:
     def _column(
         self, head: PartHead, path: str, packed: Packed, together: Sequence[PartHead]
     ) -> Column:
+        """Returns a column of a part.
+
+        Raises:
+            GoneError: the part was deleted meanwhile, or the store cannot be read, or is damaged.
+        """
         key = (head.number, path)
         known = self.caches.read.get(key)
         if known is not None:
             return cast("Column", known)
-        data = b""
+        assert self.store is not None  # noqa: S101 - as above
+        stored = b""
         # The one value of a constant is its least, unless it is a text.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
         if packed.count and not is_constant:
             stored = self._stored(head, path, together)
             if is_large(stored):
                 self._large.acquire()
+        try:
             data = decompressed(stored) if stored else b""
-        column = unpack(packed.codec, packed.count, packed.zone.least, data)
+            column = unpack(packed.codec, packed.count, packed.zone.least, data)
+        except (ValueError, LookupError, struct.error) as error:
+            # Else each question about the part would fail, for ever.
+            self.store.give_up(error)
+            raise GoneError from error
         self.caches.read.put(key, column, column_bytes(column))
         return column
 

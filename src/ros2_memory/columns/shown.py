@@ -184,10 +184,9 @@ class Listing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Items:
-    """A list of so many for all rows; `ragged`: of which the last may be absent."""
+    """A list of so many for all rows."""
 
     items: tuple[Node, ...]
-    ragged: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -339,45 +338,33 @@ class Shape:
         return Message(self, level, path, kind, depth, plain=True)
 
     def summary(self, message: Message, place: Place) -> Node:
-        """Returns what the conversions make of the data of an image, a cloud, a map or a magnet.
+        """Returns what the conversions make of the data of an image, a map or a magnet.
 
         Raises:
-            UnknownShapeError: the definition is not the standard one.
+            UnknownShapeError: it is a plain image or a cloud, or the definition is not the standard
+                one.
         """
         kind = message.definition.type.rpartition("/")[2]
         if kind == "MagneticField":
             node = self.shown(place)
             if isinstance(node, Group) and node.turned is None:
                 return node
-            raise UnknownShapeError(f"{place.path} is no vector")
         if not isinstance(place.kind, str) or place.length != SEQUENCE:
             raise UnknownShapeError(f"{place.path} is no sequence of bytes")
 
-        def leaf(name: str, kind: Kind) -> Leaf:
-            found = descend(message, name.split("."))
-            if isinstance(found, Leaf) and found.kind is kind and found.made is Made.STORED:
+        def leaf(kind: Kind, *path: str) -> Leaf:
+            found = descend(message, path)
+            if isinstance(found, Leaf) and found.kind is kind:
                 return found
-            raise UnknownShapeError(f"{name} is not what it is in the standard definition")
+            raise UnknownShapeError(f"{'.'.join(path)} is not as in the standard definition")
 
-        def shape(prefix: str = "") -> tuple[Leaf, Leaf]:
-            height, width = (leaf(f"{prefix}{name}", Kind.INTEGER) for name in ("height", "width"))
-            return height, width
-
-        fields: dict[str, Node] = {
-            "bytes": Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
-        }
-        if kind == "CompressedImage":
-            return Group({**fields, "encoding": leaf("format", Kind.TEXT)})
-        if kind == "OccupancyGrid":
-            return Group({**fields, "shape": Items(shape("info."))})
-        sources = [each.sources[0] for each in shape()]
-        if kind == "PointCloud2":
-            points = Leaf(place.level, tuple(sources), Kind.INTEGER, Made.PRODUCT)
-            return Group({**fields, "points": points, "shape": Items(shape())})
-        encoding = leaf("encoding", Kind.TEXT)
-        channels = Leaf(place.level, encoding.sources, Kind.REAL, Made.CHANNELS)
-        sized = Items((*shape(), channels), ragged=True)
-        return Group({**fields, "encoding": encoding, "shape": sized})
+        count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
+        if kind == "CompressedImage":  # as markers have them
+            return Group({"bytes": count, "encoding": leaf(Kind.TEXT, "format")})
+        if kind != "OccupancyGrid":
+            raise UnknownShapeError("images and clouds are no columns")
+        shape = tuple(leaf(Kind.INTEGER, "info", name) for name in ("height", "width"))
+        return Group({"bytes": count, "shape": Items(shape)})
 
     def _message(self) -> Node:
         return self.shown(Place(ROWS, "", self.definition, None, 0))
@@ -583,8 +570,6 @@ def _step(spot: Spot, segment: str) -> Iterator[Spot]:
 def _picked(node: Listing | Items, index: int) -> Node:
     if isinstance(node, Listing):
         return Narrowed(Pick(node.level, index), node.element)
-    if node.ragged and index < 0:
-        raise UnknownShapeError("the list is not of the same length in all messages")
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
 
 

@@ -427,7 +427,8 @@ class ColumnStore(Database):
     def put_fragments(self, kind: str, made: Sequence[tuple[FragmentKey, bytes]]) -> bool:
         """Stores fragments in place of those of the same time, settings and some of the parts.
 
-        Not those of a part that is not stored any more, nor any again.
+        Not those of a part that is not stored any more. What was stored of the same parts may be
+        damaged, so others take its place, too.
         """
 
         def write(connection: sqlite3.Connection) -> None:
@@ -435,24 +436,26 @@ class ColumnStore(Database):
                 if not all(map(self.is_current, key.parts)):
                     continue
                 parts = self._ids(key.parts)
-                cursor = connection.execute(
-                    "INSERT OR IGNORE INTO fragment (kind, settings, start_ns, parts, data)"
+                stored = connection.execute(
+                    "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
                     " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
-                    " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))",
+                    " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
+                    " ON CONFLICT DO UPDATE SET data = excluded.data"
+                    " WHERE data <> excluded.data RETURNING id",
                     (kind, key.settings, key.start, parts, data),
-                )
-                if cursor.rowcount > 0:
+                ).fetchall()
+                for (number,) in stored:
                     # What followed before there were all of these parts is not asked for again.
                     older = connection.execute(
                         "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
                         " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
                         " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
-                        (kind, key.settings, key.start, cursor.lastrowid, parts),
+                        (kind, key.settings, key.start, number, parts),
                     ).fetchall()
                     connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
                     connection.execute(
-                        "INSERT INTO fragment_part SELECT value, ? FROM json_each(?)",
-                        (cursor.lastrowid, parts),
+                        "INSERT OR IGNORE INTO fragment_part SELECT value, ? FROM json_each(?)",
+                        (number, parts),
                     )
 
         return self.write(write)

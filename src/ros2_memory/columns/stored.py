@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.table import Column, Elements, Table, Zone, joined_column, joined_zone
+from ros2_memory.columns.table import Column, Elements, Table, Zone, joined_levels, joined_zone
 
 if TYPE_CHECKING:
     from ros2_memory.columns.layout import Layout
@@ -140,34 +140,12 @@ def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
         none,
         none,
         none,
-        _joined_columns([table.columns for table in tables]),
-        _joined_elements([table.elements for table in tables], [*map(len, tables)]),
+        *joined_levels(tables, Lazily),
         first.left_out,
         definition=first.definition,
         packed=lambda _: None,
         tables=tables,
     )
-
-
-def _joined_columns(parts: Sequence[Mapping[str, Column]]) -> Mapping[str, Column]:
-    return Lazily(parts[0], lambda path: joined_column([part[path] for part in parts]))
-
-
-def _joined_elements(
-    parts: Sequence[Mapping[str, Elements]], counts: Sequence[int]
-) -> Mapping[str, Elements]:
-    """Returns sequences of several parts as one; `counts` are the rows of each part."""
-
-    def make(path: str) -> Elements:
-        inner = [part[path] for part in parts]
-        before = np.cumsum([0, *counts[:-1]]).tolist()
-        return Elements(
-            np.concatenate([one.owners + rows for one, rows in zip(inner, before, strict=True)]),
-            _joined_columns([one.columns for one in inner]),
-            _joined_elements([one.elements for one in inner], [*map(len, inner)]),
-        )
-
-    return Lazily(parts[0], make)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +166,7 @@ class Topic:
 
 
 def lazy_columns(
-    layout: Layout, column: Callable[[str], Column], dropped: Collection[str]
+    layout: Layout, column: Callable[[str], Column], dropped: Collection[str], sequence: str = ""
 ) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
     """Returns the columns and sequences of a table, each made when it is needed, and kept.
 
@@ -196,24 +174,20 @@ def lazy_columns(
         layout: of the table.
         column: returns the column, or the owners, at a path of `Layout.slots`.
         dropped: the paths of those that there are not.
+        sequence: the path of that whose elements they are of; "" for those of the messages.
     """
-    return _lazy_level(layout, column, frozenset(dropped), "")
+    columns, sequences = layout.levels[sequence]
 
-
-def _lazy_level(
-    level: Layout, column: Callable[[str], Column], dropped: Collection[str], around: str
-) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
-    """Returns the columns and sequences of one level; `around` is its path and a dot."""
-
-    def whole(name: str) -> str:
-        return f"{around}{name}".rstrip(".")
-
-    def elements(path: str) -> Elements:
-        owners = cast("IntArray", column(f"{around}{path}#"))
-        inner = _lazy_level(level.sequences[path], column, dropped, f"{around}{path}.")
-        return Elements(owners, *inner)
+    def elements(name: str) -> Elements:
+        path = sequences[name]
+        owners = cast("IntArray", column(f"{path}#"))
+        return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
     # Owners that are all equal take no bytes: they stay where the columns beside them are dropped.
-    columns = [name for name in level.columns if whole(name) not in dropped]
-    sequences = [path for path in level.sequences if f"{around}{path}#" not in dropped]
-    return Lazily(columns, lambda name: column(whole(name))), Lazily(sequences, elements)
+    return (
+        Lazily(
+            [name for name, path in columns.items() if path not in dropped],
+            lambda name: column(columns[name]),
+        ),
+        Lazily([name for name, path in sequences.items() if f"{path}#" not in dropped], elements),
+    )

@@ -25,12 +25,12 @@ import math
 import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
@@ -336,8 +336,7 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate([table.log_times for table in tables]),
         np.concatenate([table.publish_times for table in tables]),
         np.concatenate([table.places for table in tables]),
-        _joined_columns([table.columns for table in tables]),
-        _joined_elements([table.elements for table in tables], [len(table) for table in tables]),
+        *joined_levels(tables, lambda names, make: {name: make(name) for name in names}),
         dict(ChainMap(*(dict(table.left_out) for table in tables))),
         np.concatenate(hashes) if len(hashes) == len(tables) else None,
         first.definition,
@@ -348,10 +347,6 @@ def _rows(column: Column, positions: IntArray) -> Column:
     return column.rows(positions) if isinstance(column, Texts) else column[positions]
 
 
-def _joined_columns(parts: Sequence[Mapping[str, Column]]) -> dict[str, Column]:
-    return {path: joined_column([part[path] for part in parts]) for path in parts[0]}
-
-
 def joined_column(parts: Sequence[Column]) -> Column:
     """Returns columns of one kind one after the other."""
     texts = [part for part in parts if isinstance(part, Texts)]
@@ -360,20 +355,34 @@ def joined_column(parts: Sequence[Column]) -> Column:
     return joined_texts(texts)
 
 
-def _joined_elements(
-    parts: Sequence[Mapping[str, Elements]], counts: Sequence[int]
-) -> dict[str, Elements]:
-    """Returns sequences of several parts as one; `counts` are the rows of each part."""
-    before = [sum(counts[:nth]) for nth in range(len(counts))]
-    found: dict[str, Elements] = {}
-    for path in parts[0]:
-        inner = [part[path] for part in parts]
-        found[path] = Elements(
-            np.concatenate([each.owners + rows for each, rows in zip(inner, before, strict=True)]),
-            _joined_columns([each.columns for each in inner]),
-            _joined_elements([each.elements for each in inner], [len(each) for each in inner]),
-        )
-    return found
+def joined_levels(
+    parts: Sequence[Table] | Sequence[Elements], mapping: _Mapping
+) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
+    """Returns the columns and sequences of tables or elements one after the other.
+
+    Args:
+        parts: these, of one topic, type and definition; at least one.
+        mapping: returns a mapping of names to what is made of each.
+    """
+    before = np.cumsum([0, *map(len, parts)]).tolist()
+
+    def elements(path: str) -> Elements:
+        inner = [part.elements[path] for part in parts]
+        owners = [each.owners + rows for each, rows in zip(inner, before, strict=False)]
+        return Elements(np.concatenate(owners), *joined_levels(inner, mapping))
+
+    return (
+        mapping(
+            parts[0].columns, lambda path: joined_column([part.columns[path] for part in parts])
+        ),
+        mapping(parts[0].elements, elements),
+    )
+
+
+class _Mapping(Protocol):
+    """Makes a mapping of names to what `make` returns of each."""
+
+    def __call__(self, names: Collection[str], make: Callable[[str], T], /) -> Mapping[str, T]: ...
 
 
 def column_bytes(column: Column) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
-from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.columns.fragments import Kind
 from ros2_memory.columns.steps import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
 from ros2_memory.core.model import StampedTransform, Transform
@@ -121,32 +120,7 @@ class Statics:
         return 200 + 600 * len(self.transforms)
 
 
-def _statics_fragment(statics: Statics) -> Fragment:
-    rows = [
-        [
-            one.parent,
-            one.child,
-            one.stamp,
-            one.log_time,
-            *one.transform.translation,
-            *one.transform.rotation,
-        ]
-        for one in statics.transforms
-    ]
-    return Fragment(json.dumps([statics.recording, rows]), {})
-
-
-def _statics_of(fragment: Fragment) -> Statics:
-    found = []
-    recording, rows = json.loads(fragment.head)
-    for parent, child, stamp, log_time, x, y, z, *rotation in rows:
-        qx, qy, qz, qw = rotation
-        transform = Transform((x, y, z), (qx, qy, qz, qw))
-        found.append(StampedTransform(parent, child, stamp, log_time, transform, static=True))
-    return Statics(recording, tuple(found))
-
-
-STATICS: Final = Kind("statics", _statics_fragment, _statics_of)
+STATICS: Final[Kind[Statics]] = Kind("statics", (Statics, StampedTransform, Transform))
 """The static transforms of a part, exact."""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.store import PartHead
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
@@ -31,86 +30,43 @@ class GoneError(BusyError):
         super().__init__("stored columns were deleted while they were read: ask again")
 
 
-class BagUnit:
-    """A table of a bag that is not stored. `nth` tells tables of one bag apart.
+class Unit:
+    """The rows of a topic in a part of the store, or in a bag.
 
     Attributes:
         key: tells units of one scan apart.
         table: the rows, ordered by log time.
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
-        part: None, as it is none.
-    """
-
-    part: Final = None
-
-    def __init__(self, bag: BagFile, table: Table, nth: int) -> None:
-        self.key: object = (bag.file, nth)
-        self.table = table
-        self.first, self.last = int(table.log_times[0]), int(table.log_times[-1])
-        self._bag = bag
-
-    @property
-    def first_bag(self) -> BagFile:
-        """The bag."""
-        return self._bag
-
-    def times(self) -> IntArray:
-        """Returns the log times of the rows (ns)."""
-        return self.table.log_times
-
-    def identities(self) -> tuple[IntArray, IntArray] | None:
-        """Returns publish times and hashes of payloads; None where they were not hashed."""
-        hashes = self.table.payload_hashes
-        return None if hashes is None else (self.table.publish_times, hashes)
-
-    def bags(self) -> Mapping[int, BagFile]:
-        """Returns the bag."""
-        return {0: self._bag}
-
-    def bag_numbers(self) -> IntArray:
-        """Returns 0 for each row."""
-        return np.zeros(len(self.table), np.int64)
-
-    def counting(self) -> NDArray[np.bool_] | None:
-        """Returns which rows are of bags that count: all are."""
-        return None
-
-
-class PartUnit:
-    """A part of the store.
-
-    Attributes:
-        key: tells units of one scan apart.
-        table: the rows, ordered by log time.
-        first: the earliest log time, inclusive.
-        last: the latest, inclusive.
-        part: the number of the part; None where it may be replaced.
+        part: the number of the part; None where it is none, or may be replaced.
 
     Args:
-        head: what is known of it.
-        table: its rows.
         load: returns one of the columns that every part may have; None where it has none.
         counting: the numbers, as the part has them, of its bags of which rows count; at least one.
         bag_of: returns the bag of such a number.
+        all_count: whether these are all of its bags.
     """
 
     def __init__(
         self,
-        head: PartHead,
+        key: object,
         table: Table,
+        span: tuple[Ns, Ns],
+        *,
         load: Callable[[str], IntArray | None],
         counting: IntArray,
         bag_of: Callable[[int], BagFile],
+        part: int | None = None,
+        all_count: bool = True,
     ) -> None:
-        self.key: object = head.number
-        self.part = head.number if head.is_whole else None
+        self.key = key
+        self.part = part
         self.table = table
-        self.first, self.last = head.first, head.last
+        self.first, self.last = span
         self._load = load
         self._counting = counting
         self._bag_of = bag_of
-        self._all_count = counting.size == head.bags.size
+        self._all_count = all_count
 
     @cached_property
     def first_bag(self) -> BagFile:
@@ -122,12 +78,12 @@ class PartUnit:
         return self._column(LOG_TIME)
 
     def identities(self) -> tuple[IntArray, IntArray] | None:
-        """Returns publish times and hashes of payloads; None where they are not stored."""
+        """Returns publish times and hashes of payloads; None where they are not known."""
         delays, hashes = self._load(DELAY), self._load(PAYLOAD_HASH)
         return None if delays is None or hashes is None else (self.times() - delays, hashes)
 
     def bags(self) -> Mapping[int, BagFile]:
-        """Returns the bags of which rows count, by their numbers in the store."""
+        """Returns the bags of which rows count, by their numbers."""
         return {number: self._bag_of(number) for number in self._counting.tolist()}
 
     def bag_numbers(self) -> IntArray:
@@ -136,9 +92,7 @@ class PartUnit:
 
     def counting(self) -> NDArray[np.bool_] | None:
         """Returns which rows are of bags that count; None: all are."""
-        if self._all_count:
-            return None
-        return np.isin(self.bag_numbers(), self._counting)
+        return None if self._all_count else np.isin(self.bag_numbers(), self._counting)
 
     def _column(self, path: str) -> IntArray:
         column = self._load(path)
@@ -147,7 +101,22 @@ class PartUnit:
         return column
 
 
-Unit: TypeAlias = BagUnit | PartUnit
+class BagUnit(Unit):
+    """A table of a bag that is not stored. `nth` tells tables of one bag apart."""
+
+    def __init__(self, bag: BagFile, table: Table, nth: int) -> None:
+        times, zeros = table.log_times, np.zeros(len(table), np.int64)
+        columns = {
+            LOG_TIME: times,
+            DELAY: times - table.publish_times,
+            PAYLOAD_HASH: table.payload_hashes,
+            BAG: zeros,
+        }
+        span = int(times[0]), int(times[-1])
+        key = (bag.file, nth)
+        super().__init__(
+            key, table, span, load=columns.get, counting=zeros[:1], bag_of=lambda _: bag
+        )
 
 
 class Rows:

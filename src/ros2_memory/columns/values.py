@@ -19,10 +19,10 @@ from ros2_memory.columns.table import MAX_NUMBERS, Column, Elements, Table, Text
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.messages.conversions import ANGLES, channels_of, euler_of
+from ros2_memory.messages.conversions import ANGLES, euler_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
     # Of any dtype: that of floats has the operations that all of them have.
@@ -61,8 +61,6 @@ class Made(Enum):
     ROLL = auto()  # degrees, of x, y, z, w; NaN where that is no rotation
     PITCH = auto()
     YAW = auto()
-    PRODUCT = auto()
-    CHANNELS = auto()  # of an image's encoding; NaN where that has no fixed number
     CONSTANT = auto()
 
 
@@ -150,21 +148,15 @@ class Values:
     def __init__(self, table: Table) -> None:
         self.table = table
         self.rows = len(table.log_times)
-        self._levels: dict[Level, Elements | None] = {}
         self.kept: dict[object, tuple[Mask, Mask]] = {}
         self._angles: dict[tuple[Level, tuple[str, ...]], tuple[Floats, ...]] = {}
 
     def elements(self, level: Level) -> Elements | None:
         """Returns the elements of a sequence; None where the table does not hold them."""
-        if level in self._levels or level.parent is None:
-            return self._levels.get(level)
-        if level.parent.parent is None:
-            found = self.table.elements.get(level.name)
-        else:
-            above = self.elements(level.parent)
-            found = None if above is None else above.elements.get(level.name)
-        self._levels[level] = found
-        return found
+        if level.parent is None:
+            return None
+        above = self.table if level.parent.parent is None else self.elements(level.parent)
+        return None if above is None else above.elements.get(level.name)
 
     def size(self, level: Level) -> int | None:
         """Returns how many rows or elements a level has; None where that is not held."""
@@ -184,13 +176,8 @@ class Values:
 
     def column(self, level: Level, path: str) -> Column | None:
         """Returns a column of a level; None where the table does not hold it."""
-        columns: Mapping[str, Column] | None
-        if level.parent is None:
-            columns = self.table.columns
-        else:
-            found = self.elements(level)
-            columns = None if found is None else found.columns
-        return None if columns is None else columns.get(path)
+        rows = self.table if level.parent is None else self.elements(level)
+        return None if rows is None else rows.columns.get(path)
 
     def texts(self, leaf: Leaf) -> Texts | None:
         """Returns the texts of a leaf; None where the table does not hold them."""
@@ -216,9 +203,6 @@ class Values:
 
     def numbers(self, leaf: Leaf) -> Numbers | None:
         """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
-        if leaf.made is Made.CHANNELS:
-            texts = self.texts(leaf)
-            return None if texts is None else Numbers(_channels(texts))
         if leaf.made is Made.CONSTANT:
             size = self.size(leaf.level)
             return None if size is None else Numbers(np.full(size, float(leaf.constant)))
@@ -230,8 +214,6 @@ class Values:
         if leaf.made in _ANGLES:
             return self._turned(leaf, columns)
         first, error = columns[0], self.error(leaf)
-        if leaf.made is Made.PRODUCT:
-            return Numbers(_product(first, columns[1]))
         if leaf.made is Made.SECONDS:
             return Numbers(seconds(first), error / NS_PER_S)
         return Numbers(first.astype(np.float64) if leaf.made is Made.REAL else first, error)
@@ -291,8 +273,6 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
     if leaf.made in _ANGLES:
         most = 90.0 if leaf.made is Made.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
-    if len(leaf.sources) > 1 or leaf.made is Made.CHANNELS:
-        return None
     found = zone(leaf.level.full(leaf.sources[0]))
     if found is not None and leaf.is_of_array and leaf.level.parent is not None:
         lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
@@ -319,16 +299,6 @@ def seconds(times: Numeric) -> Floats:
     whole = times // NS_PER_S
     parts = whole.astype(np.float64) + (times - whole * NS_PER_S) / NS_PER_S
     return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
-
-
-def _product(one: Numeric, other: Numeric) -> Numeric:
-    return cast("Numeric", one.astype(np.uint64) * other.astype(np.uint64))
-
-
-def _channels(encodings: Texts) -> Floats:
-    known = [channels_of(word) for word in encodings.words]
-    table = np.array([math.nan if each is None else each for each in known], np.float64)
-    return table[encodings.codes] if known else np.empty(0)
 
 
 def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:

@@ -9,7 +9,6 @@ the decoder, which decides message by message.
 
 from __future__ import annotations
 
-import struct
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
@@ -28,8 +27,9 @@ from ros2_memory.core.arrays import gathered
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import SEQUENCE, Batch, IntArray
 
+_MANY: Final = 500
 _FEW_ROWS: Final = 24
-"""With fewer rows on average, the elements of sequences are sooner passed one by one than nth by
+"""Of more than `_MANY` elements, in fewer rows on average, each is sooner decoded alone than nth by
 nth."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
@@ -40,7 +40,6 @@ _MAX_PADDING: Final = 3
 _UINT8: Final = np.dtype("u1")
 _UINT16: Final = np.dtype("<u2")
 _UINT32: Final = np.dtype("<u4")
-_LENGTH: Final = struct.Struct("<I")
 
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
@@ -77,7 +76,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
         level = Level(left_out=dict(plan.left_out))
         rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
-    except (IndexError, UnicodeDecodeError, struct.error) as error:
+    except (IndexError, UnicodeDecodeError) as error:
         raise NotWalkedError from error
     left = rows.sizes - end
     if left.min() < 0 or left.max() > _MAX_PADDING:
@@ -137,9 +136,8 @@ class _Walk:
         block = gathered(self.buffer, run.dtype, places)
         for nth, entry in enumerate(run.fields):
             if isinstance(entry, Array):
-                columns[f"{entry.path}.length"] = np.full(places.size, entry.length, np.uint32)
-                if entry.is_ranged:
-                    add_ranges(columns, entry.path, block[str(nth)], is_bool=entry.is_bool)
+                values = block[str(nth)] if entry.is_ranged else None
+                add_array(columns, entry, places.size, values)
             elif isinstance(entry, Time):
                 time = block[str(nth)]
                 columns[entry.path] = time["f0"] * np.int64(NS_PER_S) + time["f1"]
@@ -240,8 +238,8 @@ class _Walk:
     ) -> tuple[IntArray, IntArray]:
         """Returns where elements of various sizes begin, and where their sequences end."""
         most, total = int(counts.max(initial=0)), int(counts.sum())
-        if total < _FEW_ROWS * most:
-            return self._passed_each(plan, rows, at, counts)
+        if most > _MANY and total < _FEW_ROWS * most:
+            raise NotWalkedError
         first = np.cumsum(counts) - counts
         begins = np.zeros(total, np.int64)
         end = at
@@ -257,47 +255,6 @@ class _Walk:
                 end = end.copy()
                 end[left] = behind
         return begins, end
-
-    def _passed_each(
-        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
-    ) -> tuple[IntArray, IntArray]:
-        """Returns what `_stepped` does, element by element."""
-        begins: list[int] = []
-        ends: list[int] = []
-        spans = zip(rows.origins.tolist(), rows.sizes.tolist(), at.tolist(), strict=True)
-        for (origin, size, position), count in zip(spans, counts.tolist(), strict=True):
-            here = position
-            for _ in range(count):
-                here += -here % plan.align
-                begins.append(here)
-                here = self._passed(plan, origin, here, size)
-            ends.append(here)
-        return np.array(begins, np.int64), np.array(ends, np.int64)
-
-    def _passed(self, plan: Plan, origin: int, at: int, size: int) -> int:
-        """Returns where a message ends that begins `at` behind its origin."""
-        for step in plan.steps:
-            if isinstance(step, Run):
-                at += -at % step.align + step.size
-                continue
-            if isinstance(step, Sequence) and step.length != SEQUENCE:
-                count = step.length
-            else:
-                at += -at % step.align + step.skip
-                (count,) = _LENGTH.unpack_from(self.buffer, origin + at)
-                at += 4
-            if isinstance(step, Text):
-                at += count
-            elif isinstance(step, NumberSequence):
-                at += (-at % step.size if count and step.size > 4 else 0) + count * step.size
-            elif at + count * max(step.plan.least, 1) > size:
-                raise NotWalkedError
-            else:
-                for _ in range(count):
-                    at = self._passed(step.plan, origin, at + -at % step.plan.align, size)
-            if at > size:
-                raise NotWalkedError
-        return at
 
 
 def _steady(
@@ -341,10 +298,8 @@ def add_sequence(
     """
     if is_bool:
         values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
-    level.columns[f"{path}.length"] = counts.astype(np.uint32)
     ranged = counts * values.itemsize <= MAX_RANGED_BYTES
-    least, greatest = _ranges(np.where(ranged, counts, 0), values)
-    level.columns[f"{path}.least"], level.columns[f"{path}.greatest"] = least, greatest
+    add_ranges(level.columns, path, counts, np.where(ranged, counts, 0), values)
     few = counts <= MAX_NUMBERS
     kept = np.repeat(few[ranged], counts[ranged])
     numbers = values if kept.all() else values[kept]
@@ -354,53 +309,33 @@ def add_sequence(
         level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
 
 
-def _ranges(counts: IntArray, values: Numbers) -> tuple[Floats, Floats]:
-    """Returns the least and greatest finite value of each row; NaN where there is none."""
-    least = np.full(counts.size, np.nan)
-    greatest = least.copy()
-    filled = counts > 0
-    if values.size:
-        begins = (np.cumsum(counts) - counts)[filled]
-        low, high = np.minimum.reduceat(values, begins), np.maximum.reduceat(values, begins)
-        if not _are_finite(low, high):
-            least_of, greatest_of = _finite_only(values)
-            low = np.minimum.reduceat(least_of, begins)
-            high = np.maximum.reduceat(greatest_of, begins)
-        least[filled], greatest[filled] = low, high
-        _unbounded(least, greatest)
-    return least, greatest
-
-
-def add_ranges(columns: dict[str, Column], path: str, values: Numbers, *, is_bool: bool) -> None:
-    """Adds the least and greatest finite value of each row of numbers."""
-    if is_bool:
+def add_array(columns: dict[str, Column], entry: Array, rows: int, values: Numbers | None) -> None:
+    """Adds what is kept of a fixed array: its length, and the range of its numbers, if given."""
+    lengths = np.full(rows, entry.length)
+    if values is None:
+        columns[f"{entry.path}.length"] = lengths.astype(np.uint32)
+        return
+    values = values.reshape(-1)
+    if entry.is_bool:
         values = (values != 0).view(np.uint8)
-    # Numpy goes along the last axis, so that the shorter one comes first.
-    table = np.ascontiguousarray(values.T)
-    least, greatest = table.min(0), table.max(0)
-    if not _are_finite(least, greatest):
-        low, high = _finite_only(table)
-        least, greatest = low.min(0), high.max(0)
-    least, greatest = least.astype(np.float64), greatest.astype(np.float64)
-    _unbounded(least, greatest)
-    columns[f"{path}.least"], columns[f"{path}.greatest"] = least, greatest
+    add_ranges(columns, entry.path, lengths, lengths, values)
 
 
-def _are_finite(least: Numbers, greatest: Numbers) -> bool:
-    """Returns whether all numbers were finite: NaN and infinities are among their bounds."""
-    if least.dtype.kind != "f":
-        return True
-    return bool(np.isfinite(least).all() and np.isfinite(greatest).all())
+def add_ranges(
+    columns: dict[str, Column], path: str, lengths: IntArray, counts: IntArray, values: Numbers
+) -> None:
+    """Adds the lengths of arrays, and the least and greatest finite number of each.
 
-
-def _finite_only(values: Numbers) -> tuple[Numbers, Numbers]:
-    """Returns the values twice, with what is not finite put where it is neither bound."""
+    Those are NaN where there is none; `counts` of the `values` are of each.
+    """
+    columns[f"{path}.length"] = lengths.astype(np.uint32)
+    filled = counts > 0
+    begins = (np.cumsum(counts) - counts)[filled]
     finite = np.isfinite(values)
-    return np.where(finite, values, np.inf), np.where(finite, values, -np.inf)
-
-
-def _unbounded(least: Floats, greatest: Floats) -> None:
-    """Puts NaN where no value was finite."""
-    none = least > greatest
-    if none.any():
-        least[none] = greatest[none] = np.nan
+    for end, ufunc, none in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
+        found = np.full(counts.size, np.nan)
+        if values.size:
+            some = values if finite.all() else np.where(finite, values, none)
+            found[filled] = ufunc.reduceat(some, begins)
+            found[np.isinf(found)] = np.nan
+        columns[f"{path}.{end}"] = found

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.decode import BagRows
 from ros2_memory.columns.layout import Layout
 from ros2_memory.columns.parts import (
     ALWAYS,
@@ -53,25 +52,30 @@ class ReadBag(NamedTuple):
     is_current: Callable[[], bool] = lambda: True
 
 
+class BagRows(NamedTuple):
+    """A table of one of some bags, which is named by its place among these."""
+
+    table: Table
+    bag: int
+
+
 class DecodedBags(NamedTuple):
     """Bags of one recording, and tables with all of their messages."""
 
-    bags: Sequence[ReadBag]
-    tables: Sequence[BagRows]
+    bags: list[ReadBag]
+    tables: list[BagRows]
+
+    def add(self, bag: ReadBag, tables: Sequence[Table]) -> None:
+        """Adds a bag."""
+        self.tables.extend(BagRows(table, len(self.bags)) for table in tables)
+        self.bags.append(bag)
 
     def chosen(self, places: Sequence[int]) -> DecodedBags:
         """Returns some of the bags, by their places among these."""
-        if len(places) == len(self.bags):
-            return self
-        new = np.full(len(self.bags), -1)
-        new[places] = np.arange(len(places))
-        tables = [
-            BagRows(table.rows(rows), new[bags[rows]])
-            for table, bags in self.tables
-            for rows in [np.flatnonzero(new[bags] >= 0)]
-            if rows.size
-        ]
-        return DecodedBags([self.bags[place] for place in places], tables)
+        new = DecodedBags([], [])
+        for place in places:
+            new.add(self.bags[place], [table for table, bag in self.tables if bag == place])
+        return new
 
 
 class LongBag:
@@ -246,24 +250,16 @@ def insert_bags(
     whole: bool,
 ) -> list[int]:
     """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
-    lacking = {
-        place
-        for table, bags in decoded.tables
-        if lacks_definitions([table])
-        for place in np.unique(bags).tolist()
-    }
-    numbers = np.array(
-        [
-            insert_bag(connection, to_store, definitions if place in lacking else "")
-            for place, to_store in enumerate(decoded.bags)
-        ],
-        np.int64,
-    )
+    lacking = {bag for table, bag in decoded.tables if lacks_definitions([table])}
+    numbers = [
+        insert_bag(connection, to_store, definitions if place in lacking else "")
+        for place, to_store in enumerate(decoded.bags)
+    ]
     tables: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
-    for table, bags in decoded.tables:
+    for table, bag in decoded.tables:
         topic, layout_of[topic] = topic_of(connection, table, layouts)
-        tables[topic].append((table, numbers[bags]))
+        tables[topic].append((table, np.full(len(table), numbers[bag])))
     packed = {topic: [packed_part(layout_of[topic], some)] for topic, some in tables.items()}
     return insert_parts(connection, packed, whole=whole)
 
@@ -272,11 +268,8 @@ def insert_parts(
     connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
 ) -> list[int]:
     """Inserts parts, by the numbers of their topics; returns their ids."""
-    return [
-        _insert_part(connection, topic, part, whole=whole)
-        for topic, some in parts.items()
-        for part in some
-    ]
+    every = [(topic, part) for topic, some in parts.items() for part in some]
+    return [_insert_part(connection, topic, part, whole=whole) for topic, part in every]
 
 
 def _insert_part(

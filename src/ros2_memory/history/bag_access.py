@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_thinned
-from ros2_memory.columns.decode import decoded, pieces
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.scanner import DECODED_BYTES
 from ros2_memory.core.errors import (
@@ -224,7 +224,7 @@ class BagAccess:
         key = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         known = remembered.get(key) if is_lasting else None
-        undecoded = pieces(
+        read_now = decoded(
             self.memory.reader,
             bag.path,
             part,
@@ -232,7 +232,7 @@ class BagAccess:
             hashed=lambda channel: hashed or channel.latched,
             columns=columns,
         )
-        groups = decoded(self.memory.reader, undecoded) if known is None else iter(known)
+        groups = read_now if known is None else iter(known)
         read: list[list[Table]] = []
         size = 0
         while True:

@@ -245,7 +245,7 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np
     found: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
-        return _STAMP in parts.topic.layout.columns
+        return _STAMP in parts.topic.layout.slots
 
     for rows in scan(view, topic, window, may_match=may_match):
         column = rows.table.columns.get(_STAMP)

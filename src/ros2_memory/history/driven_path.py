@@ -20,7 +20,7 @@ from ros2_memory.analysis.motion.trajectory import (
 )
 from ros2_memory.analysis.poses import Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey, Kind, Sized
-from ros2_memory.columns.motion import PATHS
+from ros2_memory.columns.kinds import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,

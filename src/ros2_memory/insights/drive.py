@@ -22,7 +22,7 @@ from ros2_memory.analysis.motion.standstills import (
     standstills_of,
 )
 from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, Trajectory
-from ros2_memory.columns.motion import STANDS
+from ros2_memory.columns.kinds import STANDS
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (

@@ -15,9 +15,9 @@ from ros2_memory.analysis.topic_events import (
     events_of,
     joined_events,
 )
-from ros2_memory.columns.decode import decoded, pieces
-from ros2_memory.columns.events import EVENTS
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
@@ -118,7 +118,7 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     """
     reader, columns = view.memory.reader, StatedColumns(view.extractor)
     found: dict[str, list[Stated]] = {}
-    for tables in decoded(reader, pieces(reader, bag.path, topics=topics)) if topics else ():
+    for tables in decoded(reader, bag.path, topics=topics) if topics else ():
         for nth, table in enumerate(tables):
             rows = Rows(BagUnit(bag, table, nth), lambda: None)
             stated = _stated(view, columns, rows)

@@ -28,9 +28,9 @@ from ros2_memory.analysis.motion.robot_track import (
 )
 from ros2_memory.analysis.poses import Poses, headings
 from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.steps import QUATERNION
 from ros2_memory.columns.store import relative
-from ros2_memory.columns.tracks import TRACKS
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply

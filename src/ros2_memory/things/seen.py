@@ -19,7 +19,7 @@ import numpy as np
 from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS, Flags, Ints
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.columns.fragments import Fragment, FragmentKey, Kind
+from ros2_memory.columns.fragments import FragmentKey, Kind
 from ros2_memory.columns.sights import packed
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -95,17 +95,8 @@ class SeenBytes(NamedTuple):
         """About how much memory it takes."""
         return 200 + len(self.data)
 
-    @classmethod
-    def of(cls, fragment: Fragment) -> SeenBytes:
-        """Returns what was stored."""
-        return cls(fragment.arrays["sights"].tobytes())
 
-    def fragment(self) -> Fragment:
-        """Returns it as it is stored."""
-        return Fragment("", {"sights": np.frombuffer(self.data, np.uint8)})
-
-
-SIGHTS: Final = Kind("sights", SeenBytes.fragment, SeenBytes.of)
+SIGHTS: Final[Kind[SeenBytes]] = Kind("sights", (SeenBytes,))
 """What detectors saw in a stretch."""
 
 

@@ -22,8 +22,8 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents, joined_events
 from ros2_memory.analysis.topic_events import events_of as events_of_stated
-from ros2_memory.columns.events import EVENTS
-from ros2_memory.columns.fragments import Fragment
+from ros2_memory.columns.fragments import from_bytes, to_bytes
+from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.core.timebase import NS_PER_S
 
 Messages = list[tuple[int, State]]
@@ -102,8 +102,7 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
 def test_events_come_back_from_their_bytes(history: tuple[Messages, list[int]]) -> None:
     events = events_of(history[0])
     assert events is not None
-    stored = EVENTS.store(events).to_bytes()
-    assert EVENTS.load(Fragment.from_bytes(stored)) == events
+    assert from_bytes(to_bytes(events, EVENTS.classes), EVENTS.classes) == events
 
 
 @given(histories(), st.data())

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from ros2_memory.columns.decode import decoded, decoded_together, pieces
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.table import Table, joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -31,7 +29,7 @@ def tables_of(reader: BagReader, path: Path) -> list[Table]:
     Without the messages that cannot be decoded.
     """
     parts: dict[object, list[Table]] = {}
-    groups = decoded(reader, pieces(reader, path), skip_undecodable=True)
+    groups = decoded(reader, path, skip_undecodable=True)
     while True:
         try:
             group = next(groups)
@@ -85,15 +83,6 @@ def decoded_alike(reader: BagReader, path: Path) -> Comparison:
     comparison = compared(reader, path, tables_of(reader, path))
     assert comparison.wrong == []
     return comparison
-
-
-def decoded_together_alike(reader: BagReader, paths: Sequence[Path]) -> None:
-    """Bags that are decoded together have the rows that they have alone, and none is missing."""
-    found = decoded_together(reader, [[*pieces(reader, path)] for path in paths])
-    for nth, path in enumerate(paths):
-        tables = [table.rows(np.flatnonzero(bags == nth)) for table, bags in found]
-        comparison = compared(reader, path, [table for table in tables if len(table)])
-        assert comparison.wrong == []
 
 
 def bag_of(

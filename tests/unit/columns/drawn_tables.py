@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -23,10 +23,12 @@ from ros2_memory.analysis.conditions import (
     leaves,
     positions,
 )
-from ros2_memory.columns.objects import level_of
+from ros2_memory.columns.decode import _Kind, _table
+from ros2_memory.columns.layout import Layout, columns_in
+from ros2_memory.columns.pack import pack
 from ros2_memory.columns.plan import plan_of
-from ros2_memory.columns.table import Column, Elements, Table, Texts, Zone, joined
-from ros2_memory.columns.walk import NotWalkedError, walked
+from ros2_memory.columns.stored import StoredTable, lazy_columns
+from ros2_memory.columns.table import Column, Table, Texts, joined
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
@@ -108,8 +110,6 @@ OTHERS: Final = (
     "nav_msgs/msg/OccupancyGrid",
     "visualization_msgs/msg/MarkerArray",
     "std_msgs/msg/Float64MultiArray",
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/PointCloud2",
     "sensor_msgs/msg/CompressedImage",
 )
 ROWS: Final = 6
@@ -170,125 +170,53 @@ class Drawn:
 
 def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     """Messages of one channel in the order of time, as a table."""
-    found: Iterator[Batch] = batched(enumerate(records))
-    table = joined([_table(batch, reader) for batch in found])
-    return Drawn(table, [reader.decode(record) for record in records])
-
-
-def _table(batch: Batch, reader: McapReader) -> Table:
-    definition = reader.definition(batch.channel)
+    definition = reader.definition(records[0].channel)
     assert definition is not None
-    plan = plan_of(definition)
-    try:
-        level = walked(plan, batch)
-    except NotWalkedError:
-        level = level_of(
-            plan, [reader.decode(batch.record(nth)) for nth in range(len(batch.starts))]
-        )
-    return Table(
-        batch.channel,
-        batch.log_times,
-        batch.publish_times,
-        batch.places,
-        level.columns,
-        level.elements,
-        level.left_out,
-        definition=definition,
-    )
+    kind = _Kind(definition, plan_of(definition), "", is_hashed=False)
+    found: Iterator[Batch] = batched(enumerate(records))
+    table = joined([_table(kind, batch, reader, skip=False) for batch in found])
+    return Drawn(table, [reader.decode(record) for record in records])
 
 
 _READER: Final = McapReader()
 
 
-class LazyColumns(Mapping[str, Column]):
-    """Columns that say which of them were unpacked."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Stored(StoredTable):
+    """A table as it comes out of the store, and the columns that were unpacked of it."""
 
-    def __init__(self, prefix: str, columns: Mapping[str, Column], unpacked: set[str]) -> None:
-        self._prefix = prefix
-        self._columns = columns
-        self._unpacked = unpacked
-
-    def __getitem__(self, path: str) -> Column:
-        column = self._columns[path]
-        self._unpacked.add(f"{self._prefix}.{path}".strip("."))
-        return column
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._columns)
-
-    def __len__(self) -> int:
-        return len(self._columns)
+    unpacked: set[str] = field(kw_only=True)
 
 
-class StoredTable(Table):
-    """A table as it comes out of a store: floats rounded to a step, with zones."""
-
-    __slots__ = ("errors", "unpacked", "zones")
-    errors: dict[str, float]
-    unpacked: set[str]
-    zones: dict[str, Zone]
-
-    def error(self, path: str) -> float:
-        return self.errors.get(path, 0.0)
-
-    def zone(self, path: str) -> Zone | None:
-        return self.zones.get(path)
-
-
-def stored(table: Table, step: float, *, zones: bool = True) -> StoredTable:
+def stored(table: Table, step: float) -> Stored:
     """The table with floats rounded to a multiple of `step`; 0 for no rounding."""
-    errors: dict[str, float] = {}
-    known: dict[str, Zone] = {}
+    columns = dict(columns_in(table))
+    packed = {path: pack(column) for path, column in columns.items()}
     unpacked: set[str] = set()
+    for path, column in columns.items() if step else ():
+        if not isinstance(column, Texts) and column.dtype.kind == "f":
+            near = rounded(column, step)
+            is_finite = np.isfinite(near)
+            off = np.abs(near[is_finite] - column[is_finite].astype(np.float64))
+            columns[path] = near
+            packed[path] = replace(packed[path], error=float(off.max(initial=0.0)))
 
-    def packed(prefix: str, columns: Mapping[str, Column]) -> LazyColumns:
-        found: dict[str, Column] = {}
-        for path, column in columns.items():
-            full = f"{prefix}.{path}".strip(".")
-            if zones:
-                known[full] = zone_of(column)
-            found[path] = column
-            if step and not isinstance(column, Texts) and column.dtype.kind == "f":
-                found[path], errors[full] = rounded(column, step)
-        return LazyColumns(prefix, found, unpacked)
+    def load(path: str) -> Column:
+        if not path.endswith("#"):
+            unpacked.add(path)
+        return columns[path]
 
-    def elements(prefix: str, within: Mapping[str, Elements]) -> dict[str, Elements]:
-        return {
-            path: Elements(
-                inner.owners,
-                packed(f"{prefix}.{path}".strip("."), inner.columns),
-                elements(f"{prefix}.{path}".strip("."), inner.elements),
-            )
-            for path, inner in within.items()
-        }
-
-    made = {entry.name: getattr(table, entry.name) for entry in fields(Table)}
-    made["columns"] = packed("", table.columns)
-    made["elements"] = elements("", table.elements)
-    result = StoredTable(**made)
-    for name, value in (("errors", errors), ("zones", known), ("unpacked", unpacked)):
-        object.__setattr__(result, name, value)
-    return result
+    made = {each.name: getattr(table, each.name) for each in fields(Table)}
+    made["columns"], made["elements"] = lazy_columns(Layout.of(table, None), load, ())
+    return Stored(**made, packed=packed.get, unpacked=unpacked)
 
 
-def rounded(column: Any, step: float) -> tuple[Any, float]:
-    """Floats as multiples of a step, and the most by which they are off."""
+def rounded(numbers: Any, step: float) -> Any:
+    """Finite numbers as multiples of a step, if it is not 0; others as they are."""
+    numbers = numbers.astype(np.float64)
     with np.errstate(all="ignore"):
-        near = np.round(column.astype(np.float64) / step) * step
-        near = np.where(np.isfinite(near), near, column.astype(np.float64))
-        off = np.abs(near - column.astype(np.float64))
-    return near, float(np.max(off, initial=0.0, where=np.isfinite(off)))
-
-
-def zone_of(column: Column) -> Zone:
-    """What is known of a column without unpacking it."""
-    if isinstance(column, Texts):
-        return Zone(words="\n".join(sorted({word.casefold() for word in column.words})))
-    kept = column[~np.isnan(column)] if column.dtype.kind == "f" else column
-    if not kept.size:
-        return Zone(nulls=column.size)
-    least, greatest = (end.item() for end in (kept.min(), kept.max()))
-    return Zone(least, greatest, int(column.size - kept.size))
+        near = np.round(numbers / step) * step if step else numbers
+    return np.where(np.isfinite(near), near, numbers)
 
 
 @st.composite
@@ -311,14 +239,14 @@ def drawn_of(type_name: str, messages: Sequence[object]) -> Drawn:
 
 def message(type_name: str, random: Random, *, is_odd: bool = True) -> object:
     """A message with values that tests look for; `is_odd`: NaN and infinities among them."""
-    fields = store().fielddefs[type_name][1]
     build: Any = store().types[type_name]
-    made = [_value(field, random, is_odd) for _, field in fields]
+    drawn = store().fielddefs[type_name][1]
+    made = [_value(each, random, is_odd) for _, each in drawn]
     return build(*made)
 
 
-def _value(field: Any, random: Random, is_odd: bool) -> object:
-    node, about = field
+def _value(drawn: Any, random: Random, is_odd: bool) -> object:
+    node, about = drawn
     if node == Nodetype.BASE:
         return _scalar(about[0], random, is_odd)
     if node == Nodetype.NAME:

@@ -6,7 +6,7 @@ import random
 import struct
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import pytest
 from hypothesis import given, settings
@@ -18,11 +18,8 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.examples import LONG, examples
 from tests.support.leaves import Comparison
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
-from tests.unit.columns.decoded_bags import bag_of, decoded_alike, decoded_together_alike, tables_of
+from tests.unit.columns.decoded_bags import bag_of, decoded_alike, tables_of
 from tests.unit.columns.drawn_types import DrawnTypes, drawn_types
-
-if TYPE_CHECKING:
-    pass
 
 EVERYTHING: Final = TimeWindow.everything()
 
@@ -94,10 +91,8 @@ def test_damaged_payloads_are_decoded_or_left_out_as_rosbags_decides(
     chance = random.Random(seed)
     store = types.store()
     payloads = []
-    whole: list[bytes] = []
     for _ in range(4):
         payload = bytearray(store.serialize_cdr(types.message(store, chance, 3), types.root))
-        whole.append(bytes(payload))
         at = chance.randrange(4, max(len(payload), 5))
         match chance.randrange(5):
             case 0:
@@ -114,5 +109,3 @@ def test_damaged_payloads_are_decoded_or_left_out_as_rosbags_decides(
     with tempfile.TemporaryDirectory() as folder:
         path = bag_of(Path(folder) / "damaged.mcap", types, payloads)
         decoded_alike(McapReader(), path)
-        other = bag_of(Path(folder) / "whole.mcap", types, whole)
-        decoded_together_alike(McapReader(), [other, path, other])

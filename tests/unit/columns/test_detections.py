@@ -46,8 +46,8 @@ def listed(found: Detections, step: float) -> list[tuple[int | str, ...]]:
         found.rows.tolist(),
         found.labels.values(),
         found.frames.values(),
-        (rounded(found.scores, step)[0] if step else found.scores).tolist(),
-        (rounded(found.places, step)[0] if step else found.places).tolist(),
+        rounded(found.scores, step).tolist(),
+        rounded(found.places, step).tolist(),
     )
 
     def said(number: float) -> str:

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from ros2_memory.columns.fragments import Fragment, FragmentKey, Fragments, Kind
+from ros2_memory.analysis.motion.robot_track import track_part
+from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, from_bytes, to_bytes
+from ros2_memory.columns.kinds import TRACKS
+from ros2_memory.columns.pack import compressed
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -25,24 +30,25 @@ from tests.support.column_worlds import EVERYTHING, World, store_file
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from ros2_memory.columns.store import ColumnStore
 
 S = NS_PER_S
 T0 = 1_700_000_400 * S
 
 
-class Words:
+class Words(NamedTuple):
     """A value to store: some words."""
 
-    def __init__(self, words: str) -> None:
-        self.words = words
+    words: str
 
     @property
     def memory_bytes(self) -> int:
         return 100
 
 
-WORDS = Kind("words", lambda made: Fragment(made.words, {}), lambda found: Words(found.head))
+WORDS: Final[Kind[Words]] = Kind("words", (Words,))
 
 
 @pytest.fixture
@@ -71,24 +77,54 @@ def fragments_in(file: Path) -> int:
         return int(base.execute("SELECT count(*) FROM fragment").fetchone()[0])
 
 
-arrays = st.one_of(
-    st.lists(st.integers(-(2**63), 2**63 - 1)).map(lambda rows: np.array(rows, np.int64)),
-    st.lists(st.floats()).map(lambda rows: np.array(rows, np.float64)),
-    st.lists(st.booleans()).map(lambda rows: np.array(rows, np.bool_)),
-    st.integers(0, 5).map(lambda rows: np.arange(3.0 * rows).reshape(-1, 3)),
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """A value of whatever a fragment may consist of."""
+
+    words: Words | None
+    data: bytes
+    numbers: tuple[object, ...]
+    arrays: dict[str, NDArray[Any]]
+
+
+arrays = st.sampled_from(["int64", "uint64", "uint32", "float64", "float32", "bool"]).flatmap(
+    lambda name: hnp.arrays(
+        name,
+        st.sampled_from([(0,), (7,), (300,), (100, 3), (7, 2, 40)]),
+        elements=hnp.from_dtype(np.dtype(name)),
+        fill=st.sampled_from([0, 1]) if name != "bool" else st.booleans(),
+    )
+)
+wholes = st.builds(
+    Whole,
+    st.none() | st.builds(Words, st.text()),
+    st.binary(),
+    st.lists(st.integers() | st.floats(allow_nan=False) | st.text() | st.none()).map(tuple),
+    st.dictionaries(st.text(), arrays | st.just(np.arange(1000) / 10_000), max_size=3),
 )
 
 
-@given(st.text().filter(lambda head: "\n" not in head), st.dictionaries(st.text(), arrays))
-def test_a_fragment_is_the_same_once_it_was_stored(
-    head: str, named: dict[str, np.ndarray[tuple[int, ...], np.dtype[np.generic]]]
-) -> None:
-    found = Fragment.from_bytes(Fragment(head, named).to_bytes())
-    assert found.head == head
-    assert [*found.arrays] == [*named]
-    for name, array in named.items():
-        assert found.arrays[name].dtype == array.dtype
-        np.testing.assert_array_equal(found.arrays[name], array)
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(wholes)
+def test_a_fragment_is_the_same_once_it_was_stored(whole: Whole) -> None:
+    classes = (Whole, Words)
+    found = from_bytes(to_bytes(whole, classes), classes)
+    assert isinstance(found, Whole)
+    assert replace(found, arrays={}) == replace(whole, arrays={})
+    for (name, array), (own, back) in zip(whole.arrays.items(), found.arrays.items(), strict=True):
+        assert name == own
+        assert (back.dtype, back.shape) == (array.dtype, array.shape)
+        assert back.flags.c_contiguous
+        np.testing.assert_array_equal(back, array)
+        if array.dtype.kind == "f":
+            assert np.array_equal(np.signbit(back[array == 0]), np.signbit(array[array == 0]))
+
+
+def test_a_robot_that_stands_takes_few_bytes() -> None:
+    times = np.arange(0, 600 * S, S // 25) + T0
+    level = np.ones(times.size)
+    track = track_part(times, level, level, level)
+    assert len(to_bytes(track, TRACKS.classes)) < 1000
 
 
 def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world: World) -> None:
@@ -158,14 +194,28 @@ def test_a_fragment_of_a_part_that_went_meanwhile_is_not_stored(
     assert fragments_in(store_file(tmp_path)) == 0
 
 
-def test_a_damaged_fragment_is_made_again(world: World, tmp_path: Path) -> None:
+@pytest.mark.parametrize("data", [b"\0", compressed(b"[]\n"), compressed(b"[0]"), b""])
+def test_a_damaged_fragment_is_made_again_and_takes_its_place(
+    world: World, tmp_path: Path, data: bytes
+) -> None:
     world.store.close()
     with closing(sqlite3.connect(store_file(tmp_path), isolation_level=None)) as base:
-        base.execute("UPDATE fragment SET data = x'00'")
+        base.execute("UPDATE fragment SET data = ?", (data,))
+
+    def damaged() -> int:
+        with closing(sqlite3.connect(store_file(tmp_path))) as base:
+            query = "SELECT count(*) FROM fragment WHERE kind LIKE 'path %' AND data = ?"
+            return int(base.execute(query, (data,)).fetchone()[0])
+
+    before = fragments_in(store_file(tmp_path))
+    assert damaged() > 0
     again = World.of(tmp_path)
     view = View(again.memory, Call())
     slices = [*slices_of_path(view, "/odom", EVERYTHING, [])]
     assert sum(path.poses for _, path in slices) == 3000
+    again.memory.columns.write_fragments()
+    assert damaged() == 0
+    assert fragments_in(store_file(tmp_path)) == before
 
 
 def test_stored_slices_of_a_path_are_those_that_are_measured_now(world: World) -> None:

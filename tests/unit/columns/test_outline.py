@@ -58,7 +58,7 @@ def test_of_texts_with_too_many_different_letters_nothing_is_known() -> None:
     assert Letters.of(Texts.of(words)) is None
 
 
-def write_world(folder: Path, draw: Random, hours: float = 2.5) -> None:
+def write_world(folder: Path, draw: Random, hours: float = 1.5) -> None:
     """A robot that drives, stands still, and tells in JSON what it sees; some bags are missing."""
     every = draw.choice([4, 10])
     for number in range(round(hours * 60)):
@@ -106,7 +106,7 @@ def answers(memory: Memory, draw: Random) -> Iterator[object]:
             )
 
 
-@pytest.mark.parametrize("seed", range(examples(4)))
+@pytest.mark.parametrize("seed", range(examples(2)))
 def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
     with TemporaryDirectory() as folder:
         write_world(Path(folder), Random(seed))
@@ -143,5 +143,5 @@ def test_whole_parts_are_told_without_their_columns_and_without_bags(
 
     monkeypatch.setattr(BagAccess, "tables", counted)
     assert by_weekday(world.memory) == expected
-    # Of 142 bags those that hold an end of a number, or are in no whole part yet.
+    # Of some 85 bags those that hold an end of a number, or are in no whole part yet.
     assert len(read) < 30

@@ -112,21 +112,16 @@ def test_zones_are_exact(column: Values) -> None:
     assert zone.greatest == max(there, default=None)
     assert zone.nulls == len(column) - len(there)
     assert zone.words is None
+    if zone.nulls in {0, len(column)} and len({*there}) <= 1:
+        assert pack(column, METRES).data == b""
 
 
-@pytest.mark.parametrize("name", [*INTEGERS, *FLOATS])
-def test_a_column_of_one_value_has_no_bytes(name: str) -> None:
-    for value in (0, 1):
-        packed = pack(np.full(7, value, name), METRES)
-        assert packed.data == b""
-        assert unpacked(packed).tolist() == [value] * 7
-
-
-def test_a_column_of_nan_has_no_bytes() -> None:
-    packed = pack(np.full(7, np.nan, np.float32), METRES)
-    assert packed.data == b""
-    assert packed.zone.nulls == 7
-    assert np.isnan(unpacked(packed)).all()
+def test_regular_times_and_decimals_in_single_precision_take_little() -> None:
+    stamps = 1_768_176_000_000_000_000 + np.arange(500) * 20_000_000
+    assert len(pack(stamps).data) <= 8
+    speeds = pack(np.round(np.sin(np.arange(500) / 30), 3).astype(np.float32), RELATIVE)
+    assert speeds.error == 0.0
+    assert len(compressed(speeds.data)) < 500
 
 
 @pytest.mark.parametrize(
@@ -144,29 +139,6 @@ def test_a_column_of_nan_has_no_bytes() -> None:
 )
 def test_extreme_integers_come_back_as_they_were(column: Values) -> None:
     assert unpacked(pack(column)).tolist() == column.tolist()
-
-
-def test_decimals_in_single_precision_are_exact_and_small() -> None:
-    speeds = np.round(np.sin(np.arange(500) / 30), 3).astype(np.float32)
-    packed = pack(speeds, RELATIVE)
-    assert packed.error == 0.0
-    assert len(compressed(packed.data)) < 400
-
-
-@pytest.mark.parametrize("first", [0, 2**62])
-def test_long_planes_are_compressed_apart_and_come_back(first: int) -> None:
-    draw = np.random.default_rng(3)
-    jittered = first + np.arange(2000) * 20_000_000 + draw.integers(0, 400_000, 2000)
-    for column in (jittered, Texts.of([f"word {number % 300}" for number in jittered.tolist()])):
-        packed = pack(column)
-        blob = compressed(packed.data, packed.plane)
-        assert decompressed(blob) == packed.data
-        assert len(blob) < len(compressed(packed.data)) or isinstance(column, Texts)
-
-
-def test_regular_times_take_next_to_nothing() -> None:
-    stamps = 1_768_176_000_000_000_000 + np.arange(500) * 20_000_000
-    assert len(pack(stamps).data) <= 8
 
 
 @settings(max_examples=examples(200), deadline=None)
@@ -217,12 +189,12 @@ def test_damaged_bytes_are_refused() -> None:
     with pytest.raises(ValueError, match="cannot be decompressed"):
         decompressed(b"no frame at all")
     with pytest.raises(ValueError, match="arranged"):
-        unpack("int64 whole spiral 1", 3, 0, bytes(20))
+        unpack("int64 whole curve 1", 3, 0, bytes(20))
 
 
 def test_packed_bytes_of_this_format_do_not_change() -> None:
     """Stores that robots have are read by the bytes' format."""
-    assert (FORMAT, hashlib.sha256(golden()).hexdigest()[:16]) == (18, "5dc94e7bfc97dc55"), (
+    assert (FORMAT, hashlib.sha256(golden()).hexdigest()[:16]) == (19, "c9823d5ef8b5aa03"), (
         "packed columns are other bytes than before: raise FORMAT in columns/pack.py, so that "
         "stores are filled anew, and pin the new number and hash here"
     )

@@ -76,7 +76,7 @@ def test_windows_of_hours_and_of_all_time_have_the_same_rows(
     cut(tmp_path, [9, 30, 31, 60], each=hours)  # ten days
     world = World.of(tmp_path)
     bags = world.memory.index.snapshot().timeline.bags
-    edges = [T0 + nth * hours + 1 for nth in range(-1, 41)]
+    edges = [T0 + nth * hours + 1 for nth in range(-1, 44, 3)]
     windows = [TimeWindow(*pair) for pair in pairwise(edges)]
 
     def check() -> None:

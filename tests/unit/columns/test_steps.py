@@ -7,11 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from ros2_memory.columns.pack import FORMAT, pack, unpack
+from ros2_memory.columns.pack import pack, unpack
 from ros2_memory.columns.steps import (
     DEGREES,
     METRES,
-    MOST_RELATIVE,
     QUATERNION,
     RADIANS,
     RELATIVE,
@@ -19,7 +18,6 @@ from ros2_memory.columns.steps import (
     Step,
     step_of,
 )
-from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES
 from ros2_memory.storage.base import SEQUENCE, Definition, Field
 
 
@@ -100,13 +98,3 @@ def test_rotations_come_back_within_a_tenth_of_a_milliradian() -> None:
     # The rotation between two unit quaternions is by 2 asin(|a - b| / 2) * 2 for small distances.
     apart = np.sqrt(((given - back) ** 2).sum(axis=0))
     assert 4 * math.asin(float(apart.max()) / 2) <= 1e-4
-
-
-def test_what_a_number_means_changes_with_the_format_alone() -> None:
-    steps = [step.per_unit for step in (METRES, RADIANS, VELOCITY, QUATERNION, DEGREES)]
-    limits = (MOST_RELATIVE, MAX_NUMBERS, MAX_RANGED_BYTES)
-    assert (FORMAT, steps, limits) == (
-        18,
-        [10_000, 10_000, 10_000, 20_000, 1_000_000_000],
-        (1e-6, 9, 4096),
-    )

@@ -7,12 +7,12 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import pytest
 
 from ros2_memory.columns import scan
-from ros2_memory.columns.fragments import Fragment, Kind
+from ros2_memory.columns.fragments import Kind
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -39,18 +39,17 @@ LENGTH = 1200 * S
 WINDOW = TimeWindow(T0 - LENGTH, T0 + 6 * LENGTH)
 
 
-class Numbers:
-    """A value to store: a text, and some numbers."""
+class Words(NamedTuple):
+    """A value to store: some words."""
 
-    def __init__(self, fragment: Fragment) -> None:
-        self.fragment = fragment
+    words: str
 
     @property
     def memory_bytes(self) -> int:
         return 100
 
 
-NUMBERS = Kind("numbers", lambda made: made.fragment, Numbers)
+WORDS: Final[Kind[Words]] = Kind("words", (Words,))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -200,14 +199,14 @@ def test_what_was_made_in_time_is_told_before_the_time_is_over(world: World) -> 
     view = View(world.memory, Call())
     opened = open_scan(view, "/odom", WINDOW)
 
-    def made(stretch: Stretch) -> Iterator[tuple[int, Numbers]]:
-        yield stretch.window.start, Numbers(Fragment("one", {}))
+    def made(stretch: Stretch) -> Iterator[tuple[int, Words]]:
+        yield stretch.window.start, Words("one")
         if stretch.parts is not None:
             raise QueryTimeoutError("no time")
 
     found: list[int] = []
     with pytest.raises(QueryTimeoutError):
-        found += (start for start, _ in joined_back(view, opened, NUMBERS, made))
+        found += (start for start, _ in joined_back(view, opened, WORDS, made))
     newest = next(one for one in opened.stretches() if one.parts is not None)
     assert found[-1] == newest.window.start
 

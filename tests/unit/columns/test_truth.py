@@ -230,7 +230,7 @@ def test_only_the_columns_that_may_match_are_unpacked() -> None:
 def test_a_limit_within_the_error_of_a_number_is_unsure() -> None:
     kind = "std_msgs/msg/Float64"
     drawn = drawn_of(kind, [make(kind, data=number) for number in (0.96, 1.04, 2.0)])
-    table = stored(drawn.table, 0.1, zones=False)
+    table = stored(drawn.table, 0.1)
     found = ColumnCondition(Condition(Beyond(1.01, above=True), "value"), EXTRACTOR).truth(table)
     assert found.surely.tolist() == [False, False, True]
     assert found.unsure.tolist() == [True, True, False]

@@ -36,7 +36,7 @@ from ros2_memory.bag_dir.state_files import (
     Superseded,
     Thinned,
 )
-from ros2_memory.columns.decode import decoded, pieces
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
@@ -387,7 +387,7 @@ class MemoryDays:
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
-        groups = decoded(self._reader, pieces(self._reader, path), skip_undecodable=True)
+        groups = decoded(self._reader, path, skip_undecodable=True)
         for tables in or_errors(groups):
             if isinstance(tables, BagError):
                 self._raise_if_transient(path, tables)

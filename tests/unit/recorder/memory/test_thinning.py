@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
-from ros2_memory.columns.decode import decoded, pieces
+from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.recorder.memory.thinning import (
     EXTREMES_NS,
@@ -37,7 +37,7 @@ def times_that_stay(
     thinned = TopicThinning(DetectionColumns(shipped_extractor()), numbers_ns)
     for nth, messages in enumerate(bags):
         path = write_mcap(folder / f"{nth}.mcap", messages)
-        for tables in decoded(reader, pieces(reader, path)):
+        for tables in decoded(reader, path):
             for table in tables:
                 thinned.add(table)
         path.unlink()

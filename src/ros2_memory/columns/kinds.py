@@ -1,0 +1,57 @@
+"""The kinds of fragments: what follows from the rows of some parts, and of what it consists."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.analysis.intervals import IntervalTable
+from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
+from ros2_memory.analysis.motion.path_length import Creep, End
+from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
+from ros2_memory.analysis.motion.speed_drops import SpeedDrop
+from ros2_memory.analysis.motion.standstills import Blocks, Stands
+from ros2_memory.analysis.motion.trajectory import Line, PathSlice
+from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.analysis.topic_events import (
+    Change,
+    KnownState,
+    Report,
+    TopicEvents,
+    joined_events,
+)
+from ros2_memory.columns.fragments import Kind
+from ros2_memory.core.arrays import stacked
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
+    drops = tuple(drop for stands in found for drop in stands.drops)
+    blocks = stacked([stands.blocks for stands in found])
+    return [Stands(blocks, drops, max(stands.last for stands in found))]
+
+
+def _joined_events(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
+    whole = joined_events(found)
+    return [] if whole is None else [whole]
+
+
+def _joined_tracks(found: Sequence[TrackPart]) -> Sequence[TrackPart]:
+    by_recording: dict[str, list[TrackPart]] = {}
+    for part in found:
+        by_recording.setdefault(part.recording, []).append(part)
+    return [*map(united_parts, by_recording.values())]
+
+
+_MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
+PATHS: Final[Kind[PathSlice]] = Kind("path", (*_MOTION, Poses, Frames))
+"""The path of the poses of a topic in a slice of the clock."""
+STANDS: Final = Kind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
+"""Where the robot may have stood in a slice of the clock, by the poses of a topic."""
+EVENTS: Final = Kind(
+    "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
+)
+"""What came into view, changed or failed on a topic in a part."""
+TRACKS: Final = Kind("track", (TrackPart,), _joined_tracks)
+"""Where the poses of a part have the robot in a frame; joined, those of a recording."""
