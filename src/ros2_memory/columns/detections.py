@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.columns.plan import fields_at
 from ros2_memory.columns.scores import Scored, hypotheses, is_object, or_else, ranked, scored
 from ros2_memory.columns.shown import (
     ByType,
@@ -260,7 +261,7 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
     for path in POSITIONS:
         node: Node | None = Group(fields)
         for name in path:
-            node = dict(children(node)).get(name) if node and is_object(node) else None
+            node = node.child(name) if node and is_object(node) else None
         if node is None or isinstance(node, Leaf | Nothing):
             continue
         if isinstance(node, Items):
@@ -458,11 +459,9 @@ def _owners(values: Values, level: Level, among: Ints, around: Level) -> Ints:
 
 def _kind_at(definition: Definition, *path: str) -> str | Definition:
     """Returns what a field is; empty where there is no such field, or an array."""
-    kind: str | Definition = definition
-    for name in path:
-        fields = kind.fields if isinstance(kind, Definition) else ()
-        kind = next((each.kind for each in fields if each.name == name and each.length is None), "")
-    return kind
+    found = fields_at(definition, path)
+    is_there = len(found) == len(path) and all(each.length is None for each in found)
+    return found[-1].kind if is_there else ""
 
 
 def _own_frame(definition: Definition) -> tuple[Leaf, ...]:

@@ -55,8 +55,6 @@ from ros2_memory.core.large_reads import LARGE_BYTES
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from numpy.typing import NDArray
-
     from ros2_memory.storage.base import IntArray
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
@@ -374,7 +372,8 @@ def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
 
 
 def _pack_texts(column: Texts) -> Packed | _Whole:
-    codes, words = _in_use(column)
+    column = _in_use(column)
+    codes, words = column.codes, column.words
     zone = Zone(words=folded(words))
     if not words:
         return Packed("text constant", 0, 0.0, zone, b"")
@@ -386,18 +385,13 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
     return _Whole("text", 0.0, zone, head, codes.astype(np.int64), 0, len(words) - 1)
 
 
-def _in_use(column: Texts) -> tuple[NDArray[np.uint32], tuple[str, ...]]:
-    """Returns the codes and words of a column without the words that no row has.
+def _in_use(column: Texts) -> Texts:
+    """Returns a column without the words that no row has.
 
     Words of deleted rows must not stay in the file.
     """
-    if len(column.words) <= 1 and len(column.codes):
-        return column.codes, column.words
     used = np.bincount(column.codes, minlength=len(column.words)) > 0
-    if used.all():
-        return column.codes, column.words
-    codes = (np.cumsum(used, dtype=np.uint32) - np.uint32(1))[column.codes]
-    return codes, tuple(column.words[nth] for nth in np.flatnonzero(used).tolist())
+    return column if used.all() else column.rows(np.arange(len(column)))
 
 
 def folded(words: Collection[str]) -> str | None:

@@ -11,12 +11,15 @@ from __future__ import annotations
 import keyword
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES
 from ros2_memory.storage.base import SEQUENCE, Definition, Field
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 MAX_COLUMNS: Final = 5_000
 """Of one type, with those of its sequences."""
@@ -346,6 +349,20 @@ def first_align(kind: str | Definition) -> int:
         entry = kind.fields[0]
         kind = "string" if entry.length == SEQUENCE else entry.kind
     return _LENGTH_BYTES if kind == "string" else _dtype(kind).itemsize
+
+
+def fields_at(definition: Definition | None, path: Iterable[str]) -> list[Field]:
+    """Returns the fields along a path, each inside the one before, as far as there are such."""
+    found: list[Field] = []
+    kind: str | Definition | None = definition
+    for name in path:
+        inside = kind.fields if isinstance(kind, Definition) else ()
+        own = next((each for each in inside if each.name == name), None)
+        if own is None:
+            break
+        found.append(own)
+        kind = own.kind
+    return found
 
 
 def _dtype(kind: str | Definition) -> np.dtype[np.generic[object]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.columns.plan import fields_at
 from ros2_memory.columns.shown import ByType, UnknownShapeError
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
@@ -144,21 +145,14 @@ def _field(definition: Definition, path: Segments) -> _Field | None:
     """Returns the field at a path; None where there is none.
 
     Raises:
-        UnknownShapeError: the path leads through a list.
+        UnknownShapeError: it leads through a list.
     """
-    inside: Definition | None = definition
-    for nth, name in enumerate(path, 1):
-        found = (
-            next((each for each in inside.fields if each.name == name), None) if inside else None
-        )
-        if found is None:
-            return None
-        if nth == len(path):
-            return _Field(".".join(path), found.kind, found.length)
-        if found.length is not None:
-            raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
-        inside = found.kind if isinstance(found.kind, Definition) else None
-    return None
+    found = fields_at(definition, path)
+    if any(each.length is not None for each in found[: len(path) - 1]):
+        raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
+    if len(found) < len(path):
+        return None
+    return _Field(".".join(path), found[-1].kind, found[-1].length)
 
 
 def _columns_of(plan: Plan, definition: Definition) -> _Columns:

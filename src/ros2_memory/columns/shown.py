@@ -301,7 +301,7 @@ class Shape:
         if found is not None:
             return found
         plain = self._at(segments)
-        return None if plain is None else _as_numbers(plain)
+        return None if plain is None else _changed(plain, _as_numbers)
 
     def shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
@@ -374,17 +374,13 @@ class Shape:
         if found is not None:
             return found
         plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
-        return None if plain is None else self._as_shown(plain)
+        return None if plain is None else _changed(plain, self._as_shown)
 
     def _as_shown(self, node: Node) -> Node:
         """Returns the end of a walk through definitions as the value shows it."""
-        if isinstance(node, Message):
-            return self.shown(Place(node.level, node.path, node.definition, None, node.depth))
-        if isinstance(node, Listing):
-            return Listing(node.level, self._as_shown(node.element))
-        return (
-            Narrowed(node.limit, self._as_shown(node.node)) if isinstance(node, Narrowed) else node
-        )
+        if not isinstance(node, Message):
+            return node
+        return self.shown(Place(node.level, node.path, node.definition, None, node.depth))
 
     def _array(self, place: Place) -> Node:
         level, path, kind, length, depth = place
@@ -573,18 +569,23 @@ def _picked(node: Listing | Items, index: int) -> Node:
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
 
 
+def _changed(node: Node, change: Callable[[Node], Node]) -> Node:
+    """Returns a node with what it stands for changed: of a list its elements."""
+    if isinstance(node, Listing):
+        return Listing(node.level, _changed(node.element, change))
+    if isinstance(node, Narrowed):
+        return Narrowed(node.limit, _changed(node.node, change))
+    return change(node)
+
+
 def _as_numbers(node: Node) -> Node:
     """Returns what was found by its full path: a quaternion then stays x, y, z, w."""
-    if isinstance(node, Listing):
-        return Listing(node.level, _as_numbers(node.element))
-    if isinstance(node, Narrowed):
-        return Narrowed(node.limit, _as_numbers(node.node))
-    if isinstance(node, Group) and node.turned is not None:
-        message = node.turned
-        return Group(
-            {name: _real(message.level, f"{message.path}.{name}".lstrip(".")) for name in "xyzw"}
-        )
-    return node
+    if not isinstance(node, Group) or node.turned is None:
+        return node
+    message = node.turned
+    return Group(
+        {name: _real(message.level, f"{message.path}.{name}".lstrip(".")) for name in "xyzw"}
+    )
 
 
 def _real(level: Level, source: str) -> Leaf:

@@ -194,7 +194,7 @@ def _entry(value: Node, type_name: str) -> tuple[Leaf, ...]:
 
 
 def _child(node: Node, name: str) -> Node | None:
-    return dict(children(node)).get(name) if is_object(node) else None
+    return node.child(name) if is_object(node) else None
 
 
 def _charge(value: Node) -> Iterator[Leaf]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from ros2_memory.columns.plan import fields_at
 from ros2_memory.storage.base import Definition
 
 MOST_RELATIVE: Final = 1e-6
@@ -112,13 +113,12 @@ def step_of(path: str, definition: Definition | None = None) -> Step:
 
 def _type_at(path: str, definition: Definition | None) -> str:
     """The type of the message at a path; empty where it is not known."""
-    for name in path.split(".") if path else ():
-        if definition is None:
-            break
-        fields = {field.name: field.kind for field in definition.fields}
-        kind = fields.get(name)
-        definition = kind if isinstance(kind, Definition) else None
-    return definition.type if definition is not None else ""
+    names = path.split(".") if path else []
+    found = fields_at(definition, names)
+    if len(found) < len(names):
+        return ""
+    kind = found[-1].kind if found else definition
+    return kind.type if isinstance(kind, Definition) else ""
 
 
 def _axis(name: str, owner: str, field: str) -> Step:

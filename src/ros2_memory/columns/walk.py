@@ -240,20 +240,13 @@ class _Walk:
         most, total = int(counts.max(initial=0)), int(counts.sum())
         if most > _MANY and total < _FEW_ROWS * most:
             raise NotWalkedError
-        first = np.cumsum(counts) - counts
+        first, end = np.cumsum(counts) - counts, at.copy()
         begins = np.zeros(total, np.int64)
-        end = at
         for nth in range(most):
             left = np.flatnonzero(counts > nth)
-            is_all = left.size == counts.size
-            here = _aligned(end if is_all else end[left], plan.align)
-            begins[first + nth if is_all else first[left] + nth] = here
-            behind = self.read(plan, rows if is_all else rows.of(left), here, None)
-            if is_all:
-                end = behind
-            else:
-                end = end.copy()
-                end[left] = behind
+            here = _aligned(end[left], plan.align)
+            begins[first[left] + nth] = here
+            end[left] = self.read(plan, rows.of(left), here, None)
         return begins, end
 
 

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pytest
 
-from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.columns import decode
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.table import Table, Texts
@@ -358,13 +356,3 @@ def test_a_bag_that_is_gone_has_vanished_when_it_is_asked_for(tmp_path: Path) ->
     groups = groups_of(tmp_path / "gone.mcap")
     with pytest.raises(BagVanishedError):
         next(groups)
-
-
-def test_messages_that_count_elsewhere_have_no_row(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a" / "a_0.mcap", mixed(12))
-    end = Overlap(log_from=None, log_until=None, files=("a_0.mcap",))
-    write_handover(tmp_path / "a", Handover(next="b", counts_until=60, end=end))
-    reader = BagDirReader(McapReader())
-    tables = tables_of(reader, path)
-    assert compared(reader, path, tables).wrong == []
-    assert {int(table.log_times.max()) // 10 for table in tables} == {5}

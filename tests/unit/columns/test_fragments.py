@@ -26,6 +26,7 @@ from ros2_memory.history.view import View
 from ros2_memory.storage.cache import ByteLru
 from tests.support.bags import odom, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, store_file
+from tests.support.examples import examples
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -104,7 +105,7 @@ wholes = st.builds(
 )
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(60), suppress_health_check=[HealthCheck.too_slow])
 @given(wholes)
 def test_a_fragment_is_the_same_once_it_was_stored(whole: Whole) -> None:
     classes = (Whole, Words)
@@ -236,12 +237,12 @@ def test_of_a_long_backlog_no_fragment_is_dropped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Though it is of more than may wait to be written."""
-    for number in range(24):
+    for number in range(12):
         start = T0 + number * 1800 * S
         poses = [odom(start + n * 60 * S, number + n / 300, 0.1 * (n % 7)) for n in range(30)]
         write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", poses)
     stored = []
-    for most in (40, 10_000):
+    for most in (20, 10_000):
         monkeypatch.setattr("ros2_memory.columns.fragments._MOST_WAITING", most)
         file = tmp_path / f"with_{most}.sqlite"
         World.of(tmp_path, file=file).fill()
@@ -249,4 +250,4 @@ def test_of_a_long_backlog_no_fragment_is_dropped(
             stored.append({*base.execute("SELECT kind, start_ns FROM fragment")})
     few, many = stored
     assert few == many
-    assert len(many) > 10 * 40
+    assert len(many) > 5 * 20
