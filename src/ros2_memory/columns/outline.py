@@ -152,7 +152,8 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
     if not is_finite.all():
         column, times = column[is_finite], times[is_finite]
     numbers = cast("Floats", column if error == 0.0 else column.astype(np.float64, copy=False))
-    total = float(numbers.sum(dtype=np.float64))
+    with np.errstate(over="ignore", invalid="ignore"):  # not finite where no float holds it
+        total = float(numbers.sum(dtype=np.float64))
     if error == 0.0:
         ends = [int(times[nth]) for nth in (numbers.argmin(), numbers.argmax())]
         return Totals(len(numbers), total, (ends[0],) * 2, (ends[1],) * 2)

@@ -36,6 +36,8 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Definition, IntArray
 
 _LARGEST: Final = sys.float_info.max
+SUM_SCALE: Final = 2.0**-64
+"""What sums are scaled by: those of the largest floats are finite then, and no digit is lost."""
 _SUMMARY: Final = frozenset({"bytes", "numbers"})
 """The keys of a summary in place of numbers that are too many to show."""
 LEAST: Final = 1
@@ -80,7 +82,7 @@ class Part(NamedTuple):
         first: log time of the first of the messages.
         last: of the last.
         size: how many numbers.
-        total: their sum.
+        total: their sum, times `SUM_SCALE`.
         least: the least of them.
         greatest: the greatest, as the least one of their negatives.
     """
@@ -204,7 +206,8 @@ class PieceNumbers:
         if len(known) < len(every):
             return False
         for field, (totals, ends) in enumerate(known):
-            part = Part(rows.first, rows.last, totals.size, totals.total, *ends)
+            total = totals.total * SUM_SCALE
+            part = Part(rows.first, rows.last, totals.size, total, *ends)
             self._parts[field, piece].append(part)
         return True
 
@@ -220,7 +223,7 @@ class PieceNumbers:
         path, outline = self._columns[key], table.outline()
         totals = None if path is None or outline is None else outline.totals(path)
         zone = None if path is None or totals is None else table.zone(path)
-        if totals is None or zone is None:
+        if totals is None or zone is None or not math.isfinite(totals.total):
             return None
         least = Extreme(zone.low, zone.low, *totals.least)
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
@@ -252,7 +255,7 @@ class PieceNumbers:
                 begin, end = np.searchsorted(found.rows, [start, stop]).tolist()
                 if begin == end:
                     continue
-                total = float(found.numbers[begin:end].sum(dtype=np.float64))
+                total = float((found.numbers[begin:end] * SUM_SCALE).sum())
                 ends = [_extreme(rows, found, (begin, end), sign) for sign in (LEAST, GREATEST)]
                 known = self._ends(rows, field) if rows.index is None else None
                 if known is not None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
-from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers
+from ros2_memory.counts.column_numbers import GREATEST, LEAST, SUM_SCALE, PieceNumbers
 from ros2_memory.counts.values import count_values
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
@@ -110,15 +110,11 @@ def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | Non
     greatest = found.extreme(field, pieces, GREATEST)
     if least is None or greatest is None:
         return None
-    mean = _mean(math.fsum(part.total for part in parts), sum(part.size for part in parts))
-    # The extremes are exact; what columns add up to is not.
+    total = math.fsum(part.total for part in parts)
+    mean = float(f"{total / sum(part.size for part in parts) / SUM_SCALE:.{_MEAN_DIGITS}g}")
+    # The extremes are exact; what columns add up to is not. Plus 0.0: no reply says -0.0.
     mean = min(max(mean, least[0]), greatest[0]) + 0.0
     return least[0] + 0.0, least[1], greatest[0] + 0.0, greatest[1], mean
-
-
-def _mean(total: float, count: int) -> float:
-    # Plus 0.0: no reply says -0.0.
-    return float(f"{total / count:.{_MEAN_DIGITS}g}") + 0.0
 
 
 def _note_failures(view: View, failures: Sequence[UndecodableError]) -> None:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.analysis.conditions import Condition
-    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
 
@@ -108,14 +108,6 @@ def count_values(
     )
 
 
-def _value_of(held: Held) -> JsonValue:
-    """Returns a value as conditions take it; where a message has a single field, that of it."""
-    value: JsonValue = json.loads(held.word)
-    if isinstance(value, dict) and len(value) == 1:
-        [value] = value.values()
-    return value
-
-
 def _tallied(
     view: View,
     held: Sequence[Held],
@@ -127,7 +119,7 @@ def _tallied(
     elapsed = elapsed_in(view, asked)
     for each in held:
         if each.word not in found:
-            counts = condition is None or condition.matches({"value": _value_of(each)})
+            counts = condition is None or condition.matches({"value": each.exact})
             found[each.word] = (
                 None
                 if each.is_blank or not counts

@@ -53,12 +53,17 @@ class Held(NamedTuple):
     ended: bool
 
     @property
-    def value(self) -> JsonValue:
-        """The value, as replies round it; of a message that has one part alone, that."""
+    def exact(self) -> JsonValue:
+        """The value; of a message that has one part alone, that."""
         value: JsonValue = json.loads(self.word)
         if isinstance(value, dict) and len(value) == 1:
             [value] = value.values()
-        return round_real(value) if isinstance(value, float) else value
+        return value
+
+    @property
+    def value(self) -> JsonValue:
+        """The same as replies round it: NaN and infinity are None."""
+        return round_real(exact) if isinstance(exact := self.exact, float) else exact
 
     @property
     def is_blank(self) -> bool:
@@ -107,7 +112,7 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            found = Held(self._word(message, newest.type), 0, 0, ended=True).value
+            found = Held(self._word(message, newest.type), 0, 0, ended=True).exact
             if isinstance(found, list | dict | None):
                 of = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(

@@ -33,7 +33,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.view import View, ns_argument, open_view
-from ros2_memory.insights.goals import GOAL_WORDS, action_of
+from ros2_memory.insights.goals import GOAL_WORDS, action_of, last_listed
 from ros2_memory.insights.topic_events import (
     events_in,
     events_of_messages,
@@ -182,7 +182,7 @@ def changes_in(
     return ChangesBefore(
         changes,
         tuple(looked_at),
-        tuple(_state(joined)),
+        tuple(_state(view, window, joined)),
         joined,
     )
 
@@ -306,7 +306,9 @@ def _is_active(action: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
     return nth >= 0 and action[nth][1]
 
 
-def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]]:
+def _state(
+    view: View, window: TimeWindow, joined: Mapping[str, TopicEvents]
+) -> Iterator[tuple[str, bool | str]]:
     """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end."""
     for topic, events in joined.items():
         is_battery = any(each.kind == CHARGE for each in events.known)
@@ -315,7 +317,10 @@ def _state(joined: Mapping[str, TopicEvents]) -> Iterator[tuple[str, bool | str]
         goals, _ = events.of_kind(GOAL)
         if goals:
             newest = max(goals, key=lambda each: each.at)
-            yield f"{action_of(topic)} goal", GOAL_WORDS.get(newest.last, "active")
+            word = GOAL_WORDS.get(newest.last, "active")
+            if newest.last in _ACTIVE_GOAL and last_listed(view, topic, window, {newest.name}):
+                word = "listed no more"  # its server has restarted
+            yield f"{action_of(topic)} goal", word
         for status in events.of_kind(STATUS)[0]:
             if status.last:
                 word = _LEVELS[status.last] if 0 < status.last < len(_LEVELS) else str(status.last)

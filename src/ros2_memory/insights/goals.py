@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.analysis.facts import GOAL, GOALS
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.insights.topic_events import events_in, events_of_messages, note_limits
 
@@ -39,9 +40,10 @@ _FAILED: Final = "failed"
 class GoalRun(NamedTuple):
     """A goal: when it was accepted and when it ended, as log times, and its last status.
 
-    `accepted` is None for a goal that was active before the window, `ended` for one that is active
-    at its end. `first` and `last` are the log times between which it is known (inclusive); `goal`
-    is its id in hexadecimal digits.
+    `accepted` is None for a goal that was active before the window, `ended` for one that no message
+    says to have ended. `first` and `last` are the log times between which it is known (inclusive);
+    `goal` is its id in hexadecimal digits. `is_lost`: its server went on without it, as after a
+    restart, and listed it at `last` for the last time.
     """
 
     topic: str
@@ -51,6 +53,7 @@ class GoalRun(NamedTuple):
     status: int
     first: Ns
     last: Ns
+    is_lost: bool = False
 
     @property
     def action(self) -> str:
@@ -88,7 +91,32 @@ def goals_in(
         earlier = None if before is None else events_of_messages(view, [before])
         listed = [] if earlier is None else earlier.of_kind(GOAL)[0]
         old = {goal.name: goal.last for goal in listed}
-        yield from _goals(topic, found, old)
+        goals = [*_goals(topic, found, old)]
+        lost = last_listed(view, topic, window, {each.goal for each in goals if each.ended is None})
+        for each in goals:
+            last = lost.get(each.goal)
+            yield each if last is None else each._replace(last=last, is_lost=True)
+
+
+def last_listed(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
+    """Returns those of some active goals that a window's newest message does not list.
+
+    Each with the log time of the last message that lists it: a server lists what has not ended for
+    as long as it runs.
+    """
+    found: dict[str, Ns] = {}
+    left = set(active)
+    newest = view.stream.messages([topic], window, newest_first=True) if left else iter(())
+    for nth, message in enumerate(newest):
+        events = events_of_messages(view, [message])
+        if events is None or events.beyond or events.undecodable:
+            break  # what it lists is not known
+        listed = {goal.name for goal in events.of_kind(GOAL)[0]} & left
+        left -= listed
+        found |= dict.fromkeys(listed if nth else (), message.time)
+        if not left:
+            break
+    return found
 
 
 def goals_asked(
@@ -125,7 +153,13 @@ def goals_asked(
             note_limits(view, topic, events)
     goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
     goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
-    return [each for each in goals if scope.holds_at(each.last)]
+    goals = [each for each in goals if scope.holds_at(each.last)]
+    if lost := sum(each.is_lost for each in goals):
+        view.notes.add(
+            f"{counted(lost, 'goal')} whose end was not published, and which the action server "
+            "listed no more: last is when it did"
+        )
+    return goals
 
 
 def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:

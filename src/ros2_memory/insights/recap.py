@@ -406,9 +406,16 @@ def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     """Returns a goal from when it was accepted; one from before the window, from when it ended."""
     kind = "failed goal" if goal.outcome in FAILURES else "goal"
     if goal.accepted is None:
-        text = f"{goal.action} goal {goal.outcome or 'active'}, accepted before"
-        at = start if goal.ended is None else goal.ended
-        return Event(kind, at, None, text, goes_on=goal.ended is None)
+        state = "last heard of" if goal.is_lost else goal.outcome or "active"
+        at = goal.last if goal.is_lost or goal.ended is not None else start
+        goes_on = goal.ended is None and not goal.is_lost
+        return Event(
+            kind, at, None, f"{goal.action} goal {state}, accepted before", goes_on=goes_on
+        )
+    if goal.is_lost:
+        after = f"after {seconds(elapsed.between(goal.accepted, goal.last))}"
+        text = f"{goal.action} goal last heard of {after}, and listed no more by its server"
+        return Event(kind, goal.accepted, goal.last, text)
     if goal.ended is None:
         return Event(kind, goal.accepted, None, f"{goal.action} goal accepted", goes_on=True)
     after = f"after {seconds(elapsed.between(goal.accepted, goal.ended))}"

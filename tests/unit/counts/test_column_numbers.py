@@ -224,3 +224,21 @@ def test_a_condition_that_runs_out_of_time_has_no_rows_for_what_was_not_searched
             sinces.add(since)
     assert BEGIN in sinces
     assert len(sinces) > 3
+
+
+@pytest.mark.parametrize(
+    ("positions", "mean"),
+    [
+        ([1.7e308] * 3, 1.7e308),
+        ([1.7e308, 1.7e308, -1.7e308, -1.7e308], 0.0),
+        ([1.7e308, 1.7e308, -1.7e308, 1.7e308], 8.5e307),
+    ],
+)
+@pytest.mark.parametrize("recalls", [False, True])
+def test_numbers_of_which_no_float_holds_the_sum_have_a_mean(
+    tmp_path: Path, positions: list[float], mean: float, recalls: bool
+) -> None:
+    write(tmp_path, [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)], split=3)
+    memory = memory_of(tmp_path, limits=LATEST, recalls=recalls)
+    answer = count_range(memory, Call(), "/odom", span(), "day", fields=["position.x"])
+    assert cells(answer, "position.x.mean") == [mean] * 2

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, detections, make, typestore, write_mcap
+from tests.support.bags import Msg, battery, detections, make, typestore, write_mcap
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
@@ -64,3 +65,17 @@ def test_what_two_topics_show_at_once_lasts_once(tmp_path: Path) -> None:
     condition = {"condition_type": "contains", "value": "person"}
     found = counted(tmp_path, messages, "/cam*/objects", **condition)
     assert 99 <= found["seconds"] <= found["recorded_s"] + 1
+
+
+def test_a_number_that_is_none_at_last_is_a_value_like_others(tmp_path: Path) -> None:
+    charges = [0.5, 0.5, math.nan, 0.7, 0.7, math.nan]
+    messages = [battery((T + n) * NS_PER_S, charge) for n, charge in enumerate(charges)]
+    condition = {"condition_type": "above", "value": 0.1, "field": "percentage", "by": "value"}
+    found = counted(tmp_path, messages, "/battery_state", **condition)
+    assert (found["count"], found["seconds"]) == (2, 4.0)
+    window = {"topic": "/battery_state", "fields": ["percentage"], "start": T, "end": T + 9}
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
+    assert [change["value"] for change in reply["changes"]] == [0.5, None, 0.7, None]
+    reply = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
+    assert {row[0]: row[1] for row in reply["rows"]} == {"0.5": 1, "0.7": 1, "null": 2}

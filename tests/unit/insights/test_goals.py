@@ -207,3 +207,25 @@ def test_however_the_history_is_cut_the_same_is_told(
         (f"/drive goal {status} after {end - begin:g} s", begin, end)
         for _, status, begin, end, _ in reversed(searched)
     ] == expected
+
+
+def test_a_goal_that_its_server_lost_is_known_until_it_was_listed_last(tmp_path: Path) -> None:
+    lost = history((10, {1: 2}), (15, {1: 2}), (30, {2: 2}), (35, {2: 4}), (40, {2: 4, 3: 2}))
+    assert told(tmp_path, lost, 0, 50, cut=2, recalls=False) == [
+        ("goal", "/drive goal last heard of after 5 s, and listed no more by its server", 10, 15)
+        + (False,),
+        ("goal", "/drive goal succeeded after 5 s", 30, 35, False),
+        ("goal", "/drive goal accepted", 40, None, True),
+    ]
+    memory = memory_of(tmp_path)
+    assert found_in(memory, "equals", "executing") == [
+        (3, "executing", 40, 40, True),
+        (1, "executing", 10, 15, True),
+    ]
+    asked = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
+    reply = json.loads(replied(memory, tmp_path, "find_matches", asked).text)
+    assert any("1 goal whose end was not published" in note for note in reply["notes"])
+    # Of the newest goal alone the state is told; here the server listed none at the end.
+    write_mcap(tmp_path / "rec" / "rec_9.mcap", history((60, {3: 4})))
+    given = {"start": BEGIN / S + 58, "end": BEGIN / S + 61}
+    assert "listed no more" not in replied(memory_of(tmp_path), tmp_path, "recap", given).text
