@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import re
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -218,80 +218,61 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
     )
 
 
-class Candidate(NamedTuple):
-    """A time at which messages may match, and the topics that these are of."""
-
-    window: TimeWindow
-    topics: tuple[str, ...]
-
-
 class CandidateRows:
     """Finds the times of messages that may meet a condition, before a moment.
 
     Attributes:
-        condition: what is searched for.
         ruled_out: whether a message was left out, because its columns do not meet the condition.
         has_looked: whether any message was looked at.
     """
 
     def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
-        self.condition = condition
         self.ruled_out = False
         self.has_looked = False
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
-        self._ready: list[tuple[Ns, int]] = []
+        self._ready: list[tuple[Ns, str]] = []
+        self._group: list[tuple[Ns, str]] = []
         self._view = view
-        self._topics = topics
         self._until = until
         self._test = ColumnCondition(condition, view.extractor)
 
-    def windows(self) -> Iterator[Candidate]:
-        """Yields the times at which a match can lie, newest first; they do not overlap."""
-        group: list[tuple[Ns, str]] = []
+    def windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+        """Yields the times at which a match can lie, newest first, and of which topics it would be.
+
+        They do not overlap.
+        """
         most = 1
-        for time, topic in self._times():
+        for time, topic in chain(self._times(), [(MIN_NS - 1, "")]):
+            group = self._group
             if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
-                yield _together(group)
+                window = TimeWindow(group[-1][0], group[0][0] + 1)
+                yield window, sorted({each for _, each in group})
                 # The first that may match mostly does; where many do not, more are read at once.
-                most, group = min(2 * most, _MOST_TOGETHER), []
-            group.append((time, topic))
-        if group:
-            yield _together(group)
+                most, self._group = min(2 * most, _MOST_TOGETHER), []
+            self._group.append((time, topic))
 
     @property
     def reached(self) -> Ns:
-        """The log time from which on all has been looked at, and what may match was yielded."""
-        waiting = [-time + 1 for time, _ in self._ready]
+        """The log time from which on all has been looked at, and what may match was searched."""
+        waiting = [-time + 1 for time, _ in self._ready] + [time + 1 for time, _ in self._group]
         return max([*self._left.values(), *waiting], default=MIN_NS)
 
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
-        sources = [iter(self._of_topic(topic)) for topic in self._topics]
-        # What each topic may still yield is no newer than its next table.
-        waiting = [
-            (-last, nth, times)
-            for nth, source in enumerate(sources)
-            if (found := next(source, None)) is not None
-            for last, times in [found]
-        ]
-        heapq.heapify(waiting)
-        ready = self._ready
-        before: tuple[Ns, int] | None = None
-        while waiting or ready:
-            while waiting and (not ready or waiting[0][0] <= ready[0][0]):
-                _, nth, times = heapq.heappop(waiting)
-                for time in times.tolist():
-                    heapq.heappush(ready, (-time, nth))
-                if (found := next(sources[nth], None)) is not None:
-                    heapq.heappush(waiting, (-found[0], nth, found[1]))
-            if ready:
-                time, nth = heapq.heappop(ready)
-                if (time, nth) != before:
-                    yield -time, self._topics[nth]
-                before = time, nth
+        ready, before = self._ready, (MAX_NS, "")
+        tables = heapq.merge(*map(self._of_topic, self._left), key=lambda table: -table[0])
+        for last, topic, times in chain(tables, [(MIN_NS - 1, "", list[Ns]())]):
+            # What is left is no newer than the next table.
+            while ready and -ready[0][0] > last:
+                found = heapq.heappop(ready)
+                if found != before:
+                    yield -found[0], found[1]
+                before = found
+            for time in times:
+                heapq.heappush(ready, (-time, topic))
 
-    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, IntArray]]:
+    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, str, list[Ns]]]:
         """Yields for each table of a topic its last log time, and when messages may match."""
 
         def reached(last: Ns) -> None:
@@ -307,7 +288,9 @@ class CandidateRows:
             may_be_empty=True,
             reached=reached,
         ):
-            yield rows.last, self._candidates(rows)
+            found = self._candidates(rows)
+            reached(rows.last)
+            yield rows.last, topic, found.tolist()
         self._left[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:
@@ -327,17 +310,6 @@ class CandidateRows:
             may = may[rows.index]
         self.ruled_out |= not may.all()
         return rows.times[may]
-
-
-def _together(group: Sequence[tuple[Ns, str]]) -> Candidate:
-    topics = tuple(sorted({topic for _, topic in group}))
-    return Candidate(TimeWindow(group[-1][0], group[0][0] + 1), topics)
-
-
-class Searched(Protocol):
-    """What was searched; `ruled_out` says whether something in it was known to be no match."""
-
-    ruled_out: bool
 
 
 class ReverseSearch:
@@ -373,8 +345,8 @@ class ReverseSearch:
         candidates = CandidateRows(self._view, self.topics, self.condition, until)
         noted_before = self._view.notes.keys()
         try:
-            for part in candidates.windows():
-                messages = self._view.stream.messages(part.topics, part.window, newest_first=True)
+            for window, topics in candidates.windows():
+                messages = self._view.stream.messages(topics, window, newest_first=True)
                 for found in filter(self.matches, messages):
                     self._view.notes.retract_outside(
                         TimeWindow(found.time, MAX_NS), keep=noted_before
@@ -386,17 +358,20 @@ class ReverseSearch:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
-        self.close(candidates, TimeWindow(MIN_NS, until), found=False)
+        everything = TimeWindow(MIN_NS, until)
+        self.close(everything, found=False, ruled_out=candidates.ruled_out)
         return None
 
-    def close(self, candidates: Searched, window: TimeWindow, *, found: bool) -> None:
+    def close(self, window: TimeWindow, *, found: bool, ruled_out: bool) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
+
+        `ruled_out`: whether something in it was known to be no match, without being read.
 
         Raises:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
             NoDataError: nothing was found, since no message could be decoded.
         """
-        if not found and self._failures and not self._has_decoded and not candidates.ruled_out:
+        if not found and self._failures and not self._has_decoded and not ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self.note_undecodable()

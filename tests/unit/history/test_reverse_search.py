@@ -174,6 +174,18 @@ def test_a_search_that_got_nowhere_in_its_time_does_not_say_how_far(bag_dir: Pat
     assert "searched_back_to" not in Replies(bag_dir, 4000).error(caught.value).text
 
 
+def test_a_search_that_runs_out_of_time_has_searched_what_it_says(bag_dir: Path) -> None:
+    reached: set[int | None] = set()
+    for memory in (memory_of(bag_dir), filled(bag_dir)[0]):
+        for looks in range(1, 40):
+            call = Call(Deadline.after(looks + 0.5, partial(next, map(float, itertools.count()))))
+            try:
+                assert at(last(memory, "contains", "chair", topic="/*", call=call)) == 31
+            except QueryTimeoutError as error:
+                reached.add(error.searched_back_to)
+    assert min(each for each in reached if each is not None) > T0 + 31 * NS_PER_S
+
+
 @pytest.mark.parametrize("tool", ["find_last_match", "find_matches"])
 def test_a_search_of_many_short_topics_reads_each_where_it_has_messages(
     tmp_path: Path, tool: str
