@@ -8,7 +8,6 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import partial
 from itertools import chain, combinations, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -54,14 +53,10 @@ _MAX_TREES: Final = 32
 """Recordings of which static transforms are compared, the newest."""
 _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
-_APART: Final[Key[dict[tuple[Path, Path], tuple[Overlapping, str | None]]]] = Key()
-"""Of a memory: by two recordings, how they overlapped, and the topic on which they differed."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: the parent of each static frame of a recording that is closed."""
-_MAKERS: Final[Key[list[tuple[str, Sequence[BagFile]]]]] = Key()
-"""Of a timeline: the recordings of which frames are compared."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
@@ -108,23 +103,16 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     recordings ran, show no second robot. A few messages are read once of each of the first pairs.
     """
     view = View(memory, call)  # notes on what is read here are of no answer
-    known = memory.memo.of(_APART, dict)
     found: list[Mixed] = []
-    bags: Mapping[str, Sequence[BagFile]] | None = None
-    steps = _steps_back(view)
-    for pair in overlapping_recordings(view.snapshot, memory.index.joined_with):
-        key = (pair.first, pair.second)
-        before, topic = known.get(key, (None, None))
+    pairs = overlapping_recordings(view.snapshot, memory.index.joined_with)
+    bags, steps = recordings_of(view.snapshot) if pairs else {}, _steps_back(view)
+    for pair in pairs:
         by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
-        # A bag that is being copied grows.
-        if before != pair and not by_clock and len(found) < _MAX_PAIRS:
-            bags = bags or recordings_of(view.snapshot)
-            try:
-                topic = _differing_topic(view, pair, bags)
-            except QueryTimeoutError:
-                break
-            known[key] = pair, topic
-        found.append(Mixed(pair, topic))
+        is_compared = not by_clock and len(found) < _MAX_PAIRS
+        try:
+            found.append(Mixed(pair, _differing_topic(view, pair, bags) if is_compared else None))
+        except QueryTimeoutError:
+            break
     return tuple(found)
 
 
@@ -137,8 +125,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     view = View(memory, call)
     known = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    makers = view.timeline.memo.of(_MAKERS, partial(_of_different_makers, view))
-    for path, bags in makers:
+    for path, bags in _of_different_makers(view):
         try:
             parents = known[path] if path in known else _static_parents(view, bags)
         except QueryTimeoutError:
