@@ -18,15 +18,13 @@ from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
+from ros2_memory.analysis.intervals import IntervalPart, joined, united
 from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.counts.bins import BinnedWindow, By
-from ros2_memory.counts.labels import ANY_LABEL, BY_LABEL, count_labels
-from ros2_memory.counts.time_bins import TrueIntervals
-from ros2_memory.counts.values import count_values
+from ros2_memory.counts.bins import BinnedWindow, By, TrueIntervals
+from ros2_memory.counts.held import ANY_LABEL, BY_LABEL, count_labels, count_values
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import reached
 from ros2_memory.history.held_values import held_at, held_until
@@ -208,19 +206,19 @@ def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueInter
     if not any(part.visible.labels for part in parts):
         return None
     of_labels = [
-        IntervalPart(part.first, part.last, _of_labels(part.visible, condition))
+        IntervalPart(
+            part.first,
+            part.last,
+            part.visible.without(
+                [label for label in part.visible.labels if not condition.test.matches(label)]
+            ),
+        )
         for part in parts
         if part.first <= part.last
     ]
     # Each label's first: only of one label it is known whether a message lay between.
     seen = united([joined(of_labels).visible.under_one_label("")]).intervals()
     return TrueIntervals.of([(each.first, each.last, True) for each in seen])
-
-
-def _of_labels(visible: IntervalTable, condition: Condition) -> IntervalTable:
-    """Returns the intervals of all labels that meet a condition."""
-    others = [label for label in visible.labels if not condition.test.matches(label)]
-    return visible.without(others)
 
 
 def _flag_held(

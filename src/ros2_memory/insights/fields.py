@@ -10,7 +10,7 @@ import numpy as np
 from ros2_memory.core.errors import NoDataError, NoDataReason, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import listed
-from ros2_memory.counts.column_numbers import GREATEST, LEAST, PieceNumbers, TooManyError
+from ros2_memory.counts.numbers import GREATEST, LEAST, PieceNumbers, TooManyError
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.view import View, open_view
 from ros2_memory.results import Extremes, TypeFields

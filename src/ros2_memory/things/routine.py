@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.counts.time_bins import Offset, local_offset
+from ros2_memory.counts.bins import Offset, local_offset
 from ros2_memory.results import UsualPlace
 
 if TYPE_CHECKING:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ros2_memory.counts.matches import count_matches
-from ros2_memory.counts.stays import count_visits
+from ros2_memory.counts.robot import count_visits
 from ros2_memory.insights.compare import compare
 from ros2_memory.insights.fields import describe_type
 from ros2_memory.insights.recap import recap_or_before

@@ -13,7 +13,7 @@ from ros2_memory import queries, results
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
 from ros2_memory.counts.numbers import count_range
-from ros2_memory.counts.path import count_path
+from ros2_memory.counts.robot import count_path
 from ros2_memory.insights.at_each import at_each
 from ros2_memory.insights.episodes import topic_changes
 from ros2_memory.places.driven_inside import driven_inside

@@ -16,7 +16,7 @@ from ros2_memory.columns.numbers import numbers
 from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values, seconds
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
-from ros2_memory.counts.column_numbers import numbers_in
+from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, euler_of
 from tests.support.bags import make

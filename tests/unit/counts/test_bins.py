@@ -12,7 +12,7 @@ import pytest
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
-from ros2_memory.counts.path import count_path
+from ros2_memory.counts.robot import count_path
 from ros2_memory.history import driven_path
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange

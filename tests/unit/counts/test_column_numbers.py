@@ -20,7 +20,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.counts.matches import count_matches
 from ros2_memory.counts.numbers import count_range
-from ros2_memory.counts.stays import count_visits
+from ros2_memory.counts.robot import count_visits
 from ros2_memory.history.bag_access import BagAccess
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange

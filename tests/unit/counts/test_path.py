@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.counts.path import count_path
+from ros2_memory.counts.robot import count_path
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from tests.support.bags import odom, write_mcap

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.counts.time_bins import (
+from ros2_memory.counts.bins import (
     MOST_BINS,
     MOST_DAYS,
     ClockBin,

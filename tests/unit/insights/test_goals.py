@@ -211,9 +211,9 @@ def test_however_the_history_is_cut_the_same_is_told(
 
 def test_a_goal_that_its_server_lost_is_known_until_it_was_listed_last(tmp_path: Path) -> None:
     lost = history((10, {1: 2}), (15, {1: 2}), (30, {2: 2}), (35, {2: 4}), (40, {2: 4, 3: 2}))
+    no_more = "listed no more by its server"
     assert told(tmp_path, lost, 0, 50, cut=2, recalls=False) == [
-        ("goal", "/drive goal last heard of after 5 s, and listed no more by its server", 10, 15)
-        + (False,),
+        ("goal", f"/drive goal last heard of after 5 s, and {no_more}", 10, 15, False),
         ("goal", "/drive goal succeeded after 5 s", 30, 35, False),
         ("goal", "/drive goal accepted", 40, None, True),
     ]

@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, rounded
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
-from ros2_memory.counts.column_numbers import Part, PieceNumbers
+from ros2_memory.counts.numbers import Part, PieceNumbers
 from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,

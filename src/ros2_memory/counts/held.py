@@ -1,14 +1,16 @@
-"""What was seen: for each label of detections how often, how long, when first and last.
+"""What a window held, in a row for each: labels of detections by label, values of a topic by value.
 
-A thing is in view as in a recap: it may be missed for `FLICKER_NS`, and is gone after `SILENCE_NS`
-without a message of the topic.
+A label has how often, how long, when first and last it was seen, as in a recap: a thing may be
+missed for `FLICKER_NS`, and is gone after `SILENCE_NS` without a message of the topic. A value has
+how often and how long the topic held it.
 """
 
 from __future__ import annotations
 
 import heapq
+import json
 from collections import Counter, defaultdict
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -24,13 +26,14 @@ from ros2_memory.analysis.intervals import (
 )
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.spans import united as united_spans
-from ros2_memory.core.text import listed, named
+from ros2_memory.core.text import Quoted, counted, listed, named, shortened
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
-from ros2_memory.history.no_data import matching_topics, seconds
-from ros2_memory.history.robots import note_robots_on
+from ros2_memory.history.held_values import Held, HeldValues
+from ros2_memory.history.no_data import matching_topics, no_data_between, seconds
+from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import blocks, scan
 from ros2_memory.results import BinColumn, Bins
 
@@ -39,9 +42,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.model import JsonValue, TimeWindow
-    from ros2_memory.core.timebase import Deadline, Ns
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
+
 
 BY_LABEL: Final = "label"
 ANY_LABEL: Final = ""
@@ -169,7 +173,8 @@ class _Seen:
                 for block in heapq.merge(*sources, key=lambda block: -block.last):
                     parts[block.topic].append(self._counted(block, wanted))
                     reached = block.first if len(topics) == 1 else block.last
-                    _check(reading)
+                    if reading.expired():
+                        raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
                 self._take(parts)
         except QueryTimeoutError:
             if reached is None:
@@ -202,11 +207,6 @@ class _Seen:
             self.most_of_all = max(self.most_of_all, int(np.bincount(rows).max()))
         visible = visible_in(times, rows, codes, found.scores[counts], labels)
         return IntervalPart(block.first, block.last, visible)
-
-
-def _check(reading: Deadline) -> None:
-    if reading.expired():
-        raise QueryTimeoutError("the rest is left out")
 
 
 def _blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Block]:
@@ -258,3 +258,119 @@ def _whole(seen: _Seen, table: IntervalTable, elapsed: Elapsed) -> tuple[float |
         max((each.best for each in every if each.best is not None), default=None),
         seen.most_of_all,
     )
+
+
+_MOST_VALUES: Final = 100
+_LONGEST_VALUE: Final = 120
+
+
+@dataclass(slots=True)
+class _Tally:
+    """How often and how long (ns) a value held, when it first began, and when it last ended."""
+
+    name: str
+    count: int
+    length: Ns
+    first: Ns
+    last: Ns
+
+
+def count_values(
+    view: View,
+    topic: str,
+    asked: TimeWindow,
+    *,
+    fields: Sequence[str] = (),
+    condition: Condition | None = None,
+) -> Bins:
+    """Returns a row for each value that held at some time of a window, that of the longest first.
+
+    What lies outside of the window counts to no length. An empty text is no value.
+
+    Args:
+        view: the call's.
+        topic: its name.
+        asked: the window.
+        fields: the field of the messages that is meant, if it is not all that they have.
+        condition: what values have to meet, if there is one.
+
+    Raises:
+        InvalidArgumentsError: more than one field is named, or there is no single value.
+        NoDataError: the topic said nothing in the window.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    if len(fields) > 1:
+        raise InvalidArgumentsError("by value counts one field: name one in fields")
+    values = HeldValues(view, topic, *fields, asked="by value")
+    start, end = asked.asked()
+    first, last = recorded_reach(view.snapshot, asked) or (start, end)
+    start, stop = max(start, first), min(end, last) + 1
+    held: list[Held] = []
+    try:
+        held += values.during(start, stop)
+    except QueryTimeoutError as error:
+        # What is newer is known all the same.
+        held += values.known[::-1]
+        if not held:
+            raise
+        start = values.reached
+        view.notes.add_lack(f"{error}: only what is after {unix_text(start)} is counted")
+    if not held:
+        raise no_data_between(view, (topic,), asked)
+    tallies = _tallied(view, held, asked, (start, stop), condition)
+    rows = sorted(tallies, key=lambda each: (-each.length, each.first))
+    if len(rows) > _MOST_VALUES:
+        more = counted(len(rows) - _MOST_VALUES, "value")
+        view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")
+    note_unread(view, asked)
+    note_edges(view, asked)
+    note_robots(view, topic, asked)
+    return Bins(
+        by="value",
+        about=(topic,),
+        start=start,
+        end=stop - 1,
+        columns=(("count", "count"), ("seconds", "duration"), ("first", "time"), ("last", "time")),
+        rows=tuple(
+            (each.name, (each.count, each.length, each.first, each.last))
+            for each in rows[:_MOST_VALUES]
+        ),
+        all=(
+            sum(each.count for each in rows),
+            sum(each.length for each in rows),
+            min((each.first for each in rows), default=None),
+            max((each.last for each in rows), default=None),
+        ),
+        notes=view.notes.sentences(),
+    )
+
+
+def _tallied(
+    view: View,
+    held: Sequence[Held],
+    asked: TimeWindow,
+    window: tuple[Ns, Ns],
+    condition: Condition | None,
+) -> list[_Tally]:
+    found: dict[str, _Tally | None] = {}
+    elapsed = elapsed_in(view, asked)
+    for each in held:
+        if each.word not in found:
+            counts = condition is None or condition.matches({"value": each.exact})
+            found[each.word] = (
+                None
+                if each.is_blank or not counts
+                else _Tally(_name(each), 0, 0, each.start, each.stop)
+            )
+        tally = found[each.word]
+        if tally is not None:
+            tally.count += 1
+            tally.length += elapsed.between(max(each.start, window[0]), min(each.stop, window[1]))
+            tally.last = each.stop
+    return [each for each in found.values() if each is not None]
+
+
+def _name(held: Held) -> str:
+    value = held.value
+    name = value if isinstance(value, str) else json.dumps(value)
+    return Quoted(shortened(name, _LONGEST_VALUE))
