@@ -77,11 +77,6 @@ def test_the_limits_of_the_configuration_reach_the_questions(tmp_path: Path) -> 
     assert limits.split_duration_s == 20
 
 
-def test_a_memory_is_built_before_its_directory_exists(tmp_path: Path) -> None:
-    memory = build_memory(settings(tmp_path / "later"))
-    assert memory.index.snapshot().bags == ()
-
-
 @pytest.mark.parametrize(
     ("override", "key", "expected"),
     [

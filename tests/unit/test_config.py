@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from ros2_memory.config import NullRecorderNode, Settings, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.recorder.base import NullRecorder
-from tests.support.config_folders import MCAP, NONE, ROOT, ROS2BAG, ROSBAG2, refusal
+from tests.support.config_folders import MCAP, NONE, ROS2BAG, ROSBAG2, refusal
 from tests.support.examples import examples
 
 PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
@@ -25,115 +25,6 @@ PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
 
 
 class TestDefaults:
-    def test_are_those_of_the_specification(self) -> None:
-        settings = load_settings((), {})
-        assert dataclasses.asdict(settings) == {
-            "recording": {
-                "bag_dir": Path("data/bags"),
-                "split_duration_s": 10,
-                "session_duration_s": 600.0,
-                "queue_mb": 64,
-                "use_sim_time": False,
-                "clear_on_startup": False,
-                "topics_file": ROOT / "config/topics.yaml",
-                "keep_when": ROOT / "config/triggers.yaml",
-                "exclude_when": ROOT / "config/exclusions.yaml",
-                "required": (),
-            },
-            "data": {
-                "recording": None,
-                "max_array_length": 50,
-                "position_tolerance_m": 0.5,
-                "min_score": 0.0,
-                "labels_file": ROOT / "config/labels.yaml",
-                "time_tolerance_s": 0.1,
-                "pose_topic": "/odom",
-                "map_frame": "map",
-                "tf_topics": ("/tf",),
-                "tf_static_topics": ("/tf_static",),
-                "now": "wall",
-                "tf_clock": "auto",
-                "max_plausible_speed_mps": 10.0,
-                "latched_topics": {"include": (), "exclude": ()},
-                "places_file": ROOT / "config/places.yaml",
-            },
-            "reader": {
-                "index_refresh_s": 5.0,
-                "include_active": False,
-                "custom_msg_paths": (),
-                "chunk_cache_mb": 24,
-                "max_chunk_mb": 64,
-                "schemas_file": ROOT / "config/message_schemas.yaml",
-            },
-            "store": {"enabled": True, "max_share": 0.15, "max_gb": 2.0, "cache_mb": 64},
-            "retention": {
-                "max_total_gb": 5.0,
-                "max_age_h": 168.0,
-                "min_free_gb": 1.0,
-                "max_moments_gb": 1.0,
-                "foreign": "keep",
-                "require_shipped": False,
-                "topics": {},
-            },
-            "memory": {
-                "keep": False,
-                "texts": (),
-                "labels": (),
-                "people": (),
-                "max_share": 0.2,
-                "max_age_d": 400.0,
-            },
-            "server": {
-                "name": "episodic",
-                "transport": "stdio",
-                "host": "127.0.0.1",
-                "port": 9203,
-                "call_timeout_s": 25.0,
-                "max_reply_chars": 24000,
-                "tools": "all",
-                "write_tools": False,
-                "page": True,
-                "keep_questions": 0,
-                "metrics": False,
-                "traces": False,
-            },
-            "fleet": {"robots": {}, "places": None, "shared_map": False, "tokens": {}},
-            "lake": {
-                "engine": None,
-                "warehouse": None,
-                "catalog": "sql",
-                "uri": None,
-                "state_dir": None,
-                "properties": {},
-                "secrets_file": None,
-                "messages": (),
-                "commit_interval_s": 60.0,
-                "grace_h": 24.0,
-            },
-            "logging": {"level": "info", "format": "json", "arguments": True},
-            "storage": {
-                "target": MCAP,
-                "custom_msg_paths": (),
-                "cache_mb": 24,
-                "max_chunk_mb": 64,
-            },
-            "recorder": {
-                "target": ROS2BAG,
-                "bag_dir": Path("data/bags"),
-                "topics_file": ROOT / "config/topics.yaml",
-                "split_duration_s": 10,
-                "session_duration_s": 600.0,
-                "queue_mb": 64,
-                "use_sim_time": False,
-                "min_free_gb": 1.0,
-                "setup_files": (),
-                "latched_topics": ("/tf_static",),
-                "repeat_latched": (),
-                "required": (),
-                "chunk_bytes": 16384,
-            },
-        }
-
     def test_leave_no_trace_in_hydra_or_in_the_working_directory(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:

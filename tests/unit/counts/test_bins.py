@@ -40,7 +40,7 @@ def way(number: int) -> float:
 
 
 def driven() -> Iterator[Msg]:
-    """An evening and a night: the robot leaves its dock twice, drives, and sees a cup on its way."""
+    """An evening and a night: a robot leaves its dock twice, drives, and sees a cup on its way."""
     for number in range(HOURS * 3600 * S // EVERY):
         at = BEGIN + number * EVERY
         yield odom(at, way(number), 0.0)

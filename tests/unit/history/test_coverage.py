@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
-from ros2_memory.core.text import listed
 from ros2_memory.history.coverage import unread_spans
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
@@ -90,9 +89,3 @@ def test_what_is_reported_stays_short_however_much_was_lost(
     sentences = told(snapshot, *sorted(window), nothing=nothing)
     assert len(sentences) <= 5
     assert sum(map(len, sentences)) < 2000
-
-
-def test_a_list_names_a_few_and_counts_the_rest() -> None:
-    assert listed(["a", "b"]) == "a, b"
-    assert listed(["a", "b", "c", "d", "e"]) == "a, b, c and 2 more"
-    assert listed(["a", "b", "c"], 9) == "a, b, c and 6 more"

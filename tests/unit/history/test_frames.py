@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.frames import edges_of
-from ros2_memory.columns.transforms import pairs_in, stamped_between
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
@@ -89,18 +88,6 @@ def test_columns_hold_the_transforms_of_the_messages(tmp_path: Path, stored: boo
         rotation = np.concatenate([edge.rotation for edge in parts])
         assert translation == pytest.approx(whole.translation, abs=6e-5)
         assert rotation == pytest.approx(whole.rotation, abs=6e-5)
-
-
-def test_some_rows_of_a_table_have_their_own_pairs_and_stamps(tmp_path: Path) -> None:
-    made = world(tmp_path, [])
-    made.fill()
-    view = View(made.memory, Call())
-    [rows] = scan(view, "/tf", TimeWindow(T0 + 11 * S, T0 + 12 * S))
-    assert pairs_in(rows.table, rows.index) == frozenset({("odom", "base")})
-    assert pairs_in(rows.table) == frozenset({("map", "odom"), ("odom", "base")})
-    near = stamped_between(rows.table, None, T0 + 12 * S + 5, T0 + 12 * S + 5)
-    assert near is not None
-    assert near.tolist() == [12]
 
 
 @settings(max_examples=examples(15), deadline=None)

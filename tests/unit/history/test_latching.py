@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory import cli
 from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
@@ -194,20 +193,6 @@ def test_the_status_sees_telemetry_fall_silent_and_topics_tell_its_rate(tmp_path
     snapshot, latching = memory.index.snapshot(), memory.limits.latching
     assert usual_rate(snapshot, TELEMETRY, latching) == pytest.approx(100.0)
     assert usual_rate(snapshot, MAP, latching) is None
-
-
-def test_an_export_takes_along_what_is_latched_and_no_telemetry(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag_dir, out = tmp_path / "bags", tmp_path / "out.mcap"
-    telemetry = every(0.1, 7, TELEMETRY)
-    messages = [text(T0, "x", MAP), log_line(T0), *telemetry, *drive(T0, T0 + 60 * S)]
-    record(bag_dir / "rec", messages)
-    monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
-    start, end = str(T0 / S + 30), str(T0 / S + 40)
-    words = ["export", "--mcap", str(out), "--start", start, "--end", end, "--latched"]
-    assert cli.main([*words, "deployment=replay"]) == 0
-    assert {each.topic for each in McapReader().channels(out)} == {MAP, "/odom"}
 
 
 def test_a_value_of_another_time_says_that_it_is_latched(tmp_path: Path) -> None:

@@ -18,14 +18,13 @@ from ros2_memory.history.counting import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap
-from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, log_entry, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
 
 S = 10**9
@@ -167,38 +166,6 @@ def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part
         for bag in bags[:3]:
             bag.unlink()
             check()
-
-
-QUESTIONS: tuple[Callable[[Memory, Path], object], ...] = (
-    lambda memory, _: recap(memory, Call(), TimeRange(0.0, 1e5)),
-    lambda memory, _: find_matches(memory, Call(), TOPIC, "contains", "lost", limit=50),
-    lambda memory, _: find_matches(
-        memory, Call(), TOPIC, "contains", "blocked", limit=3, oldest_first=True
-    ),
-    lambda memory, root: asked(
-        memory,
-        root,
-        "find_matches",
-        topic=TOPIC,
-        condition="contains",
-        value="lost",
-        by="hour",
-        start=0,
-        end=1e5,
-    ),
-)
-
-
-@settings(max_examples=4, deadline=None)
-@given(seed=st.integers(0, 10**6))
-def test_questions_get_equal_answers_with_and_without_the_store(seed: int) -> None:
-    with TemporaryDirectory() as folder:
-        root = Path(folder)
-        write_recordings(root, random.Random(seed))
-        plain = memory_of(root, reader=McapReader())
-        recalled = with_store(plain, root)
-        for question in QUESTIONS:
-            assert question(plain, root) == question(recalled, root)
 
 
 def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_path: Path) -> None:

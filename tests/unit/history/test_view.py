@@ -10,9 +10,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.errors import BagError, QueryTimeoutError
+from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call
 from ros2_memory.history.counting import pick
 from ros2_memory.history.view import View
@@ -64,12 +63,6 @@ def test_a_copy_just_inside_a_window_whose_original_lies_outside_does_not_count(
     assert [each.time for each in view.stream.messages(["/odom"], window)] == [T0 + S]
 
 
-def test_payload_alone_makes_no_copy(tmp_path: Path) -> None:
-    recorded(tmp_path, "a", [boolean(T0 + n * S, True) for n in range(4)])
-    recorded(tmp_path, "b", [boolean(T0 + n * S + 10 * MS, True) for n in range(4)])
-    assert len(times(view_of(tmp_path), "/bumper")) == 8
-
-
 def test_a_bag_that_fails_is_named_and_the_others_still_answer(tmp_path: Path) -> None:
     broken = recorded(tmp_path, "a", [odom(T0, 0, 0)])
     recorded(tmp_path, "b", [odom(T0 + 60 * S, 1, 0)])
@@ -92,23 +85,6 @@ def test_a_bag_that_fails_is_named_and_the_others_still_answer(tmp_path: Path) -
     [note] = view.notes.sentences()
     assert note == "a/a_0.mcap could not be read to its end: the disk returned an error"
     assert not view.notes.complete
-
-
-def test_a_bag_deleted_under_a_question_is_named(tmp_path: Path) -> None:
-    gone = recorded(tmp_path, "a", [odom(T0, 0, 0)])
-    recorded(tmp_path, "b", [odom(T0 + 60 * S, 1, 0)])
-    view = view_of(tmp_path)
-    gone.unlink()
-    assert times(view, "/odom") == [T0 + 60 * S]
-    assert view.notes.sentences() == ("a/a_0.mcap was deleted before it could be read",)
-
-
-def test_a_question_past_its_deadline_gives_up(tmp_path: Path) -> None:
-    recorded(tmp_path, "a", [odom(T0, 0, 0)])
-    over = Deadline.after(0.0, monotonic=lambda: 5.0)
-    view = View(memory_of(tmp_path), Call(over))
-    with pytest.raises(QueryTimeoutError, match="shorter window"):
-        view.stream.newest("/odom", TimeWindow.everything())
 
 
 @st.composite
