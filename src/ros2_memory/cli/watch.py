@@ -32,7 +32,7 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.counting import count_messages
-from ros2_memory.history.coverage import was_cut
+from ros2_memory.history.coverage import cut_spans
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
@@ -192,7 +192,7 @@ def _rates(memory: Memory, snapshot: Snapshot, latest: Ns) -> Iterator[TopicRate
         last = max(totals.last for totals in timeline.totals(topic).values())
         usual = usual_rate(snapshot, topic, latching)
         since = TimeWindow(last + 1, latest + 1)
-        if timeline.is_log(topic) or was_cut(memory.index.bag_dir, topic, since):
+        if timeline.is_log(topic) or cut_spans(memory.index.bag_dir, topic, since):
             usual = None
         age_s = max(unix_from_ns(latest - last), 0.0)
         yield TopicRate(topic, int(count) / unix_from_ns(WINDOW_NS), usual, age_s)

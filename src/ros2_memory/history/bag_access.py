@@ -256,23 +256,6 @@ class BagAccess:
         if is_lasting and known is None:
             remembered.put(key, read, size)
 
-    def newest_in(self, bag: BagFile, topic: str, window: TimeWindow) -> StoredMessage | None:
-        """Returns what `read` yields first with `newest_first`, without reading more of the bag."""
-        self.check_deadline()
-        with self.call.stages.timed("read"):
-            try:
-                record = self.memory.reader.newest(bag.path, topic, _indexed_part(bag, window))
-                if record is not None and is_thinned(bag.file):
-                    self.call.note_thinned(record.log_time, record.log_time)
-                return None if record is None else StoredMessage(bag, record)
-            except BagVanishedError as error:
-                self._note_unreadable(bag, error, window)
-                return None
-            except BagError:
-                pass
-        # Others of its messages may be whole.
-        return next(self.read(bag, [topic], window, newest_first=True), None)
-
 
 def _indexed_part(bag: BagFile, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the snapshot covers: an active bag grows meanwhile."""

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.columns.scan import Scan
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.index.segment import TopicColumn
@@ -94,18 +93,14 @@ def _told_apart(
     bags, firsts, lasts, _ = column
     pieces = np.searchsorted(edges, firsts, side="right")
     is_cut = pieces != np.searchsorted(edges, lasts, side="right")
-    is_cut |= (firsts < window.start) | (lasts >= window.stop) | _overlap(firsts, lasts, shared)
+    is_cut |= (firsts < window.start) | (lasts >= window.stop)
+    # These are inclusive; spans are half-open, in order and apart.
+    starts, stops = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
+    is_cut |= starts[np.searchsorted(stops, firsts, side="right")] <= lasts
     # Under none of its types is a bag counted that is read.
     is_cut = np.isin(bags, bags[is_cut])
     is_here = (firsts < window.stop) & (lasts >= window.start)
     return pieces, is_here & ~is_cut, is_here & is_cut
-
-
-def _overlap(firsts: IntArray, lasts: IntArray, spans: Spans) -> NDArray[np.bool_]:
-    """Returns which times (inclusive) overlap one of half-open spans, in order and apart."""
-    starts, stops = np.array([*spans, (MAX_NS, MAX_NS)], np.int64).T
-    found: NDArray[np.bool_] = starts[np.searchsorted(stops, firsts, side="right")] <= lasts
-    return found
 
 
 def _one_by_one(times: IntArray, edges: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
@@ -134,16 +129,12 @@ def pick(
         for piece in np.unique(pieces).tolist():
             part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
             nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
-            yield from _at_positions(view, topic, _times_in(opened, part), nth.tolist())
+            none = np.empty(0, np.int64)
+            times = np.concatenate([none, *(rows.times for rows in opened.rows(among=part))])
+            times = np.sort(times[(times >= part.start) & (times < part.stop)])
+            yield from _at_positions(view, topic, times, nth.tolist())
 
     return int(ends[-1]), read()
-
-
-def _times_in(opened: Scan, window: TimeWindow) -> IntArray:
-    """Returns the log times (ns) of the messages in a stretch of a scan, in order."""
-    every = [np.empty(0, np.int64), *(rows.times for rows in opened.rows(among=window))]
-    times = np.concatenate(every)
-    return np.sort(times[(times >= window.start) & (times < window.stop)])
 
 
 def _at_positions(

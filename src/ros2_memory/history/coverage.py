@@ -212,12 +212,6 @@ def _deleted_near(view: View, window: TimeWindow) -> Spans:
     ]
 
 
-def deleted_length(view: View, window: TimeWindow) -> Ns:
-    """Returns for how long something was recorded in a window that retention deleted since."""
-    parts = deleted_between(view, window)
-    return sum(stop - start for start, stop in parts)
-
-
 def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
     spans = [_span_text(*each) for each in _deleted_near(view, window)]
@@ -226,16 +220,11 @@ def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
         yield f"recorded, and deleted since: {named}"
 
 
-def was_cut(bag_dir: Path, topic: str, window: TimeWindow) -> bool:
-    """Whether messages of a topic in a window were deleted, and others of their bags were not."""
-    return bool(cut_spans(bag_dir, topic, window))
-
-
 def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
-    """Returns when (log time, half-open) such messages were, in order: see `was_cut`.
+    """Returns when messages of a topic were deleted, and others of their bags were not.
 
-    They were deleted by request, or by `retention.topics`. Those intervals that overlap the window,
-    joined where they overlap.
+    By request, or by `retention.topics`. Those intervals (log time, half-open) that overlap the
+    window, in order, joined where they overlap.
     """
     losses = read_losses(bag_dir, window.start, window.stop)
     gone = (each for each in losses if each.topic == topic and each.by in {"forgotten", "expired"})
@@ -290,7 +279,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(is_whole, view.timeline.faulty(window)))
     excluded = excluded_between(view.bag_dir, window.start, window.stop)
-    deleted = any(was_cut(view.bag_dir, each, window) for each in topics)
+    deleted = any(cut_spans(view.bag_dir, each, window) for each in topics)
     deleted |= bool(deleted_between(view, window))
     deleted |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not deleted:
@@ -332,7 +321,9 @@ def unread_spans(
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
     active = being_written(snapshot, window)
-    yield from describe_held(active)
+    # Splits are not served before they were searched.
+    if held := [short_name(each.path) for each in active if each.reason == HELD_BACK]:
+        yield f"{HELD_BACK}: {listed(held)}"
     if any(each.reason != HELD_BACK for each in active):
         yield _describe_active(snapshot, active, window)
     faults = [
@@ -362,13 +353,6 @@ def lost_in(
         for aside in (*absent, *snapshot.damaged, *snapshot.unread)
         if _touches(spans[aside], window, unknown=nothing)
     ]
-
-
-def describe_held(active: Sequence[SetAside]) -> Iterator[str]:
-    """Yields a sentence on splits that are not served before they were searched, if there are."""
-    held = [short_name(each.path) for each in active if each.reason == HELD_BACK]
-    if held:
-        yield f"{HELD_BACK}: {listed(held)}"
 
 
 def being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:

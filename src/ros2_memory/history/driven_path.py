@@ -105,43 +105,30 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
         NoDataError: no message can be decoded.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    fastest = view.limits.max_plausible_speed_mps
-    failures: list[UndecodableError] = []
-    found, since = _slices_in(view, topic, window, failures)
-    if failures and not found:
-        raise with_notes(view, window, undecodable(failures[0])) from failures[0]
-    if failures:
-        view.notes.complete = False
-        why = f"{len(failures)} ({failures[0].reason})"
-        view.notes.add(f"poses left out, since they cannot be decoded: {why}")
-    return FoundWay(joined_slices(found, fastest) if found else None, since)
-
-
-def _slices_in(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    failures: list[UndecodableError],
-) -> tuple[list[PathSlice], Ns | None]:
-    """Returns the path in slices, in order, and since when, where the time was over before."""
     reading = view.call.partial_after(READING_S)
+    failures: list[UndecodableError] = []
     found: list[PathSlice] = []
-    since = MAX_NS
+    start = MAX_NS
+    since: Ns | None = None
 
     def reached(_: Ns) -> None:
         if reading.expired() and found:
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        for start, made in slices_of_path(view, topic, window, failures, reached):
-            since = start
-            if made.poses or made.invalid:
-                found.append(made)
+        for start, made in slices_of_path(view, topic, window, failures, reached):  # noqa: B007
+            found += [made] if made.poses or made.invalid else []
     except QueryTimeoutError:
         if not found:
             raise
-        return found[::-1], since
-    return found[::-1], None
+        since = start
+    if failures and not found:
+        raise with_notes(view, window, undecodable(failures[0])) from failures[0]
+    if failures:
+        why = f"{len(failures)} ({failures[0].reason})"
+        view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
+    fastest = view.limits.max_plausible_speed_mps
+    return FoundWay(joined_slices(found[::-1], fastest) if found else None, since)
 
 
 def slices_of_path(

@@ -49,20 +49,16 @@ class MergedStream:
     def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
         """Returns the bags that hold messages of these topics in the window, in order.
 
-        Each with the times of its first and last message of these topics, in the window or not.
+        Each with the times of its first and last message of those that reach into the window.
         """
-        names = tuple(topics)
-        if len(names) == 1 and len(self._timeline.types_of(names[0])) == 1:
-            # The entry of a bag is then all that it holds of these topics.
-            extents = self._timeline.extents(names[0], window)
-            return sorted(
-                [BagSpan(first, last, bag) for bag, first, last in extents], key=_in_order
-            )
         found: dict[str, BagSpan] = {}
-        for topic in names:
-            for bag, *_ in self._timeline.extents(topic, window):
-                if bag.file not in found:
-                    found[bag.file] = bag_span_of(bag, names)
+        for topic in topics:
+            for bag, first, last in self._timeline.extents(topic, window):
+                known = found.get(bag.file)
+                span = (
+                    (first, last) if known is None else (min(first, known[0]), max(last, known[1]))
+                )
+                found[bag.file] = BagSpan(*span, bag)
         return sorted(found.values(), key=_in_order)
 
     def messages(
@@ -98,19 +94,7 @@ class MergedStream:
         return next(self.messages(topics, window, newest_first=newest_first, among=among), None)
 
     def newest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
-        """Returns the newest message of the topic in the window.
-
-        Where a single bag can hold it, that bag alone is opened, and no stream is set up.
-        """
-        if len(self._parts([topic], window)) == 1 and not self.may_be_relatched([topic]):
-            bags = self.overlapping_bags([topic], _with_horizon(window))
-            if not bag_overlaps(bags):
-                inside = [each for each in bags if window.overlaps(each.first, each.last)]
-                if not inside:
-                    return None
-                if len(inside) == 1:
-                    found = self.bags.newest_in(inside[0].bag, topic, window)
-                    return None if found is None else next(self.bags.track_sources(iter((found,))))
+        """Returns the newest message of the topic in the window."""
         return self.first([topic], window, newest_first=True)
 
     def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
@@ -222,32 +206,16 @@ class MergedStream:
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
-
-        def push(rank: int, source: Iterator[StoredMessage]) -> None:
-            found = next(source, None)
-            if found is not None:
-                heapq.heappush(heap, (sign * found.time, rank, found, source))
-
         while heap or waiting:
-            while waiting and (not heap or waiting[0][0] <= heap[0][0]):
+            if waiting and (not heap or waiting[0][0] <= heap[0][0]):
                 _, rank, bag = waiting.popleft()
-                push(rank, read(bag))
-            if not heap:
-                continue
-            _, rank, found, source = heapq.heappop(heap)
-            yield found
-            # Whole stretches that no other bag interrupts do not go through the heap.
-            others = [each[0][0] for each in (heap, waiting) if each]
-            if not others:
-                yield from source
-                continue
-            until = min(others)
-            for found in source:
-                key = sign * found.record.log_time
-                if key >= until:
-                    heapq.heappush(heap, (key, rank, found, source))
-                    break
+                source = read(bag)
+            else:
+                _, rank, found, source = heapq.heappop(heap)
                 yield found
+            following = next(source, None)
+            if following is not None:
+                heapq.heappush(heap, (sign * following.time, rank, following, source))
 
 
 def _since_published(found: StoredMessage) -> TimeWindow:

@@ -430,14 +430,12 @@ def _differ_in(
     if next(_messages(view, topic, other, both), None) is None:
         return False
     some = list(islice(_messages(view, topic, one, both), _TRIED))
-    return bool(some) and not any(_has_duplicate(view, topic, other, each) for each in some)
-
-
-def _has_duplicate(view: View, topic: str, bags: Sequence[BagSpan], found: StoredMessage) -> bool:
-    """Whether some bags hold a duplicate of a message."""
-    near = TimeWindow.around(found.time, COPY_HORIZON_NS)
-    key = copy_key(found.record)
-    return any(copy_key(each.record) == key for each in _messages(view, topic, bags, near))
+    for found in some:
+        near = TimeWindow.around(found.time, COPY_HORIZON_NS)
+        key = copy_key(found.record)
+        if any(copy_key(each.record) == key for each in _messages(view, topic, other, near)):
+            return False
+    return bool(some)
 
 
 def _messages(

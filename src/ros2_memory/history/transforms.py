@@ -429,19 +429,17 @@ def _pairs_in(
             yield _pairs_of(view, _messages_in(view, rows, among))
         elif among is None or sessions_of(view).folder(rows.recording) in among:
             part = rows.part
-            known = None if part is None else scanner.caches.pairs.get(part)
-            pairs = _pairs_of_rows(view, rows) if known is None else known
+            pairs = None if part is None else scanner.caches.pairs.get(part)
+            if pairs is None:
+                known = of_columns(view, rows, lambda each: pairs_in(each.table, each.index))
+                pairs = (
+                    _pairs_of(view, messages_of(view, rows))
+                    if known is None
+                    else frozenset[Pair]().union(*known)
+                )
             if part is not None:
                 scanner.caches.pairs.put(part, pairs, 200 + 200 * len(pairs))
             yield pairs
-
-
-def _pairs_of_rows(view: View, rows: Rows) -> frozenset[Pair]:
-    """Returns the pairs in some rows: by columns, else by their messages."""
-    known = of_columns(view, rows, lambda each: pairs_in(each.table, each.index))
-    if known is None:
-        return _pairs_of(view, messages_of(view, rows))
-    return frozenset[Pair]().union(*known)
 
 
 def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:

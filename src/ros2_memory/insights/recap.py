@@ -23,7 +23,7 @@ from ros2_memory.core.text import Quoted, counted, listed, repeating
 from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
-    deleted_length,
+    deleted_between,
     note_edges,
     note_unread,
     note_unrecorded,
@@ -373,7 +373,8 @@ def _of_recording(view: View, window: TimeWindow, drive: Drive) -> Iterator[Even
 
 
 def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
-    deleted = unix_from_ns(deleted_length(view, TimeWindow(begin, until)))
+    spans = deleted_between(view, TimeWindow(begin, until))
+    deleted = unix_from_ns(sum(stop - start for start, stop in spans))
     if not deleted:
         return "nothing was recorded"
     whole = unix_from_ns(until - begin)

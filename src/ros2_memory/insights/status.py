@@ -13,12 +13,12 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
+    cut_spans,
     deleted_between,
     describe_excluded,
     describe_gaps,
     describe_lost,
     unix_text,
-    was_cut,
 )
 from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
@@ -251,7 +251,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
         is_long = latest - last > max(SILENT_AFTER_NS, longest)
         since = TimeWindow(last + 1, latest + 1)
-        if is_long and not was_cut(memory.index.bag_dir, topic, since):
+        if is_long and not cut_spans(memory.index.bag_dir, topic, since):
             yield SilentTopic(topic, last, usual)
 
 
