@@ -26,7 +26,7 @@ from mcap.reader import make_reader
 from ros2_memory.core.model import TimeWindow
 from tests.support.bags import typestore
 from tests.support.column_worlds import World, check_all, check_rows
-from tests.support.examples import LONG, examples
+from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of
 from tests.support.random_histories import S, write_history
 from tests.unit.history.cut_histories import (
@@ -372,7 +372,7 @@ def arrive(bag_dir: Path, splits: Splits, draw: Random) -> World:
     return world
 
 
-@settings(max_examples=examples(24))
+@settings(max_examples=24 if LONG else 4)
 @given(seed=st.integers(0, 2**32), cuts=st.lists(st.floats(0, 1), max_size=4))
 @example(6671, [0.9375, 0.5, 0.03125, 0.25])  # A sighting goes on in another recording.
 def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[float]) -> None:
@@ -403,7 +403,7 @@ def test_one_history_has_one_answer_wherever_it_is_cut(seed: int, cuts: list[flo
         check_silences(memory["silences"], splits, plain)
 
 
-@settings(max_examples=examples(27))
+@settings(max_examples=27 if LONG else 4)
 @given(seed=st.integers(0, 2**32))
 @example(17293)  # A topic of two types, in recordings side by side.
 def test_what_is_stored_of_an_odd_history_while_it_changes_changes_no_answer(seed: int) -> None:

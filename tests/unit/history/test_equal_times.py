@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.core.timebase import MAX_NS
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
-from tests.support.examples import examples
+from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.random_histories import MS, S
 
@@ -142,7 +142,7 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
     return values.get("count", 0), values.get("seconds", 0.0)
 
 
-@settings(max_examples=examples(10), deadline=None)
+@settings(max_examples=10 if LONG else 2, deadline=None)
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 0.5]), has_types=st.booleans())
 @example(seed=12, part=1.0, has_types=False)
 @example(seed=35, part=0.5, has_types=False)
