@@ -4,7 +4,6 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -273,13 +272,3 @@ def test_a_map_of_ones_own_may_reach_into_lists() -> None:
         "first": {"label": "cup"},
         "second": 2,
     }
-
-
-def test_a_scan_of_float32_is_shown_in_short_decimals() -> None:
-    ranges = np.linspace(0.1, 36.0, 360, dtype=np.float32)
-    message = SimpleNamespace(ranges=ranges)
-    extracted = EXTRACTOR.shown(message, "sensor_msgs/msg/LaserScan")
-    assert extracted.notes == ("ranges: 50 of 360 values, evenly spaced",)
-    assert isinstance(extracted.value, dict)
-    assert isinstance(extracted.value["ranges"], list)
-    assert extracted.value["ranges"][:2] == [0.1, 0.8]

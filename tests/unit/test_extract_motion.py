@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from ros2_memory.core import geometry
 from ros2_memory.core.model import Pose, Twist
 from tests.support import bags
 from tests.support.memories import shipped_extractor
@@ -112,15 +111,6 @@ def test_an_acceleration_is_no_twist() -> None:
     )
     assert EXTRACTOR.twist(accel, "geometry_msgs/msg/Accel") is None
     assert EXTRACTOR.twist({"angular_velocity": {"x": 0}}, "sensor_msgs/msg/Imu") is None
-
-
-def test_orientations_are_normalised() -> None:
-    pose = EXTRACTOR.pose(
-        pose_stamped(quaternion(5.0, 6.0, 7.0, 8.0), bags.point(1.0, 2.0)),
-        "geometry_msgs/msg/PoseStamped",
-    )
-    assert pose is not None
-    assert pose.orientation == geometry.normalised((5.0, 6.0, 7.0, 8.0))
 
 
 def test_a_point_is_a_pose_without_orientation() -> None:

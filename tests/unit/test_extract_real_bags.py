@@ -92,30 +92,3 @@ def test_each_field_of_each_type_can_be_asked_for_alone() -> None:
             value = EXTRACTOR.shown(message, type_name, [path]).value
             assert isinstance(value, dict)
             assert list(value) == [path]
-
-
-@needs_real
-def test_constants_of_definitions_are_not_shown() -> None:
-    for _, type_name, message in messages(REAL / "rosbags_rs_94types_mcap"):
-        assert all(not name.isupper() for name in names_of(message)), type_name
-
-
-@needs_real
-def test_pictures_and_clouds_are_shown_as_summaries() -> None:
-    found = {t: (n, m) for t, n, m in messages(REAL / "rerun_sensors_mcap")}
-    data = {}
-    for type_name, message in found.values():
-        if type_name.rpartition("/")[2] in {"Image", "CompressedImage", "PointCloud2"}:
-            value = EXTRACTOR.exact(message, type_name)
-            assert isinstance(value, dict)
-            data[type_name] = value["data"]
-    assert data["sensor_msgs/msg/Image"] == {
-        "bytes": 921600,
-        "encoding": "rgb8",
-        "shape": [480, 640, 3],
-    }
-    compressed, cloud = data["sensor_msgs/msg/CompressedImage"], data["sensor_msgs/msg/PointCloud2"]
-    assert isinstance(compressed, dict)
-    assert compressed["encoding"] == "jpeg"
-    assert isinstance(cloud, dict)
-    assert (cloud["points"], cloud["shape"]) == (200, [1, 200])

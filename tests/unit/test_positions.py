@@ -243,15 +243,14 @@ def test_a_position_without_a_fix_says_so_and_is_in_no_map(tmp_path: Path) -> No
     assert [at for at, _ in fixes] == [T0 + n * S for n in range(5, 9)]
 
 
-@each_way
 @pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
 def test_where_the_pose_topic_is_not_recorded_the_one_with_poses_is_named(
-    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+    tmp_path: Path, tool: str, given: dict[str, Any]
 ) -> None:
     others = [text(T0, "up", "/rosout"), boolean(T0, True)]
     two = [pose_stamped(T0 + S, 1.0, 2.0, name) for name in ("/pose", "/slam")]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*others, *two])
-    reply = ask(tmp_path, recalls, tool, **given)
+    reply = ask(tmp_path, False, tool, **given)
     assert (reply["error"], reply["reason"]) == ("no_data", "topic_not_recorded")
     assert "data.pose_topic is /odom, which these bags do not have" in reply["detail"]
     assert "poses are on /pose (geometry_msgs/msg/PoseStamped)" in reply["detail"]
@@ -282,42 +281,15 @@ def test_nobody_is_sent_to_a_satellite_fix_that_the_tool_then_refuses(
     assert "data.pose_topic is /odom" in detail
 
 
-@each_way
 @pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
 def test_a_topic_of_an_unlisted_type_is_named_where_its_messages_have_poses(
-    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
+    tmp_path: Path, tool: str, given: dict[str, Any]
 ) -> None:
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "up"), local(T0 + S, 1.0, 2.0)])
-    detail = ask(tmp_path, recalls, tool, **given)["detail"]
+    detail = ask(tmp_path, False, tool, **given)["detail"]
     assert "poses are on /fmu/out/vehicle_local_position" in detail
     assert "set data.pose_topic=/fmu/out/vehicle_local_position" in detail
     assert "/chatter" not in detail
-
-
-@each_way
-@pytest.mark.parametrize(("tool", "given"), ABOUT_POSES)
-def test_transforms_alone_give_the_position_and_name_the_tools_for_them(
-    tmp_path: Path, recalls: bool, tool: str, given: dict[str, Any]
-) -> None:
-    moved = [
-        tf(T0 + n * S, transform(T0 + n * S, "odom", "base_link", (n, 0.0, 0.0))) for n in range(3)
-    ]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", moved)
-    reply = ask(tmp_path, recalls, tool, **given)
-    assert reply["notes"][0].startswith("by transforms, of base_link in odom")
-    assert reply["frame_id"] == "odom"
-    if tool == "get_position_at":
-        assert (reply["x"], reply["topic"]) == (1.0, "/tf")
-    elif tool == "visits":
-        [visit] = reply["visits"]
-        assert visit["arrived"] == T0_S
-        assert visit["departed"] == T0_S  # the last pose inside
-    else:
-        assert (reply["distance_m"], reply["topic"]) == (2.0, "/tf")
-    refused = ask(tmp_path, recalls, "get_velocity_at", timestamp=T0_S + 1)["detail"]
-    assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
-    asked_for = {"parent": "odom", "child": "base_link", "timestamp": T0_S + 1}
-    assert ask(tmp_path, recalls, "get_transform_at", **asked_for)["translation"]["x"] == 1.0
 
 
 def test_where_a_satellite_receiver_has_degrees_alone_the_place_is_by_transforms(
@@ -395,6 +367,8 @@ def test_slow_transforms_have_no_position_between_them_as_poses_have_none(tmp_pa
     assert reply["reason"] == "between_messages"
     reply = ask(tmp_path, False, "get_position_at", timestamp=T0_S + 20.5, tolerance_s=1)
     assert (reply["timestamp"], reply["x"]) == (T0_S + 20, 21.0)
+    refused = ask(tmp_path, False, "get_velocity_at", timestamp=T0_S + 1)["detail"]
+    assert "transforms are on /tf: get_position_at and trajectory_summary answer by" in refused
 
 
 @each_way

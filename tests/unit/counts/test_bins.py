@@ -248,19 +248,6 @@ def test_bags_without_a_digest_are_read_for_seconds_only(
     assert whole(count_path(memory, Call(), span, "day"), "metres") == 36.0
 
 
-def test_messages_that_two_recordings_hold_count_once(tmp_path: Path) -> None:
-    for number in range(3):
-        begin = BEGIN + number * 10 * S
-        moves = [odom(begin + at * S, number * 10.0 + at, 0.0) for at in range(13)]
-        write_mcap(tmp_path / f"rec_{number}" / f"rec_{number}_0.mcap", moves)
-    plain = memory_of(tmp_path, limits=LATEST)
-    for memory in (plain, with_store(plain, tmp_path)):
-        answer = count_range(memory, Call(), "/odom", everything(), "day", fields=["position.x"])
-        assert whole(answer, "count") == 33
-        assert whole(answer, "position.x.mean") == 16.0
-        assert whole(answer, "last") == BEGIN + 32 * S
-
-
 @pytest.mark.parametrize("copied", [False, True])
 def test_recordings_that_follow_each_other_at_a_full_hour_count_a_copy_once(
     tmp_path: Path, copied: bool

@@ -191,19 +191,19 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
         assert len(whole["waypoints"]) == 4
 
 
-def test_two_recorders_of_one_robot_are_not(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "other",
+    [
+        [*(each for n, each in enumerate(drive(0.0, delay=3_000_000)) if n != 1), text(T0, "b")],
+        [text(T0 + n * NS_PER_S, str(n)) for n in range(60)],
+    ],
+    ids=["two recorders of one robot", "different topics"],
+)
+def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
+    tmp_path: Path, other: list[Msg]
+) -> None:
     write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
-    copies = [each for n, each in enumerate(drive(0.0, delay=3_000_000)) if n != 1]
-    write_mcap(tmp_path / "b" / "b_0.mcap", [*copies, text(T0, "only here")])
-    memory = memory_of(tmp_path)
-    assert differing(memory) == [(("a", "b"), None)]
-    assert warned(memory) == []
-
-
-def test_recordings_of_different_topics_are_not(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "a" / "a_0.mcap", drive(0.0))
-    words = [text(T0 + n * NS_PER_S, str(n)) for n in range(60)]
-    write_mcap(tmp_path / "b" / "b_0.mcap", words)
+    write_mcap(tmp_path / "b" / "b_0.mcap", other)
     memory = memory_of(tmp_path)
     assert differing(memory) == [(("a", "b"), None)]
     assert warned(memory) == []

@@ -109,17 +109,6 @@ def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> 
 
 
 @each_way
-def test_two_robots_of_one_time_are_not_mixed_and_a_note_says_whose_it_is(
-    tmp_path: Path, recalls: bool
-) -> None:
-    two_robots(tmp_path, BEGIN, BEGIN)
-    memory = remembered(tmp_path, recalls=recalls)
-    found = transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 4 * S)))
-    assert found.transform.translation[0] == pytest.approx(3.0)
-    assert [note for note in found.notes if "2 sessions" in note and "boat" in note]
-
-
-@each_way
 def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(
     tmp_path: Path, recalls: bool
 ) -> None:
