@@ -225,7 +225,14 @@ def test_a_goal_that_its_server_lost_is_known_until_it_was_listed_last(tmp_path:
     asked = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
     reply = json.loads(replied(memory, tmp_path, "find_matches", asked).text)
     assert any("1 goal whose end was not published" in note for note in reply["notes"])
-    # Of the newest goal alone the state is told; here the server listed none at the end.
-    write_mcap(tmp_path / "rec" / "rec_9.mcap", history((60, {3: 4})))
-    given = {"start": BEGIN / S + 58, "end": BEGIN / S + 61}
-    assert "listed no more" not in replied(memory_of(tmp_path), tmp_path, "recap", given).text
+
+
+def test_the_state_before_a_moment_has_no_goal_that_its_server_lost(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", history((10, {1: 2}), (15, {1: 2}), (30, {})))
+    memory = memory_of(tmp_path)
+    states = [
+        json.loads(replied(memory, tmp_path, "recap", given).text)["state"]
+        for at in (20, 33)
+        for given in [{"around": BEGIN / S + at, "seconds_before": 25}]
+    ]
+    assert states == [{"/drive goal": "active"}, {"/drive goal": "listed no more"}]
