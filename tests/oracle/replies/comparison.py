@@ -440,12 +440,13 @@ KNOWN_WRONG: Final[Sequence[KnownWrong]] = (
     ),
     *(
         KnownWrong(
-            "home_*",
+            world,
             "*",
             f"*/events/*/{key}",
             "a goal that its action server listed no more goes on for ever",
             only=is_lost,
         )
+        for world in ("home_*", "robot_day*")
         for key, is_lost in (
             ("text", lambda _, got: "listed no more" in str(got) or "last heard of" in str(got)),
             ("goes_on", lambda recorded, got: (recorded, got) == (True, "(absent)")),

@@ -22,7 +22,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, rounded
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
-from ros2_memory.counts.numbers import Part, PieceNumbers
+from ros2_memory.counts.numbers import SUM_SCALE, Part, PieceNumbers
 from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,
@@ -170,7 +170,7 @@ def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]
     highs = np.maximum.reduceat(np.array([-each.greatest.middle for each in parts]), starts)
     # One of them may be exact, and the other rounded to beyond it.
     lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
-    means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts)
+    means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts) / SUM_SCALE
     # Of a whole part the least and the greatest number are exact, and the sum is of rounded ones.
     means = np.clip(means, lows, highs)
     times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
