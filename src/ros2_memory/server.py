@@ -151,7 +151,9 @@ def _run(overrides: Sequence[str], page: str | None = None) -> None:
                 limited=limited,
             )
             shown = None if parts.page is None else page
-            serve_http(server, app, address, partial(_show_page, shown) if shown else None)
+            serve_http(
+                app, address, server.dispatcher, partial(_show_page, shown) if shown else None
+            )
     except SystemExit:
         log.info("stopped")
     finally:
@@ -187,7 +189,7 @@ def _parts_of_one(
 
     from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.serving.backfill import keep_backfilled
-    from ros2_memory.serving.health import Health, keep_fresh, read_listings
+    from ros2_memory.serving.health import Health, keep_fresh
 
     backfill = build_backfill(settings, memory)
     server = build_server(settings, memory, telemetry, backfill.progress)
@@ -201,8 +203,6 @@ def _parts_of_one(
     async def background() -> None:
         """Keeps the index fresh and the store of columns full, until it is cancelled."""
         async with anyio.create_task_group() as tasks:
-            if warm_page is not None:
-                tasks.start_soon(read_listings, memory)
             tasks.start_soon(keep_fresh, memory, every_s)
             tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s, warm_page)
 

@@ -34,7 +34,6 @@ from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
 from ros2_memory.core.text import abbreviate, shortened
 from ros2_memory.core.timebase import Deadline, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.serving.call_size import MAX_DEPTH, MAX_VALUES
 from ros2_memory.serving.fair_queue import STOPPING, FairQueue
 from ros2_memory.tools.extra_tools import DECLARATIONS
 from ros2_memory.tools.replies import Replies, Reply
@@ -106,6 +105,9 @@ _WRITES: Final = (
     "recorder=none nothing is deleted"
 )
 _LONGEST_NAME: Final = 64
+MAX_VALUES: Final = 10_000
+"""Keys and values in the arguments of one call, which are some dozen short ones."""
+MAX_DEPTH: Final = 64
 
 log = get_logger(__name__)
 

@@ -67,21 +67,6 @@ def refresh_logged(memory: Memory) -> None:
         log.exception("index_refresh_failed")
 
 
-async def read_listings(memory: Memory) -> None:
-    """Reads each recording's metadata.yaml once, so that the first look at a page need not.
-
-    Those of a week take a sixth of that look.
-    """
-
-    def read() -> None:
-        try:
-            memory.absent_splits(memory.index.snapshot())
-        except Exception:
-            log.exception("listings_not_read")
-
-    await anyio.to_thread.run_sync(read, abandon_on_cancel=True)
-
-
 class Health:
     """Reports the state of a server, on one event loop.
 

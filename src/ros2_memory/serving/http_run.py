@@ -12,21 +12,23 @@ from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.serving.auth import MCP_PATH
 from ros2_memory.serving.connection_limits import ACCEPTED_AT_ONCE, BoundedConnection
 from ros2_memory.serving.listen import BACKLOG, Address, bound
-from ros2_memory.serving.web_app import STREAM_PATH, WebApp
+from ros2_memory.serving.web_app import STREAM_PATH
 
 if TYPE_CHECKING:
     import socket
     from collections.abc import Callable
 
-    from ros2_memory.serving.mcp_server import EpisodicServer
+    from starlette.types import ASGIApp
+
+    from ros2_memory.serving.dispatch import Dispatcher
 
 log = get_logger("ros2_memory.server")
 
 
 def serve_http(
-    server: EpisodicServer,
-    app: WebApp,
+    app: ASGIApp,
     at: Address,
+    dispatcher: Dispatcher,
     when_listening: Callable[[str], None] | None = None,
 ) -> None:
     """Serves over HTTP until a signal comes; `when_listening` is called with the site's address.
@@ -46,23 +48,21 @@ def serve_http(
         access_log=False,
         timeout_graceful_shutdown=1,
     )
-    anyio.run(_Listener(config, server, app, when_listening).serve, [bound(at)])
+    anyio.run(_Listener(config, dispatcher, when_listening).serve, [bound(at)])
 
 
 class _Listener(uvicorn.Server):
-    """Runs uvicorn, and ends the event streams and the queries when it stops."""
+    """Runs uvicorn, and ends the queries when it stops; event streams end by themselves then."""
 
     def __init__(
         self,
         config: uvicorn.Config,
-        server: EpisodicServer,
-        app: WebApp,
+        dispatcher: Dispatcher,
         when_listening: Callable[[str], None] | None,
     ) -> None:
         super().__init__(config)
+        self._dispatcher = dispatcher
         self._when_listening = when_listening
-        self._server = server
-        self._app = app
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
@@ -85,6 +85,5 @@ class _Listener(uvicorn.Server):
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         notify(STOPPING)
-        self._server.dispatcher.stop()
-        self._app.stop()
+        self._dispatcher.stop()
         await super().shutdown(sockets)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import uuid
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import anyio
@@ -15,7 +15,7 @@ import anyio.to_thread
 from mcp.server.transport_security import TransportSecuritySettings
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.responses import JSONResponse, Response
 from starlette.routing import Route
 
 from ros2_memory.serving.auth import (
@@ -44,9 +44,6 @@ Background: TypeAlias = "Callable[[], Coroutine[object, object, None]]"
 
 STREAM_PATH: Final = "/sse"
 METRICS_PATH: Final = "/metrics"
-GRACE_S: Final = 0.4
-"""How long requests may still take when the server stops; event streams end at once."""
-
 THREADS: Final = 4
 """For work in the background, such as scans. anyio keeps an idle thread for a while."""
 
@@ -96,7 +93,7 @@ def web_app(
     metrics: Callable[[], Awaitable[Exposition]] | None = None,
     page: Sequence[Route] | None = (),
     limited: Mapping[str, frozenset[str]] | None = None,
-) -> WebApp:
+) -> ASGIApp:
     """Returns the application that listens on `host`.
 
     Args:
@@ -158,7 +155,7 @@ def web_app(
     if page is not None:
         # The page comes before the token: it holds no data, and asks for the token.
         app = Page(app)
-    return WebApp(ForgeryGuard(app, host, admits=not needs_token))
+    return ForgeryGuard(app, host, admits=not needs_token)
 
 
 def _session_manager(
@@ -211,77 +208,3 @@ class McpEndpoint:
         streams = _EVENTS in headers.get("accept", "") and _PROGRESS in body
         app = self._streaming if streams else self._plain
         await app(scope, receive_again, send_named)
-
-
-class WebApp:
-    """Ends open requests when the server stops, which an event stream never does by itself."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-        self._open: set[_OpenRequest] = set()
-
-    def stop(self) -> None:
-        """Ends the event streams now, and other requests after `GRACE_S`."""
-        for request in self._open:
-            request.stop()
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handles an ASGI connection."""
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        request = _OpenRequest(scope, receive, send)
-        self._open.add(request)
-        try:
-            await request.run(self._app)
-        finally:
-            self._open.discard(request)
-
-
-@dataclass(eq=False)
-class _OpenRequest:
-    """One request and its response.
-
-    An event stream is ended by a disconnect message, which the application handles as if the
-    client had left; what it sends afterwards is discarded.
-    """
-
-    _scope: Scope
-    _receive: Receive
-    _send: Send
-    _has_begun: bool = False
-    _is_ended: bool = False
-    _awaited: anyio.CancelScope = field(default_factory=anyio.CancelScope)
-    _limit: anyio.CancelScope = field(default_factory=anyio.CancelScope)
-
-    def stop(self) -> None:
-        """Ends an event stream at once, and another request after `GRACE_S`."""
-        if self._scope["path"] == STREAM_PATH:
-            self._is_ended = True
-            self._awaited.cancel()
-        self._limit.deadline = anyio.current_time() + GRACE_S
-
-    async def run(self, app: ASGIApp) -> None:
-        """Runs the application, and completes a response that was stopped."""
-        with self._limit:
-            await app(self._scope, self.receive, self.send)
-        if not self._limit.cancelled_caught and not self._is_ended:
-            return
-        if self._has_begun:
-            await self._send({"type": "http.response.body", "body": b"", "more_body": False})
-        else:
-            stopping = PlainTextResponse("The server is stopping.\n", status_code=503)
-            await stopping(self._scope, self._receive, self._send)
-
-    async def receive(self) -> Message:
-        """Returns the client's next message, or a disconnect where the stream is to end."""
-        if not self._is_ended:
-            with anyio.CancelScope() as self._awaited:
-                return await self._receive()
-        return {"type": "http.disconnect"}
-
-    async def send(self, message: Message) -> None:
-        """Passes a message to the client, unless the stream was ended."""
-        if not self._is_ended:
-            self._has_begun = True
-            await self._send(message)

@@ -84,16 +84,6 @@ def test_they_show_how_much_is_kept_and_how_old_the_newest_is(tmp_path: Path) ->
     assert found["newest_data_age_seconds"] == (scanned - T0) / NS_PER_S + 3
 
 
-def test_an_empty_memory_has_no_age_and_without_a_recorder_there_is_no_budget(
-    tmp_path: Path,
-) -> None:
-    memory = memory_of(tmp_path)
-    memory.index.refresh()
-    found = measured(MemoryGauges(memory))
-    assert found["bags"] == 0
-    assert {"newest_data_age_seconds", "budget_bytes"} & {*found} == set()
-
-
 def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_path: Path) -> None:
     clock = SettableClock(T0 + 9 * NS_PER_S)
     gauges = MemoryGauges(memory_of(tmp_path, clock=clock))

@@ -119,12 +119,6 @@ async def test_nobody_without_the_token_has_a_body_read(path: str) -> None:
     assert inside.seen == []
 
 
-async def test_health_is_passed_on_as_not_having_shown_the_token() -> None:
-    inside = Inside()
-    assert (await asked(inside, "/health")).status_code == 200
-    assert inside.seen == [("http", False)]
-
-
 @pytest.mark.parametrize("name", ["token", "access_token", "authorization", "api_key"])
 async def test_a_token_in_a_query_string_is_none(name: str) -> None:
     inside = Inside()
@@ -198,9 +192,3 @@ def test_it_keeps_no_token() -> None:
     assert GOOD not in kept
     assert GOOD.encode() not in kept
     assert GOOD not in repr(vars(held))
-
-
-async def test_the_start_of_the_application_needs_none() -> None:
-    inside, nothing = Inside(), None
-    await TokenGate(inside, GOOD)({"type": "lifespan"}, nothing, nothing)  # type: ignore[arg-type]
-    assert inside.seen == [("lifespan", None)]

@@ -22,7 +22,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.cli import main
 from ros2_memory.cli.doctor import check_columns
-from ros2_memory.cli.maintenance.index import describe_progress, fill_store
+from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.columns import fill, writing
 from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
 from ros2_memory.columns.scanner import Scanner
@@ -33,7 +33,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
@@ -74,11 +74,6 @@ def stored(memory: Memory) -> list[str]:
     assert memory.columns is not None
     assert memory.columns.store is not None
     return sorted(memory.columns.store.paths())
-
-
-def test_the_newest_bag_comes_first(tmp_path: Path) -> None:
-    paths = [bag(tmp_path, number) for number in range(3)]
-    assert [each.path for each in storing(tmp_path)[1].waiting()] == paths[::-1]
 
 
 def test_when_all_is_stored_nothing_waits(tmp_path: Path) -> None:
@@ -268,13 +263,6 @@ def own_logging() -> Iterator[None]:
     structlog.reset_defaults()
 
 
-def test_the_last_line_counts_what_is_stored_and_what_cannot_be() -> None:
-    shown = describe_progress(Progress(4, 3, 0, 1))
-    assert "3 of 4 bags are stored, 1 cannot be" in shown
-    assert shown.count("#") == 30
-    assert "0 of 0" in describe_progress(Progress(0))
-
-
 @pytest.mark.usefixtures("own_logging")
 def test_the_command_fills_the_store_beside_the_bags(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -321,12 +309,3 @@ def test_the_command_counts_the_warnings_of_the_log_instead_of_showing_them(
     reply = capsys.readouterr().err
     assert "1 warning logged (bag_damaged)" in reply
     assert '"event"' not in reply
-
-
-def test_texts_of_the_newest_bag_are_found_before_and_after_it_is_stored(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(T0, "scissors")])
-    memory, backfill = storing(tmp_path)
-    before = queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors")
-    fill_store(backfill)
-    assert queries.find_last_match(memory, Call(), "/chatter", "contains", "scissors") == before
-    assert before.found is not None

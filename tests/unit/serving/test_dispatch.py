@@ -94,34 +94,6 @@ def log() -> Iterator[LogCapture]:
     structlog.reset_defaults()
 
 
-async def test_a_reply_is_one_text_block_without_structured_content() -> None:
-    async with Client(served(tool("ask", lambda _call: value({"x": 1})))) as client:
-        result = await client.call_tool("ask", {})
-        assert sent(result)["value"] == {"x": 1}
-        assert not result.is_error
-        [listed] = (await client.list_tools()).tools
-        assert listed.output_schema is None
-
-
-async def test_tools_are_listed_as_read_only_and_with_nothing_that_says_nothing() -> None:
-    quick, slow = tool("quick", raising(ValueError())), tool("slow", until_given_up, blocking=True)
-    async with Client(served(quick, slow)) as client:
-        listed = (await client.list_tools()).tools
-    assert [each.name for each in listed] == ["quick", "slow"]
-    hints = [each.annotations and each.annotations.model_dump(exclude_none=True) for each in listed]
-    # What is read-only cannot destroy; each hint is paid for by every planner that lists it.
-    assert hints == 2 * [{"read_only_hint": True, "open_world_hint": False}]
-    assert [each.title for each in listed] == ["Quick", "Slow"]
-
-
-async def test_the_server_says_its_name_its_version_and_how_to_ask() -> None:
-    async with Client(served()) as client:
-        info = client.server_info
-        assert info is not None
-        assert (info.name, info.version) == ("episodic", "1.2.3")
-        assert client.instructions == "Ask away."
-
-
 @pytest.mark.parametrize(
     ("name", "given", "error", "is_error"),
     [
@@ -258,21 +230,6 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
     assert result.is_error
     assert sent(result)["error"] == "timeout"
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
-
-
-async def test_tools_are_listed_while_queries_run_and_wait() -> None:
-    released = threading.Event()
-
-    def stuck(_call: Call) -> Answer:
-        released.wait(10)
-        return value(1)
-
-    async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
-        for _ in range(2 * QUICK_AT_ONCE):
-            tasks.start_soon(client.call_tool, "stuck", {})
-        await anyio.wait_all_tasks_blocked()
-        assert len((await client.list_tools()).tools) == 1
-        released.set()
 
 
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
@@ -426,11 +383,3 @@ async def test_stopping_has_running_queries_give_up() -> None:
         server.dispatcher.stop()
     told = sent(results[0])
     assert (told["error"], "the server is stopping" in told["detail"]) == ("busy", True)
-
-
-async def test_a_reply_stays_below_the_cap() -> None:
-    server = served(tool("ask", lambda _call: value(["x" * 100] * 1000)), max_chars=1500)
-    async with Client(server) as client:
-        result = await client.call_tool("ask", {})
-    assert len(cast("TextContent", result.content[0]).text) <= 1500
-    assert sent(result)["notes"]

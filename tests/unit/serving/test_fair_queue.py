@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.errors import BusyError
 from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
@@ -46,16 +45,6 @@ async def until(what: Callable[[], bool]) -> None:
 
 def started(queue: FairQueue, gates: Gates, client: str, count: int) -> list[asyncio.Task[str]]:
     return [asyncio.create_task(queue.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
-
-
-async def test_so_many_run_at_once_and_the_others_wait() -> None:
-    queue, gates = FairQueue("test", 2), Gates()
-    tasks = started(queue, gates, "a", 5)
-    await until(lambda: len(gates.begun) == 2)
-    assert (queue.running, queue.waiting) == (2, 3)
-    gates.release()
-    assert await asyncio.gather(*tasks) == [f"a{n}" for n in range(5)]
-    await until(lambda: (queue.running, queue.waiting) == (0, 0))
 
 
 async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
@@ -123,29 +112,3 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert leaving.cancelled()
     assert gates.begun == ["a0", "a2"]
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
-
-
-async def test_what_a_question_raises_reaches_its_caller_and_frees_the_place() -> None:
-    queue = FairQueue("test", 1)
-
-    def ask() -> None:
-        raise KeyError("inside")
-
-    for _ in range(3):
-        with pytest.raises(KeyError, match="inside"):
-            await queue.run("a", ask)
-    await until(lambda: queue.running == 0)
-
-
-async def test_a_stopped_lane_takes_no_more_and_lets_its_threads_go() -> None:
-    queue, gates = FairQueue("stopping", 2), Gates()
-    [running] = started(queue, gates, "a", 1)
-    await until(lambda: gates.begun == ["a0"])
-    queue.stop()
-    with pytest.raises(BusyError, match="stopping"):
-        await queue.run("a", gates.ask("never"))
-    gates.release()
-    assert await running == "a0"
-    await until(
-        lambda: not [each for each in threading.enumerate() if each.name.startswith("stopping")]
-    )

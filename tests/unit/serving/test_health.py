@@ -15,9 +15,8 @@ from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index import listed_splits
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.serving.health import NAMED, Health, keep_fresh, read_listings
+from ros2_memory.serving.health import NAMED, Health, keep_fresh
 from tests.support.bags import McapLayout, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.memories import memory_of
@@ -64,29 +63,6 @@ async def test_an_empty_memory_is_healthy(tmp_path: Path) -> None:
         "gaps_last_hour": {"count": 0, "seconds": 0.0},
         "index_age_s": 0.0,
     }
-
-
-async def test_the_span_of_the_memory_is_told(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a"), text(T0 + NS_PER_S, "b")])
-    reply = await Health(memory_at(tmp_path), "1")()
-    assert (reply["bags"], reply["earliest"], reply["latest"]) == (1, 1784023200.0, 1784023201.0)
-
-
-async def test_listings_are_read_before_the_first_question(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
-    listing = tmp_path / "r" / "metadata.yaml"
-    listing.write_text(
-        "rosbag2_bagfile_information:\n  files:\n    - path: r_0.mcap\n    - path: r_1.mcap\n"
-    )
-    for each in (listing, listing.parent):  # what changed just now is read anew
-        os.utime(each, (T0 / NS_PER_S - 60, T0 / NS_PER_S - 60))
-    memory = memory_at(tmp_path, seconds=3600)
-    await read_listings(memory)
-    monkeypatch.setattr(listed_splits, "read_listing", None)
-    [absent] = memory.absent_splits(memory.index.snapshot())
-    assert absent.files == ("r_1.mcap",)
 
 
 async def test_damaged_bags_degrade_it(tmp_path: Path) -> None:
@@ -157,14 +133,6 @@ async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     }
 
 
-async def test_age_that_is_held_is_shown_and_degrades_nothing(tmp_path: Path) -> None:
-    write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), age_held="2 bags stay"))
-    reply = await Health(memory_at(tmp_path, seconds=3), "1")()
-    assert reply["status"] == "ok"
-    assert isinstance(reply["recorder"], dict)
-    assert reply["recorder"]["age_held"] == "2 bags stay"
-
-
 @pytest.mark.parametrize(
     ("heartbeat", "seconds", "problem"),
     [
@@ -188,28 +156,6 @@ async def test_a_recorder_that_does_not_record_degrades_it(
 async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, beat(RecorderState.STOPPED))
     assert (await Health(memory_at(tmp_path, seconds=600), "1")())["status"] == "ok"
-
-
-async def test_health_answers_while_the_first_scan_runs(tmp_path: Path) -> None:
-    begun, released, ended = threading.Event(), threading.Event(), threading.Event()
-
-    class Slow(IndexManager):
-        def snapshot(self, reach: int | None = None) -> Snapshot:
-            begun.set()
-            released.wait(10)
-            try:
-                return super().snapshot(reach)
-            finally:
-                ended.set()
-
-    memory = memory_at(tmp_path)
-    slow = Slow(tmp_path, memory.reader, memory.clock, refresh_s=5.0, split_duration_s=10.0)
-    reply = await Health(replace(memory, index=slow), "1", timeout_s=0.01)()
-    released.set()
-    # On a busy machine patience may end before it is even begun.
-    assert not begun.is_set() or ended.wait(10)
-    assert reply["status"] == "degraded"
-    assert reply["problems"] == ["the bag directory is being scanned"]
 
 
 async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(

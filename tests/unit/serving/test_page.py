@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-import asyncio
 import re
-import socket
 from importlib import resources
 
 import pytest
 
 from ros2_memory.serving.page import POLICY, SCRIPTS, STYLES
-from tests.support.processes import BOUND_S, listening
 from tests.unit.serving.test_web_app import EVERYWHERE, GOOD, SHOWN, app, client
 
 FOLDER = resources.files("ros2_memory.serving.page")
@@ -39,19 +36,6 @@ async def test_a_browser_that_has_a_file_is_not_sent_it_again() -> None:
         again = await http.get("/page/page.js", headers={"if-none-match": first.headers["etag"]})
     assert again.status_code == 304
     assert again.content == b""
-
-
-async def test_on_a_socket_the_headers_alone_answer_a_head_request() -> None:
-    async with listening(app(), lifespan="on") as server:
-        port = server.servers[0].sockets[0].getsockname()[1]
-        reader, writer = await asyncio.open_connection("127.0.0.1", port)
-        for ending in ("HEAD / HTTP/1.1", "GET / HTTP/1.1\r\nConnection: close"):
-            writer.write(f"{ending}\r\nHost: 127.0.0.1:{port}\r\n\r\n".encode())
-        async with asyncio.timeout(BOUND_S):
-            answers = await reader.read()
-        writer.close()
-    assert answers.count(b"HTTP/1.1 200 OK") == 2
-    assert answers.count(b"</html>") == 1
 
 
 async def test_only_these_are_the_page_and_only_to_be_read() -> None:
@@ -95,25 +79,6 @@ async def test_it_is_shown_without_the_token_which_it_asks_for(host: str) -> Non
             assert (await http.get(path, headers=SHOWN)).status_code != 401
 
 
-async def test_a_name_that_was_rebound_to_this_machine_gets_no_page() -> None:
-    async with client(app()) as http:
-        for path in (*PATHS, "/page/span"):
-            assert (await http.get(path, headers={"host": "evil.example"})).status_code == 421
-            refused = await http.get(path, headers={"origin": "http://evil.example"})
-            assert refused.status_code == 403
-        its = socket.gethostname() + ".evil.example"
-        assert (await http.get("/", headers={"host": its})).status_code == 421
-
-
-async def test_another_site_may_link_to_the_page_alone() -> None:
-    visit = {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}
-    visit["sec-fetch-dest"] = "document"
-    async with client(app()) as http:
-        assert (await http.get("/", headers=visit)).status_code == 200
-        for path in ("/page/page.js", "/page/span", "/page/moment", "/page/topics", "/page/path"):
-            assert (await http.get(path, headers=visit)).status_code == 403
-
-
 def test_nothing_of_it_comes_from_elsewhere() -> None:
     for text in (HTML, *OWN.values()):
         assert re.findall(r"\w+://[^\s\"'<]+", text) == []
@@ -131,14 +96,6 @@ def test_nothing_of_it_comes_from_elsewhere() -> None:
 def test_text_never_becomes_markup_or_code() -> None:
     forbidden = r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|\beval\b|new Function"
     assert not re.search(forbidden, SCRIPT)
-
-
-def test_nothing_of_it_moves_so_there_is_nothing_to_reduce() -> None:
-    assert not re.search(r"@keyframes|animation:|transition|scroll-behavior", "".join(OWN.values()))
-
-
-def test_it_has_no_scroll_boxes() -> None:
-    assert not re.search(r"overflow(-[xy])?:\s*(auto|scroll)", OWN["page.css"])
 
 
 def test_it_keeps_the_token_for_its_tab_alone() -> None:

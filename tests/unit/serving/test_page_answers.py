@@ -358,20 +358,6 @@ def test_a_thinned_path_is_bounded_and_reaches_as_far_to_every_side(count: int, 
             assert column[kept].max() == column.max()
 
 
-def test_where_a_thinned_path_begins_anew_is_kept() -> None:
-    count = 20_000
-    times = BEGIN + np.arange(count) * S
-    begins = np.zeros(count, np.bool_)
-    begins[[0, 7_001]] = True
-    level = np.zeros(count)
-    track = RobotTrack(times, level, level, level, begins)
-    kept = thinned(level, level, times)
-    [first, second] = span._begins(track, kept)
-    assert first == 0
-    assert isinstance(second, int)
-    assert kept[second - 1] < 7_001 <= kept[second]
-
-
 def answered(tool: str) -> Answered:
     return Answered(tool, "ok", 0.25, 2, "id")
 
@@ -386,13 +372,6 @@ def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
     assert kept[0]["arguments"] == '{"n": 4}'
     assert len(str(kept[0]["answer"])) <= 2_000
     assert log.count == 5
-
-
-def test_without_the_setting_no_question_is_kept() -> None:
-    log = QuestionLog(0)
-    log.add("tool", {}, answered("tool"), "{}")
-    assert log.newest(9) == ()
-    assert not log.is_on
 
 
 def test_kept_questions_are_shown_and_make_an_answer_new(bag_dir: Path) -> None:

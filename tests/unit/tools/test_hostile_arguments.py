@@ -116,16 +116,3 @@ def test_an_unknown_tool_is_told_in_few_words(dispatcher: Dispatcher, name: str)
     shown = held(asked(dispatcher, name, {}))
     assert shown["error"] == "invalid_arguments"
     assert "unknown tool" in shown["detail"]
-
-
-def test_a_reversed_window_is_told(dispatcher: Dispatcher) -> None:
-    for start, end in ((2, 1), (1e9, 0), (1.5, 1.4999)):
-        shown = held(asked(dispatcher, "trajectory_summary", {"start": start, "end": end}))
-        assert (shown["error"], "start" in shown["detail"]) == ("invalid_arguments", True)
-
-
-def test_deep_values_are_refused_wherever_they_stand(dispatcher: Dispatcher) -> None:
-    for value in (nested(DEEP), nested(DEEP, kind="object")):
-        given = {"topic": "/odom", "condition_type": "near_position", "value": {"x": value}}
-        shown = held(asked(dispatcher, "find_last_match", given))
-        assert (shown["error"], "value" in shown["detail"]) == ("invalid_arguments", True)

@@ -6,12 +6,7 @@ import json
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
-from mcp import Client
-from mcp.types import TextContent
 
-from ros2_memory import cli
-from ros2_memory.bootstrap import build_memory, build_server
-from ros2_memory.config import load_settings
 from ros2_memory.core.text import Quoted, named, quote, quoted_keys
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
@@ -304,20 +299,3 @@ def test_the_replies_of_several_robots_are_marked_as_one(tmp_path: Path) -> None
         reply = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
         require_marked(reply)
         assert {*places} <= {*reply["quoted"]}
-
-
-async def test_a_client_of_the_server_receives_the_mark(bag_dir: Path) -> None:
-    settings = load_settings((f"recording.bag_dir={bag_dir}", "recorder=none"), {})
-    async with Client(build_server(settings, build_memory(settings))) as client:
-        found = await client.call_tool("find_last_match", {"topic": "/speech", **CONTAINS})
-        [content] = found.content
-    assert isinstance(content, TextContent)
-    require_marked(json.loads(content.text))
-
-
-def test_the_command_line_prints_the_mark(
-    bag_dir: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = json.dumps({"topic": "/speech", **CONTAINS})
-    assert cli.main(["ask", str(bag_dir), "find_last_match", given, "--json"]) == 0
-    require_marked(json.loads(capsys.readouterr().out))

@@ -53,11 +53,6 @@ def test_what_json_cannot_carry_does_not_leave() -> None:
     assert to_json_text(value) == '{"a":[null,null,null,0.0],"b":"? ä","?":1}'
 
 
-def test_a_reply_that_fits_is_left_as_it_is() -> None:
-    reply = samples(3)
-    assert fit_reply(reply, len(to_json_text(reply))) == to_json_text(reply)
-
-
 @given(REPLIES, NOTES, st.integers(500, 5000))
 def test_a_reply_never_passes_the_cap_and_is_always_valid(
     reply: dict[str, Any], notes: list[Any], cap: int

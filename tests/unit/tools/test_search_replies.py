@@ -30,7 +30,6 @@ from tests.support.clocks import SettableClock
 from tests.support.log_lines import with_checks
 from tests.support.mcap_surgery import change_index, chunks_of, edit_summary, spoil_chunk
 from tests.support.memories import asked, each_way, memory_of, with_store
-from tests.support.shared_bags import REAL, needs_real
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -305,13 +304,6 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
     assert last(bag_dir, recalls, "/rosout", "contains", "never")["notes"]
 
 
-@needs_real
-def test_wrong_statistics_of_a_file_that_was_read_whole_do_not_make_never_uncertain() -> None:
-    bag_dir = REAL / "rosbag2_time0_mcap"
-    given = {"topic": "*", "condition_type": "equals", "value": "never recorded"}
-    assert asked(memory_of(bag_dir), bag_dir, "find_last_match", **given) is None
-
-
 def lie_in_a_message_index(path: Path) -> None:
     chunk = chunks_of(path)[0]
     change_index(path, chunk, 0, chunk.message_start_time + 1)
@@ -373,11 +365,3 @@ def test_a_search_that_got_somewhere_says_how_far_the_catalogue_is(bag_dir: Path
         queries.find_last_match(memory, call, "/*", "contains", "never")
     assert late.value.searched_back_to is not None
     assert "has 0 of 3 bags so far: wait for it, or to continue from there" in str(late.value)
-
-
-def test_without_a_catalogue_a_shorter_window_is_all_that_is_advised(bag_dir: Path) -> None:
-    with pytest.raises(QueryTimeoutError) as late:
-        queries.find_last_match(
-            memory_of(bag_dir), Call(Deadline.after(0.0)), "/*", "contains", "never"
-        )
-    assert "catalogue" not in str(late.value)

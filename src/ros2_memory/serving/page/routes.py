@@ -25,7 +25,6 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
-from ros2_memory.serving.call_size import excess_in_json
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.moment import moment_shown, sightings_shown, stretch_shown
 from ros2_memory.serving.page.recordings import Recordings
@@ -241,10 +240,8 @@ def tool_arguments(given: QueryParams) -> JsonObject:
     """
     text = _short(given, "arguments", _LONGEST_ARGUMENTS)
     try:
-        if excess := excess_in_json(text.encode()):
-            raise InvalidArgumentsError(excess.strip())
         arguments: JsonValue = json.loads(text or "{}")
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InvalidArgumentsError(f"arguments is no JSON: {error}") from error
     if not isinstance(arguments, dict):
         raise InvalidArgumentsError("arguments must be a JSON object")
