@@ -85,28 +85,6 @@ def test_when_all_is_stored_nothing_waits(tmp_path: Path) -> None:
     assert fill_store(storing(tmp_path)[1]) == Progress(3, 3)
 
 
-def test_what_another_server_stored_as_well_does_not_wait(tmp_path: Path) -> None:
-    for number in range(3):
-        bag(tmp_path, number)
-    (_, one), (_, other) = storing(tmp_path), storing(tmp_path)
-    [batch] = other.batches()
-    assert fill_store(one) == Progress(3, 3)
-    assert other.store(batch) == 3
-    assert one.waiting() == []
-    assert other.waiting() == []
-
-
-def test_a_bag_that_a_crash_left_open_is_never_stored(tmp_path: Path) -> None:
-    bag(tmp_path, 0)
-    bag(tmp_path, 1, finish=False)
-    assert fill_store(storing(tmp_path)[1]) == Progress(1, 1)
-
-
-def test_without_a_store_nothing_waits(tmp_path: Path) -> None:
-    bag(tmp_path, 0)
-    assert fill_store(Backfill(memory_of(tmp_path), None)) == Progress(1)
-
-
 def test_a_bag_that_cannot_be_stored_is_told_of_and_not_tried_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,15 +139,6 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     known = storing(tmp_path, reading="before")[0].columns
     assert known is not None
     assert known.fragments_of_others() == []
-
-
-def test_what_is_stored_of_bags_that_are_gone_is_dropped(tmp_path: Path) -> None:
-    paths = [bag(tmp_path, number) for number in range(3)]
-    memory, backfill = storing(tmp_path)
-    fill_store(backfill)
-    paths[0].unlink()
-    backfill.prune()
-    assert stored(memory) == ["rec/rec_1.mcap", "rec/rec_2.mcap"]
 
 
 def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path: Path) -> None:

@@ -336,17 +336,6 @@ async def test_questions_that_cannot_be_stopped_do_not_become_ever_more_threads(
     held.released.set()
 
 
-async def test_a_timeout_after_a_wait_says_how_long_the_wait_was(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("ros2_memory.serving.dispatch._REPORTED_WAIT_S", 0.0)
-    late = tool("late", raising(QueryTimeoutError("too long", 5)))
-    reply = await served(late).dispatcher.answer("late", {})
-    sent = json.loads(reply.text)
-    assert sent["detail"] == "too long (it waited 0.0 s of its time behind other calls)"
-    assert "searched_back_to" in sent
-
-
 async def test_more_calls_than_may_wait_are_told_so() -> None:
     held = Held()
     dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher

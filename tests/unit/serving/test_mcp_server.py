@@ -93,25 +93,6 @@ async def test_topics_and_status_are_resources(tmp_path: Path) -> None:
         assert (await read(client, "episodic://moments"))["moments"] == []
 
 
-async def test_the_fields_of_a_type_are_a_resource(tmp_path: Path) -> None:
-    write_run(tmp_path)
-    async with Client(server(tmp_path)) as client:
-        templates = (await client.list_resource_templates()).resource_templates
-        assert [each.uri_template for each in templates] == [
-            "episodic://schema/{type}",
-            "episodic://moments/{id}",
-        ]
-        reply = await read(client, "episodic://schema/nav_msgs/msg/Odometry")
-        assert reply["topics"] == ["/odom"]
-        assert reply["fields"]["position.x"] == "number"
-        again = await read(client, "episodic://schema/nav_msgs%2Fmsg%2FOdometry")
-        assert again == reply
-        seen = await read(
-            client, "episodic://schema/ros2_vision_interfaces/msg/VisionDetectionArray"
-        )
-        assert seen["fields"]["detections.label"] == "text"
-
-
 @pytest.mark.parametrize("uri", ["episodic://nothing", "episodic://schema/", "file:///etc/passwd"])
 async def test_there_are_no_other_resources(tmp_path: Path, uri: str) -> None:
     write_run(tmp_path)
@@ -200,18 +181,6 @@ async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None
     assert [(name, text) for name in lacking for text in read if name in text] == []
     # The words that are left out above: as names of tools they follow a colon.
     assert [text for text in read if re.search(r": (visits|compare|recap)\b", text)] == []
-
-
-async def test_nothing_is_declared_that_never_comes(tmp_path: Path) -> None:
-    async with Client(server(tmp_path)) as client:
-        declared = client.server_capabilities
-    assert declared.resources is not None
-    assert declared.tools is not None
-    assert declared.prompts is not None
-    assert not declared.resources.subscribe
-    assert not declared.resources.list_changed
-    assert not declared.tools.list_changed
-    assert not declared.prompts.list_changed
 
 
 async def test_lists_may_be_cached_and_shared_and_what_is_read_may_not(tmp_path: Path) -> None:

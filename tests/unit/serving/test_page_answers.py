@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from random import Random
 from typing import TYPE_CHECKING, Any
@@ -130,15 +131,6 @@ def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
     assert "questions" not in found
 
 
-def test_a_span_has_its_own_part_of_the_path_up_to_its_ends(memory: Memory) -> None:
-    found = shown(memory, f"start={BEGIN_S + 2}&end={BEGIN_S + 7}")
-    assert found["path"]["x"][0] == pytest.approx(2.0, abs=0.06)
-    assert found["path"]["x"][-1] == pytest.approx(7.0, abs=0.06)
-    assert found["path"]["continues"]
-    assert (found["start"], found["end"]) == (BEGIN_S + 2, BEGIN_S + 7)
-    assert found["robot"]["x"] == 30.0
-
-
 def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path) -> None:
     """Totals are those of `recap` and of pictures: the first pose, inside a millisecond, counts."""
     at = BEGIN + 700_400
@@ -222,15 +214,6 @@ def test_where_a_part_takes_too_long_the_others_are_shown(
     assert found["path"]["x"][-1] == 30.0
 
 
-@pytest.mark.parametrize(("waiting", "is_shown"), [(0, False), (3, False), (4, True)])
-def test_bags_that_were_just_closed_are_no_store_that_is_being_filled(
-    memory: Memory, waiting: int, is_shown: bool
-) -> None:
-    """A robot that records always has one: the page would ask for everything again and again."""
-    found = shown(memory, progress=lambda: Progress(closed=50, waiting=waiting))
-    assert (found["filling"] is not None) == is_shown
-
-
 def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:
     signal = "/odom:twist.twist.linear.x"
     [found] = shown(memory, f"last=1000&signal={signal}")["signals"]
@@ -271,46 +254,24 @@ def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
     assert max(right["high"]) == pytest.approx(30.0)
 
 
-def test_a_moment_has_the_robot_and_what_it_saw(memory: Memory) -> None:
-    found = moment(memory, f"t={BEGIN_S + 15}")
-    assert found["robot"]["x"] == 10.0
-    assert [each["label"] for each in found["seen"]] == ["cup"]
-    assert moment(memory, f"t={BEGIN_S + 5}")["seen"] == []
-
-
-def test_a_stretch_has_what_was_seen_and_happened_in_it(memory: Memory) -> None:
-    found = moment(memory, f"start={BEGIN_S + 9}&end={BEGIN_S + 19}")
-    assert [each["label"] for each in found["seen"]] == ["cup"]
-    assert {each["kind"] for each in found["events"]} == {"stop"}
-    assert found["distance_m"] == pytest.approx(1.0, abs=0.2)
-
-
-def test_a_label_has_its_sightings_newest_first(memory: Memory) -> None:
-    found = moment(memory, f"label=cup&start={BEGIN_S}&end={BEGIN_S + 200}")
-    times = [each["last_seen"] for each in found["sightings"]]
-    assert len(times) == found["total"] == 3
-    assert times == sorted(times, reverse=True)
-
-
 @pytest.mark.parametrize(
-    ("query", "why"),
+    ("read", "query", "why"),
     [
-        ("start=a&end=2", "start must be a number of seconds"),
-        ("last=nan", "last must be a number of seconds"),
-        ("signal=odom", "/topic:field"),
-        ("&".join(f"signal=/t:{n}" for n in range(9)), "at most 4"),
+        (span_request, "start=a&end=2", "start must be a number of seconds"),
+        (span_request, "last=nan", "last must be a number of seconds"),
+        (span_request, "signal=odom", "/topic:field"),
+        (span_request, "&".join(f"signal=/t:{n}" for n in range(9)), "at most 4"),
+        (window_asked, "start=1", "give start"),
+        (window_asked, "start=2&end=1", "give start"),
+        (box_asked, "x0=0&y0=0&x1=1&y1=1", "give x0"),
+        (box_asked, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
+        (partial(moment_asked, memory=None, call=None), "label=cup", "give t, or start and end"),
+        (partial(moment_asked, memory=None, call=None), f"t=1&label={'x' * 201}", "longer than"),
     ],
 )
-def test_a_span_that_cannot_be_asked_is_refused_with_the_reason(query: str, why: str) -> None:
+def test_what_cannot_be_asked_is_refused_with_the_reason(read: Any, query: str, why: str) -> None:
     with pytest.raises(InvalidArgumentsError, match=why):
-        span_request(QueryParams(query))
-
-
-def test_a_moment_without_a_time_is_refused(memory: Memory) -> None:
-    with pytest.raises(InvalidArgumentsError, match="give t, or start and end"):
-        moment(memory, "label=cup")
-    with pytest.raises(InvalidArgumentsError, match="longer than"):
-        moment(memory, f"t=1&label={'x' * 201}")
+        read(QueryParams(query))
 
 
 paths = st.lists(
@@ -372,22 +333,6 @@ def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
     assert kept[0]["arguments"] == '{"n": 4}'
     assert len(str(kept[0]["answer"])) <= 2_000
     assert log.count == 5
-
-
-def test_kept_questions_are_shown_and_make_an_answer_new(bag_dir: Path) -> None:
-    memory, log = memory_of(bag_dir), QuestionLog(3, wall=lambda: BEGIN)
-    before = shown(memory, questions=log)
-    assert before["questions"] == []
-    log.add("recap", {"last_s": 60}, answered("recap"), '{"events": []}')
-    [kept] = shown(memory, f"version={before['version']}", questions=log)["questions"]
-    assert kept == {
-        "asked": BEGIN_S - 0.25,
-        "tool": "recap",
-        "arguments": '{"last_s": 60}',
-        "outcome": "ok",
-        "ms": 250.0,
-        "answer": '{"events": []}',
-    }
 
 
 def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
@@ -568,24 +513,6 @@ def test_without_a_path_it_says_what_gives_one(tmp_path: Path) -> None:
     assert "latitude and longitude are on /fix" in found["no_path"]
 
 
-def test_transforms_of_the_body_give_the_path_where_no_topic_has_poses(tmp_path: Path) -> None:
-    moved = [
-        tf(at, transform(at, "odom", "base", (nth / 2, 0.0, 0.0)))
-        for nth, at in enumerate(range(BEGIN, BEGIN + 10 * S, S))
-    ]
-    write_mcap(tmp_path / "bag.mcap", moved)
-    path = shown(memory_of(tmp_path))["path"]
-    assert path["frame"] == "odom"
-    assert (path["x"][0], path["x"][-1]) == (0.0, 4.5)
-
-
-def test_the_only_topic_of_poses_gives_the_path_with_a_note(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0, topic="/base")])
-    found = shown(memory_of(tmp_path))
-    assert (found["path"]["x"], found["path"]["y"]) == ([1.0], [2.0])
-    assert any(note.startswith("by /base, the only topic") for note in found["notes"])
-
-
 def topics(memory: Memory, query: str) -> dict[str, Any]:
     reply = topics_shown(memory, Call(), window_asked(QueryParams(query)))
     found: dict[str, Any] = json.loads(to_json_text(reply))
@@ -605,12 +532,6 @@ def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory
     assert set(seen["spoke"][:10]) == {0} != set(seen["spoke"][10:20])
     assert {"position.x", "orientation.yaw_deg", "linear_velocity.x"} <= set(odometry["numbers"])
     assert found["places_robot"] == [{"topic": "/odom", "kind": "poses"}]
-
-
-@pytest.mark.parametrize("query", ["", "start=1", "start=2&end=1", "start=1&end=x"])
-def test_topics_of_no_span_are_refused(memory: Memory, query: str) -> None:
-    with pytest.raises(InvalidArgumentsError, match=r"give start|must be a number"):
-        topics(memory, query)
 
 
 def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_path: Path) -> None:
@@ -704,26 +625,6 @@ def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
     assert 100 < len(found["x"]) <= 400
     assert off_line(found, poses).max() <= 0.004
-
-
-def test_where_time_runs_out_the_track_takes_the_place_of_older_poses(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def slow(*_: object) -> None:
-        raise QueryTimeoutError("it takes too long")
-
-    memory, poses = circles(tmp_path, laps=1)
-    monkeypatch.setattr("ros2_memory.places.robot_tracks.RobotTracks.poses", slow)
-    window = TimeWindow.from_unix(BEGIN_S, BEGIN_S + 1000)
-    found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.001))
-    assert not found["exact"]
-    assert off_line(found, poses).max() <= 0.06
-
-
-@pytest.mark.parametrize("query", ["", "x0=0&y0=0&x1=1&y1=1", "x0=0&y0=0&x1=1&y1=1&pixel=-1"])
-def test_a_box_without_its_corners_or_a_pixel_is_refused(query: str) -> None:
-    with pytest.raises(InvalidArgumentsError, match="give x0"):
-        box_asked(QueryParams(query))
 
 
 @pytest.mark.parametrize(("first", "seconds"), [(True, 0.7), (False, 2.4)])

@@ -232,9 +232,7 @@ VISIT = {"sec-fetch-mode": "navigate", "sec-fetch-dest": "document"}
         "file://",
     ],
 )
-async def test_other_sites_and_malformed_origins_are_refused(
-    path: str, origin: str
-) -> None:
+async def test_other_sites_and_malformed_origins_are_refused(path: str, origin: str) -> None:
     async with client(app()) as http:
         assert (await http.get(path, headers={"origin": origin})).status_code == 403
         both = [("origin", HOME), ("origin", origin)]

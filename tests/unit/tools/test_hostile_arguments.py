@@ -86,13 +86,6 @@ def test_a_thousand_unknown_arguments_are_told_in_few_words(dispatcher: Dispatch
     assert "995 more" in shown["detail"]
 
 
-def test_many_wrong_arguments_are_told_in_few_words(dispatcher: Dispatcher) -> None:
-    wrong = {name: float("nan") for name in TOOLS["find_matches"]["properties"]}
-    shown = held(asked(dispatcher, "find_matches", wrong))
-    assert shown["error"] == "invalid_arguments"
-    assert re.search(r"; and \d more problems$", shown["detail"])
-
-
 @pytest.mark.parametrize(
     "given",
     [

@@ -81,17 +81,6 @@ def test_a_table_has_it_as_its_last_column(memory: Memory, folder: Path) -> None
     assert short["fields"] == ["timestamp", "position.x"]
 
 
-def test_the_topic_of_all_rows_is_said_once(memory: Memory, folder: Path) -> None:
-    given = {"condition_type": "contains", "value": "cup", "limit": 3}
-    one = asked(memory, folder, "find_matches", topic="*/scene_objects", **given)
-    assert one["topic"] == SEEN
-    assert len(one["sightings"]) == 3
-    assert not [row for row in one["sightings"] if "topic" in row]
-    several = asked(memory, folder, "find_matches", topic="*", **given)
-    assert "topic" not in several
-    assert {row["topic"] for row in several["sightings"]} == {SEEN}
-
-
 def days_said(reply: Any) -> list[str]:
     return [row["local"] for row in _objects(reply) if "local" in row]
 
@@ -129,25 +118,6 @@ def test_rows_of_things_and_places_say_each_day_once(
     ]
     assert said
     assert [sum(day in text for text in said) for day in days] == [1, 1]
-
-
-def test_a_row_that_says_a_day_says_the_whole_stretch(memory: Memory, folder: Path) -> None:
-    things = asked(memory, folder, "find_things")["things"]
-    rows = [thing for thing in things if "local" in thing]
-    assert 0 < len(rows) < len(things)
-    for row in rows:
-        begins, ends = (
-            f"{datetime.fromtimestamp(row[key], UTC).astimezone():%a %Y-%m-%d %H:%M:%S}"
-            for key in ("first_seen", "last_seen")
-        )
-        same_day = begins[:15] if begins[:15] == ends[:15] else ""
-        assert row["local"] == f"{begins} - {ends.removeprefix(same_day)}"
-
-
-def test_a_reply_about_minutes_has_none(memory: Memory, folder: Path) -> None:
-    short = {"start": BEGIN + DAY_S, "end": BEGIN + DAY_S + 3600}
-    earlier = {"with_start": BEGIN + DAY_S - 7200, "with_end": BEGIN + DAY_S - 3600}
-    assert days_said(asked(memory, folder, "compare", **short, **earlier)) == []
 
 
 def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does_not(

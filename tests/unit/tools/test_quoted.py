@@ -193,17 +193,6 @@ def test_what_holds_no_text_of_a_message_has_no_mark(tmp_path: Path) -> None:
         assert "quoted" not in reply, tool
 
 
-def test_a_word_that_somebody_says_is_marked_though_a_label_of_one_word_is_not(
-    tmp_path: Path,
-) -> None:
-    spoken_to(tmp_path, "stop")
-    memory, at = memory_of(tmp_path), {"timestamp": T0_S + 29}
-    said = asked(memory, tmp_path, "get_topic_at_time", topic="/speech", **at)
-    assert said["quoted"] == ["value.value"]
-    seen = asked(memory, tmp_path, "get_topic_at_time", topic="/vision/objects", **at)
-    assert "quoted" not in seen
-
-
 @pytest.mark.parametrize(
     ("tool", "given"),
     [
@@ -247,11 +236,6 @@ def test_a_reply_that_is_shortened_keeps_its_mark(bag_dir: Path, most: int) -> N
         text = replied(memory_of(bag_dir), bag_dir, tool, given, max_chars=most).text
         assert len(text) <= most
         assert json.loads(text)["quoted"]
-
-
-def test_of_very_many_places_the_keys_above_them_are_marked() -> None:
-    value = quote({f"text_{n}": ATTACK for n in range(500)})
-    assert quoted_keys({"value": value, "frame_id": named(ATTACK)}) == ["value", "frame_id"]
 
 
 def test_names_in_a_message_are_its_own_and_never_become_the_mark() -> None:

@@ -25,7 +25,7 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.model import FrameEdge, Pose, Sample, SetAside, Transform, Twist
+from ros2_memory.core.model import Pose, Sample, SetAside
 from ros2_memory.core.reply import LocalTimes
 from ros2_memory.core.timebase import NS_PER_S, ns_from_unix, unix_rounded_up
 from ros2_memory.results import Answer
@@ -103,55 +103,10 @@ NOWHERE = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, HALF, HALF), "odom")
     [
         pytest.param((), "[]", id="no topics are an empty list"),
         pytest.param(
-            (row(1), results.TopicRow("/x", "a/msg/B", T0, T0, 1, "no definition")),
-            '[{"topic":"/topic_0001","type":"std_msgs/msg/String","first_ts":1784023200.0,'
-            '"last_ts":1784023200.000001,"count":7},{"topic":"/x","type":"a/msg/B",'
-            '"first_ts":1784023200.0,"last_ts":1784023200.0,"count":1}]',
-            id="topics are a bare list",
-        ),
-        pytest.param(
-            value(),
-            '{"topic":"/a","type":"std_msgs/msg/Float64","timestamp":1784023200.0,"value":1.5}',
-            id="a topic's value has no age and no notes unless there are some",
-        ),
-        pytest.param(
-            value(age=1_234_567_890, notes=("thinned",)),
-            '{"topic":"/a","type":"std_msgs/msg/Float64","timestamp":1784023200.0,"value":1.5,'
-            '"age_s":1.235,"notes":["thinned"]}',
-            id="a topic's value with its age",
-        ),
-        pytest.param(
             results.Position("/odom", T0, NOWHERE, age=2 * NS_PER_S),
             '{"x":1.2346,"y":null,"z":0.0,"yaw_deg":90.0,"timestamp":1784023200.0,'
             '"topic":"/odom","frame_id":"odom","age_s":2.0}',
             id="a position is in metres and degrees, with null for what is not known",
-        ),
-        pytest.param(
-            results.Velocity(
-                "/odom",
-                T0,
-                Twist((0.50001, 0.0, math.inf), (0.0, 0.0, -0.12345), "base_link"),
-                notes=("odd",),
-            ),
-            '{"linear":{"x":0.5,"y":0.0,"z":null},"angular":{"x":0.0,"y":0.0,"z":-0.1235},'
-            '"timestamp":1784023200.0,"topic":"/odom","frame_id":"base_link","notes":["odd"]}',
-            id="a velocity has a linear and an angular part",
-        ),
-        pytest.param(
-            results.TransformAt(
-                "odom", "laser", T0, Transform((0.123456, 0.0, 0.2), (0.0, 0.0, -HALF, HALF)), "log"
-            ),
-            '{"translation":{"x":0.1235,"y":0.0,"z":0.2},'
-            '"rotation":{"x":0.0,"y":0.0,"z":-0.707107,"w":0.707107},"yaw_deg":-90.0,'
-            '"timestamp":1784023200.0,"parent":"odom","child":"laser","clock":"log"}',
-            id="a transform has translation, rotation and yaw",
-        ),
-        pytest.param(
-            results.Frames((FrameEdge("odom", "base", False), FrameEdge("base", "laser", True))),
-            '{"frames":["base","laser","odom"],"transforms":['
-            '{"parent":"base","child":"laser","static":true},'
-            '{"parent":"odom","child":"base","static":false}]}',
-            id="frames are named once and sorted",
         ),
         pytest.param(results.Match(None), "null", id="a complete search without a match"),
         pytest.param(results.ValueWhen(None), "null", id="a complete search for a value"),
@@ -173,32 +128,10 @@ NOWHERE = Pose((1.234567, math.nan, -0.00001), (0.0, 0.0, HALF, HALF), "odom")
             id="a match says when, what and where, with each note once",
         ),
         pytest.param(
-            results.ValueWhen(
-                value(T0, {"data": True}),
-                results.TopicValue(
-                    "/odom", "nav_msgs/msg/Odometry", Sample(T0 - NS_PER_S, {"x": 1})
-                ),
-                notes=("1 s older",),
-            ),
-            '{"timestamp":1784023200.0,"matched":{"data":true},"value":{"x":1},'
-            '"value_timestamp":1784023199.0,"condition_topic":"/a","value_topic":"/odom",'
-            '"notes":["1 s older"]}',
-            id="a value when another matched has both",
-        ),
-        pytest.param(
             results.ValueWhen(value(), notes=("/odom held no message yet",)),
             '{"timestamp":1784023200.0,"matched":1.5,"value":null,"value_timestamp":null,'
             '"condition_topic":"/a","value_topic":null,"notes":["/odom held no message yet"]}',
             id="a topic that held nothing yet gives a null value",
-        ),
-        pytest.param(
-            trajectory(),
-            '{"distance_m":12.3457,"avg_speed":0.2058,"max_speed":0.5,"duration_s":60.0,'
-            '"waypoints":[{"timestamp":1784023200.0,"x":0.0,"y":1.0,"z":0.0,"yaw_deg":90.0},'
-            '{"timestamp":1784023200.000001,"x":1.0,"y":2.0,"z":0.0,"yaw_deg":null}],'
-            '"topic":"/odom","frame_id":"odom","start":1784023200.0,"end":1784023200.000001,'
-            '"poses":3000}',
-            id="a trajectory is rounded to sense",
         ),
     ],
 )
@@ -283,70 +216,12 @@ def test_a_timestamp_is_rounded_up_so_that_it_finds_its_own_message() -> None:
     assert said(value(at))["timestamp"] == 1784023200.123457
 
 
-def test_an_empty_memory_has_nulls_for_its_span() -> None:
-    empty = results.DataTimeRange(
-        None, None, T0, 0, (), (), (), (), (), 0, notes=("there is nothing",)
-    )
-    shown = said(empty)
-    assert [shown[key] for key in ("earliest", "latest", "earliest_local", "latest_local")] == [
-        None
-    ] * 4
-    assert shown["now"] == 1784023200.0
-    assert shown["bags"] == 0
-    assert shown["notes"] == ["there is nothing"]
-
-
-def test_the_span_lists_gaps_and_files_below_the_bag_directory() -> None:
-    shown = said(
-        results.DataTimeRange(
-            T0,
-            T0 + 90 * NS_PER_S,
-            T0 + 100 * NS_PER_S,
-            3,
-            (results.Gap(T0 + 10 * NS_PER_S, T0 + 70 * NS_PER_S),),
-            (SetAside(BAGS / "r1" / "r1_2.mcap", "left open"),),
-            (SetAside(BAGS / "r2" / "r2_0.mcap", "being written"),),
-            (SetAside(Path("/else/where.mcap"), "no bag"),),
-            (),
-            4,
-        )
-    )
-    gap = {"start": 1784023210.0, "end": 1784023270.0, "duration_s": 60.0}
-    assert shown["gaps"] == [gap]
-    assert shown["incomplete"] == [{"file": "r1/r1_2.mcap", "reason": "left open"}]
-    assert shown["active"] == [{"file": "r2/r2_0.mcap", "reason": "being written"}]
-    assert shown["damaged"] == [{"file": "where.mcap", "reason": "no bag"}]
-    assert shown["unread"] == []
-    assert shown["silent_topics"] == 4
-    assert shown["latest_local"].startswith("2026-07-1")
-    assert "notes" not in shown
-
-
 def test_long_lists_of_files_show_the_last_ones_and_their_number() -> None:
     damaged = tuple(SetAside(BAGS / f"{n:03}.mcap", "torn") for n in range(50))
     shown = said(results.DataTimeRange(T0, T0, T0, 1, (), (), (), damaged, (), 0))
     assert [each["file"] for each in shown["damaged"]] == [f"{n:03}.mcap" for n in range(30, 50)]
     assert shown["damaged_count"] == 50
     assert shown["notes"] == ["damaged: the last 20 of 50 are listed"]
-
-
-def test_each_of_many_samples_has_every_field_also_those_that_are_always_zero() -> None:
-    whole = [odom(-1.2345 * n / 50, 2.3456 - n / 70) for n in range(100)]
-    reply = REPLIES.answer(of_samples(whole))
-    shown = json.loads(reply.text)
-    assert len(reply.text) <= 24_000
-    assert len(shown["samples"]) > 60
-    for sample in shown["samples"]:
-        assert sample["value"].keys() == whole[0].keys()
-        assert sample["value"]["position"].keys() == {"x", "y", "z"}
-        assert sample["value"]["orientation"].keys() == whole[0]["orientation"].keys()
-
-
-def test_a_hundred_positions_stay_below_9_000_characters() -> None:
-    narrow = [{"position": odom(-1.2345 - n / 90, 2.3456)["position"]} for n in range(100)]
-    reply = REPLIES.answer(of_samples(narrow))
-    assert len(reply.text) < 9_000
-    assert len(json.loads(reply.text)["samples"]) == 100
 
 
 def of_fields(values: list[Any], fields: tuple[str, ...]) -> results.TopicRange:
@@ -365,12 +240,6 @@ def test_a_range_with_fields_is_a_table() -> None:
         [1784023200.123457, None, None, None, 0.5, None],
     ]
     assert "samples" not in shown
-
-
-def test_lists_and_empty_objects_are_cells() -> None:
-    shown = said(of_fields([{"ranges": [1.0, 2.0], "more": {}}], ("ranges", "more")))
-    assert shown["fields"] == ["timestamp", "ranges", "more"]
-    assert shown["rows"] == [[1784023200.0, [1.0, 2.0], {}]]
 
 
 def test_a_hundred_poses_stay_below_6_000_characters() -> None:
@@ -427,49 +296,6 @@ def test_a_local_time_names_the_day_where_it_is_another() -> None:
     assert [local.text(None), *(span.text(T0) for span in unknown)] == [None] * 3
 
 
-@pytest.mark.usefixtures("utc")
-def test_a_recap_of_days_has_local_times_at_its_events_and_one_of_an_hour_has_its_own() -> None:
-    stop = results.Event("stop", T0, T0 + HOUR, "stood")
-    day = results.Recap(T0, T0 + 13 * HOUR, T0 + 14 * HOUR, 1.0, 1.0, 0, 0, None, (stop,), ())
-    shown = said(day)
-    assert shown["events"][0]["local"] == "Tue 2026-07-14 10:00:00 - 11:00:00"
-    assert shown["local"] == "Tue 2026-07-14 10:00:00 - 23:00:00"
-    hour = said(replace(day, end=T0 + HOUR))
-    assert hour["local"] == "Tue 2026-07-14 10:00:00 - 11:00:00"
-    assert "local" not in hour["events"][0]
-    assert "local" not in said(replace(day, end=T0 + HOUR, now=T0 + HOUR))
-
-
-@pytest.mark.usefixtures("utc")
-def test_visits_gaps_and_extremes_of_days_have_local_times() -> None:
-    visit = results.Visit(None, T0 + HOUR, HOUR, 0.1, T0, 0)
-    there = results.Visits("map", 0.0, 0.0, 1.0, (visit,), False, 1, T0 + 20 * HOUR)
-    assert said(there)["visits"][0]["local"] == "- Tue 2026-07-14 11:00:00"
-    hole = results.Gap(T0 + HOUR, T0 + 2 * HOUR)
-    covered = results.DataTimeRange(
-        T0, T0 + 20 * HOUR, T0 + 20 * HOUR, 1, (hole,), (), (), (), (), 0
-    )
-    assert said(covered)["gaps"][0]["local"] == "Tue 2026-07-14 11:00:00 - 12:00:00"
-    samples = (Sample(T0, {"level": 0.5}), Sample(T0 + 20 * HOUR, {"level": 0.25}))
-    extremes = (results.Extremes("level", 0.25, T0 + 20 * HOUR, 0.5, T0),)
-    shown = said(results.TopicRange("/a", "t", 2, samples, extremes, ("level",)))
-    assert shown["extremes"]["level"]["min_local"] == "Wed 2026-07-15 06:00:00"
-    assert shown["extremes"]["level"]["max_local"] == "Tue 2026-07-14 10:00:00"
-
-
-@pytest.mark.usefixtures("utc")
-def test_a_match_of_long_ago_has_its_local_time() -> None:
-    assert "local" not in said(results.Match(value(age=12 * HOUR)))
-    assert said(results.Match(value(age=13 * HOUR)))["local"] == "Tue 2026-07-14 10:00:00"
-
-
-@pytest.mark.parametrize("orientation", [None, (0.0, 0.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0)])
-def test_a_position_without_a_rotation_has_no_yaw(orientation: Any) -> None:
-    shown = said(results.Position("/gps", T0, Pose((1.0, 2.0, 3.0), orientation)))
-    assert shown["yaw_deg"] is None
-    assert shown["frame_id"] is None
-
-
 def test_a_trajectory_says_what_was_left_out_and_how_it_was_measured() -> None:
     notes = said(
         trajectory(
@@ -491,26 +317,6 @@ def test_a_jump_is_marked_at_the_waypoint_it_led_to() -> None:
     ]
     shown = said(trajectory(waypoints=waypoints, totals=driven(9, 99.0)))
     assert shown["notes"][1].startswith("of the jumps the longest lead to a waypoint")
-
-
-def test_without_a_single_valid_pose_nothing_is_said_of_the_way() -> None:
-    shown = said(
-        trajectory(
-            poses=0,
-            invalid=1,
-            waypoints=(),
-            totals=MotionTotals(),
-            avg_speed=0.0,
-            max_speed=0.0,
-            max_speed_from="positions",
-        )
-    )
-    assert [shown[key] for key in ("distance_m", "avg_speed", "max_speed", "duration_s")] == [
-        None
-    ] * 4
-    assert shown["notes"] == [
-        "1 pose left out: their coordinates are not valid (NaN or out of range)"
-    ]
 
 
 def test_a_mean_above_the_highest_speed_is_told() -> None:

@@ -82,16 +82,6 @@ def test_a_thinned_range_is_evenly_spaced_and_uses_the_room(count: int, cap: int
         assert len(to_json_text(shown)) > cap - 800
 
 
-def test_a_thinned_range_says_how_many_are_left_and_how_to_see_more() -> None:
-    shown = strict(fit_reply({**samples(1000), "notes": ["first"]}, 2000))
-    thinned = (
-        f"samples: {len(shown['samples'])} of 1000 kept, evenly spaced, to keep the reply under "
-        "2000 characters; ask for a shorter window or for fewer fields to see more"
-    )
-    assert shown["notes"] == ["first", thinned]
-    assert list(shown)[-1] == "notes"
-
-
 @given(st.integers(2, 300), st.integers(1, 60), st.integers(600, 6000))
 def test_a_thinned_table_keeps_its_ends_and_every_cell_of_its_columns(
     count: int, columns: int, cap: int
@@ -122,14 +112,6 @@ def test_lists_that_are_not_along_time_keep_their_beginning() -> None:
     assert shown["notes"][0].startswith(f"frames: {len(kept)} of 500 kept, from the beginning")
 
 
-def test_a_single_huge_array_is_thinned_evenly_with_a_note() -> None:
-    shown = strict(fit_reply({"topic": "/scan", "value": {"ranges": list(range(20_000))}}, 2000))
-    ranges = shown["value"]["ranges"]
-    assert (ranges[0], ranges[-1]) == (0, 19_999)
-    assert len(ranges) > 100
-    assert f"ranges (evenly thinned: {len(ranges)} of 20000 kept)" in shown["notes"][0]
-
-
 def test_a_single_huge_text_is_cut_with_a_note_and_fills_the_room() -> None:
     shown = strict(fit_reply({"topic": "/log", "value": {"msg": "ab" * 50_000}}, 2000))
     assert shown["topic"] == "/log"
@@ -147,7 +129,7 @@ def test_a_wide_object_loses_keys_with_a_note() -> None:
 
 def test_what_cannot_be_shortened_leaves_what_it_is_about() -> None:
     tree: Any = 1
-    for _ in range(7):
+    for _ in range(5):
         tree = {f"branch_{n}": tree for n in range(5)}
     shown = strict(fit_reply({"topic": "/tree", "timestamp": 1.5, "value": tree}, 1000))
     assert (shown["topic"], shown["timestamp"]) == ("/tree", 1.5)
