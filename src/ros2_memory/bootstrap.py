@@ -64,6 +64,7 @@ if TYPE_CHECKING:
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
+    from ros2_memory.storage.base import BagWriter
     from ros2_memory.triggers.exclusion import ExclusionRule
     from ros2_memory.triggers.rules import Rule
     from ros2_memory.triggers.screening import Screening
@@ -165,12 +166,12 @@ def build_housekeeper(
     # At most half the budget, so that saved moments leave room for new recordings.
     moments_bytes = round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB)
     rules = rules_of(settings, moments_bytes)
-    bags = BagDirReader(reader)
+    bags, writer = BagDirReader(reader), McapWriter(settings.reader.max_chunk_mb)
     own = own or OwnRecordings(bag_dir)
     return Housekeeping(
         bag_dir,
         bags,
-        McapWriter(settings.reader.max_chunk_mb),
+        writer,
         WallClock(),
         retention_limits(settings),
         is_synchronised=is_synchronised,
@@ -179,18 +180,19 @@ def build_housekeeper(
         moments_bytes=moments_bytes,
         rule_bytes={each.name: each.max_bytes for each in rules},
         watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
-        screening=_screening_of(settings, bag_dir, reader),
+        screening=_screening_of(settings, bag_dir, reader, writer),
         static_topics=settings.data.tf_static_topics,
         grace_s=settings.reader.index_refresh_s + settings.server.call_timeout_s,
-        memory=_memory_days_of(settings, bag_dir, bags, own),
-        cutter=_topic_cutter_of(settings, bag_dir, reader),
+        memory=_memory_days_of(settings, bag_dir, bags, own, writer),
+        cutter=_topic_cutter_of(settings, bag_dir, reader, writer),
     )
 
 
-def _topic_cutter_of(settings: Settings, bag_dir: Path, reader: BagReader) -> TopicCutter | None:
+def _topic_cutter_of(
+    settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
+) -> TopicCutter | None:
     """Returns what cuts topics with a shorter life out of bags; None where none has one."""
     from ros2_memory.retention.topic_ages import TopicAge, TopicCutter, is_quiet
-    from ros2_memory.storage.mcap.writer import McapWriter
 
     topic_ages = [
         TopicAge(topics, ns_from_unix(life.max_age_h * 3600))
@@ -202,14 +204,14 @@ def _topic_cutter_of(settings: Settings, bag_dir: Path, reader: BagReader) -> To
         bag_dir,
         topic_ages,
         reader,
-        McapWriter(settings.reader.max_chunk_mb),
+        writer,
         static_topics=settings.data.tf_static_topics,
         is_quiet=is_quiet,
     )
 
 
 def _memory_days_of(
-    settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings
+    settings: Settings, bag_dir: Path, bags: BagReader, own: OwnRecordings, writer: BagWriter
 ) -> MemoryDays | None:
     """Returns what writes thinned days, or deletes those there are, where nothing is to stay."""
     from ros2_memory.bag_dir.layout import MEMORY_FOLDER
@@ -218,7 +220,6 @@ def _memory_days_of(
     if not memory.keep and not (bag_dir / MEMORY_FOLDER).is_dir():
         return None
     from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
-    from ros2_memory.storage.mcap.writer import McapWriter
 
     limits = MemoryLimits(
         memory.texts,
@@ -227,8 +228,6 @@ def _memory_days_of(
         round(memory.max_share * settings.retention.max_total_gb * GB),
         ns_from_unix(memory.max_age_d * 86_400),
     )
-    writer = McapWriter(settings.reader.max_chunk_mb)
-    static = settings.data.tf_static_topics
     return MemoryDays(
         bag_dir,
         bags,
@@ -236,7 +235,7 @@ def _memory_days_of(
         own,
         _extractor_of(settings),
         limits=limits if memory.keep else None,
-        static_topics=static,
+        static_topics=settings.data.tf_static_topics,
     )
 
 
@@ -320,8 +319,9 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
     return tuple(rules)
 
 
-def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Screening | None:
-    from ros2_memory.storage.mcap.writer import McapWriter
+def _screening_of(
+    settings: Settings, bag_dir: Path, reader: BagReader, writer: BagWriter
+) -> Screening | None:
     from ros2_memory.triggers.screening import Screening
 
     rules = exclusions_of(settings)
@@ -332,7 +332,7 @@ def _screening_of(settings: Settings, bag_dir: Path, reader: BagReader) -> Scree
         rules,
         reader,
         _extractor_of(settings),
-        McapWriter(settings.reader.max_chunk_mb),
+        writer,
         split_duration_s=settings.recording.split_duration_s,
     )
 

@@ -118,9 +118,9 @@ A = TypeVar("A", results.Match, results.ValueWhen)
 _MAX_ODD_BAGS: Final = 5
 _FEWEST_OF_A_LINE: Final = 2
 _REACH_M: Final = 0.05
+"""How far a robot may have got before the next pose without a note."""
 _THINNED_POSES_NS: Final = 3 * NS_PER_S
 """No farther apart are the poses of a thinned day, where they were recorded."""
-"""How far a robot may have got before the next pose without a note."""
 
 
 def topic_value(

@@ -198,7 +198,7 @@ def _parts_of_one(
         from ros2_memory.serving.page.routes import page_routes, warm_up
 
         page = page_routes(server.dispatcher, backfill.progress)
-        warm_page = partial(warm_up, memory, server.dispatcher)
+        warm_page = partial(warm_up, server.dispatcher)
 
     async def background() -> None:
         """Keeps the index fresh and the store of columns full, until it is cancelled."""

@@ -61,7 +61,9 @@ class Metrics(Observer):
         self._measuring: asyncio.Future[Sequence[Metric]] | None = None
         # One more series for each counter, of no use in this format.
         disable_created_metrics()  # type: ignore[no-untyped-call]  # has no types
+        self._gauges: Sequence[Metric] = ()
         self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(self)
         self._answers = Counter(
             "ros2_memory_answers",
             "Finished tool calls, by outcome.",
@@ -96,24 +98,14 @@ class Metrics(Observer):
                 loop = asyncio.get_running_loop()
                 self._measuring = loop.run_in_executor(self._thread, self._measure)
             gauges = await asyncio.shield(self._measuring)
-        text = generate_latest(_Collector(self._registry, gauges, self._version))
-        return Exposition(CONTENT_TYPE_PLAIN_0_0_4, text)
-
-
-@dataclass
-class _Collector:
-    """What `generate_latest` renders: the counters, and the gauges of one moment."""
-
-    _registry: CollectorRegistry
-    _gauges: Sequence[Metric]
-    _version: str
+        self._gauges = gauges
+        return Exposition(CONTENT_TYPE_PLAIN_0_0_4, generate_latest(self._registry))
 
     def collect(self) -> Iterator[Metric]:
-        """Yields all metric families."""
+        """Yields what the registry shows besides the counters."""
         yield InfoMetricFamily(
             "ros2_memory_build", "The version of this server.", {"version": self._version}
         )
-        yield from self._registry.collect()
         yield from self._gauges
 
 

@@ -39,6 +39,7 @@ from ros2_memory.things.seen import Watching
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from ros2_memory.index.timeline import Timeline
 
 T = TypeVar("T")
 
@@ -93,24 +94,30 @@ class Backfill:
             return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
         return self.filling.progress(timeline)
 
-    def waiting(self) -> list[BagFile]:
-        """Returns the bags of which columns are to be stored, the newest first."""
+    def _to_fill(self) -> tuple[Filling, Timeline] | None:
+        """Returns what fills the store, and the bags; None without a store, or without its bags.
+
+        A missing bag directory is more likely a missing disk than an empty one.
+        """
         snapshot = self._memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
-            return []
-        return self.filling.waiting(snapshot.timeline)
+            return None
+        return self.filling, snapshot.timeline
+
+    def waiting(self) -> list[BagFile]:
+        """Returns the bags of which columns are to be stored, the newest first."""
+        found = self._to_fill()
+        return [] if found is None else found[0].waiting(found[1])
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        snapshot = self._memory.index.snapshot()
-        if self.filling is None or snapshot.problem is not None:
-            return []
-        return self.filling.batches(snapshot.timeline)
+        found = self._to_fill()
+        return [] if found is None else found[0].batches(found[1])
 
     def store(self, batch: Batch) -> int:
         """Stores the columns of some bags; as `Filling.fill`."""
-        timeline = self._memory.index.snapshot().timeline
-        return 0 if self.filling is None else self.filling.fill(batch, timeline)
+        found = self._to_fill()
+        return 0 if found is None else found[0].fill(batch, found[1])
 
     def follow(self) -> bool:
         """Makes what follows from whole parts, and keeps the store within what it may take.
@@ -121,17 +128,18 @@ class Backfill:
         Returns:
             Whether there is more of that.
         """
-        snapshot = self._memory.index.snapshot()
-        if self.filling is None or snapshot.problem is not None:
+        found = self._to_fill()
+        if found is None:
             return False
-        coverage = self._memory.columns.coverage(snapshot.timeline)
-        missing = () if coverage is None else coverage.missing
-        waiting = [bag.start for bag in missing]
-        make_fragments(self._memory, self.filling.whole_since(), waiting)
-        self.filling.thin()
-        self.filling.trim()
+        filling, timeline = found
+        columns = self._memory.columns
+        coverage = columns.coverage(timeline)
+        waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
+        make_fragments(self._memory, filling.whole_since(), waiting)
+        filling.thin()
+        filling.trim()
         if self._of_others is None:
-            self._of_others = self._memory.columns.fragments_of_others()
+            self._of_others = columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
         windows = [TimeWindow(start, start + PART_NS) for start in now]
         make_fragments(self._memory, windows, [*waiting, *self._of_others])
@@ -143,13 +151,8 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        if self.filling is not None and self._memory.index.snapshot().problem is None:
-            self.filling.store.look_after(thorough=thorough)
-
-    def write_again(self) -> None:
-        """Finds out whether the disk works again, where nothing waits to be written."""
-        if self.filling is not None:
-            self.filling.store.write_again()
+        if (found := self._to_fill()) is not None:
+            found[0].store.look_after(thorough=thorough)
 
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
@@ -163,13 +166,12 @@ class Backfill:
     def prune(self) -> None:
         """Removes what is stored of deleted files; stores what each metadata.yaml lists now.
 
-        Does nothing where there are no bags: the disk of the bags is more likely missing than
-        empty.
+        Does nothing where there are no bags, for the same reason.
         """
-        snapshot = self._memory.index.snapshot()
-        if self.filling is not None and snapshot.problem is None and snapshot.bags:
-            self.filling.prune(snapshot.timeline)
-            self._memory.store_listings(snapshot)
+        found = self._to_fill()
+        if found is not None and found[1].bags:
+            found[0].prune(found[1])
+            self._memory.store_listings(self._memory.index.snapshot())
 
 
 def make_fragments(
@@ -291,8 +293,8 @@ class Filler:
         if is_helped and await _run_helper(self._helper):
             # Bags that the helper could not store are tried here, and refused if they fail.
             waiting = await in_thread(backfill.waiting)
-        if not waiting:
-            await in_thread(backfill.write_again)
+        if not waiting and store is not None:
+            await in_thread(store.write_again)  # whether the disk works again
         done = tried = 0
         for batch in await in_thread(backfill.batches):
             if tried >= (BACKLOG if self._helper else _BACKLOG_ALONE):

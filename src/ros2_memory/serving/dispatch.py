@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.tools.declaration import Question, Tool
+    from ros2_memory.tools.declaration import Tool
 
 
 LONGEST_ANSWER: Final = 2_000
@@ -120,6 +120,7 @@ class Dispatcher:
     turn of the memory's reader to hold much of a bag.
 
     Attributes:
+        memory: what answers.
         questions: the latest calls with their replies.
         tools: the tools that a call can name, in the order of their declaration.
         readable: the names of those that a resource can name.
@@ -143,7 +144,7 @@ class Dispatcher:
         self._large = large or LargeReads()
         self.tools = (*tools,)
         self.questions = QuestionLog(most_questions)
-        self._memory = memory
+        self.memory = memory
         self._tools = {tool.name: tool for tool in tools}
         self._readable = self._tools | {each.name: each for each in readable}
         self.readable = frozenset(self._readable)
@@ -172,7 +173,7 @@ class Dispatcher:
         for_resource: bool = False,
         for_page: bool = False,
         robots: frozenset[str] | None = None,
-        part: Callable[[Memory], Memory] | None = None,
+        part: Callable[[], Memory] | None = None,
     ) -> Reply:
         """Returns the reply to a call, within `call_timeout_s`. Raises nothing but cancellation.
 
@@ -215,30 +216,29 @@ class Dispatcher:
                     self.questions.add(name, given, done, text)
         return reply
 
-    async def look(
-        self, work: Callable[[Memory, Call], JsonObject], client: Hashable = None
-    ) -> Reply:
+    async def look(self, work: Callable[[Call], JsonObject], client: Hashable = None) -> Reply:
         """Returns what `work` returns as JSON, or its error; within the time of a call.
 
         For the page: it waits in the queue of the calls that may take long, and is no tool call of
         the log and the metrics. Raises nothing but cancellation.
         """
         over = threading.Event()
-        call, wait = self._call(over), _Wait()
+        call = self._call(over)
         self._begun += 1
-
-        def made() -> tuple[str, Reply]:
-            return self._asked(lambda: Reply(to_json_text(work(self._memory, call))), call, wait)
-
         with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
             try:
-                with anyio.move_on_after(self._call_timeout_s):
-                    return (await self.blocking.run(("page", client), made))[1]
-                return self._replies.error(self._timeout("the page", wait))
+                _, reply = await self._in_turn(
+                    "the page",
+                    self.blocking,
+                    ("page", client),
+                    call,
+                    lambda: Reply(to_json_text(work(call))),
+                )
             except EpisodicError as error:
                 return self._replies.error(error)
             finally:
                 self._end(over)
+        return reply
 
     def idle_call(self) -> Call | None:
         """Returns a call for work in advance, which times out as soon as anybody asks.
@@ -298,24 +298,52 @@ class Dispatcher:
         call: Call,
         client: Hashable,
         *,
-        part: Callable[[Memory], Memory] | None,
+        part: Callable[[], Memory] | None,
     ) -> tuple[str, Reply]:
-        wait = _Wait()
         try:
             tool = _named(name, tools)
             if part is not None and tool.writes:
                 raise InvalidArgumentsError(f"{name} writes, and is not asked of one recording")
             if excess := excess_in_arguments(given):
                 raise InvalidArgumentsError(excess)
-            question = asked = tool.question(given)
-            if part is not None:
-                question = lambda memory, call: asked(part(memory), call)  # noqa: E731 - of a part
+            question = tool.question(given)
+
+            def answer() -> Reply:
+                memory = self.memory if part is None else part()
+                try:
+                    found = question(memory, call)
+                except GoneError:  # the store has changed since, and is looked at anew
+                    found = question(memory, call)
+                return self._replies.answer(
+                    found,
+                    from_active=call.used_active,
+                    from_memory=call.used_thinned,
+                    now=call.now,
+                )
+
             queue = self.blocking if tool.blocking else self.quick
-            with anyio.move_on_after(self._call_timeout_s):
-                return await queue.run(client, partial(self._ask, question, call, wait))
-            raise self._timeout(name, wait)
+            return await self._in_turn(name, queue, client, call, answer)
         except EpisodicError as error:
             return error.code, self._replies.error(error)
+
+    async def _in_turn(
+        self,
+        name: str,
+        queue: FairQueue,
+        client: Hashable,
+        call: Call,
+        answer: Callable[[], Reply],
+    ) -> tuple[str, Reply]:
+        """Returns the outcome and the reply, once it is the client's turn.
+
+        Raises:
+            BusyError: its turn does not come in time, or too many wait.
+            QueryTimeoutError: the time of a call is up.
+        """
+        wait = _Wait()
+        with anyio.move_on_after(self._call_timeout_s):
+            return await queue.run(client, partial(self._asked, answer, call, wait))
+        raise self._timeout(name, wait)
 
     def _timeout(self, name: str, wait: _Wait) -> EpisodicError:
         """Returns why there is no answer when the time of a call is up."""
@@ -330,23 +358,6 @@ class Dispatcher:
             f"{name} needs more than {self._call_timeout_s:g} s{wait.note()}; "
             "ask about a shorter window or a single topic"
         )
-
-    def _ask(self, question: Question, call: Call, wait: _Wait) -> tuple[str, Reply]:
-        """Runs the query and renders its answer, in a worker thread."""
-
-        def answer() -> Reply:
-            try:
-                found = question(self._memory, call)
-            except GoneError:  # the store has changed since, and is looked at anew
-                found = question(self._memory, call)
-            return self._replies.answer(
-                found,
-                from_active=call.used_active,
-                from_memory=call.used_thinned,
-                now=call.now,
-            )
-
-        return self._asked(answer, call, wait)
 
     def _asked(self, answer: Callable[[], Reply], call: Call, wait: _Wait) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""

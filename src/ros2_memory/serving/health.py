@@ -5,6 +5,7 @@ The reply counts all faults and names the newest few, so that it stays small.
 
 from __future__ import annotations
 
+import asyncio
 import os
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import JsonValue, TimeWindow
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.reply import JsonObject, moment, seconds
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -120,28 +121,17 @@ class FleetHealth:
         A robot that does not answer in time delays the report by `TIMEOUT_S`, whatever their
         number.
         """
-        reports: dict[str, JsonObject] = {}
-
-        async def ask(name: str, health: Health) -> None:
-            reports[name] = await health()
-
-        async with anyio.create_task_group() as tasks:
-            for name, health in self._robots.items():
-                tasks.start_soon(ask, name, health)
-        problems = [
-            f"{name}: {problem}" for name in self._robots for problem in _problems(reports[name])
-        ]
-        robots: JsonObject = {}
-        for name in self._robots:
-            robots[name] = {
-                key: value for key, value in reports[name].items() if key not in {"version", "pid"}
-            }
+        found = await asyncio.gather(*(health() for health in self._robots.values()))
+        reports = dict(zip(self._robots, found, strict=True))
+        problems = []
+        for name, report in reports.items():
+            if isinstance(of_robot := report.get("problems"), list):
+                problems += [f"{name}: {each}" for each in of_robot]
+        robots: JsonObject = {
+            name: {key: value for key, value in report.items() if key not in {"version", "pid"}}
+            for name, report in reports.items()
+        }
         return _status(self._version, problems, {"robots": robots})
-
-
-def _problems(report: JsonObject) -> list[JsonValue]:
-    problems = report.get("problems")
-    return problems if isinstance(problems, list) else []
 
 
 def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:

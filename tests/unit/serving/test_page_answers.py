@@ -336,15 +336,15 @@ def test_the_latest_questions_are_kept_newest_first_and_bounded() -> None:
 
 
 def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
-    recordings = Recordings()
-    one = recordings.alone(memory, "rec_1")
+    recordings = Recordings(memory)
+    one = recordings.alone("rec_1")
     found = shown(one, "last=1000")
     assert found["range"]["earliest"] == BEGIN_S + 20
     assert found["range"]["latest"] == BEGIN_S + 39.9
     assert (found["path"]["x"][0], found["robot"]["x"]) == (10.0, 20.0)
     assert found["status"]["recorder"] is None
     assert moment(one, f"t={BEGIN_S + 5}")["robot"] is None
-    listed = recordings.shown(memory, one, Call())
+    listed = recordings.shown(one, Call())
     assert listed["recordings"] == [
         {"name": "rec_2", "start": BEGIN_S + 140, "end": BEGIN_S + 159.9},
         {"name": "rec_1", "start": BEGIN_S + 20, "end": BEGIN_S + 39.9},
@@ -352,26 +352,26 @@ def test_one_recording_answers_alone_and_all_are_listed(memory: Memory) -> None:
     ]
     assert listed["mixed"] == []
     # What belongs to the same recording later is asked of the same memory.
-    assert recordings.alone(memory, "rec_1") is one
+    assert recordings.alone("rec_1") is one
 
 
 @pytest.mark.parametrize("name", ["rec_9", "rec", "", ".", "../page0", "rec_1/..", "rec_1/x"])
 def test_a_recording_of_another_name_is_refused(memory: Memory, name: str) -> None:
     with pytest.raises(InvalidArgumentsError, match="no recording is named"):
-        Recordings().alone(memory, name)
+        Recordings(memory).alone(name)
 
 
 def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
     for n, name in enumerate(("robin/a", "robin/b", "wren/c", "moments/x/d", "moments/y/e")):
         write_mcap(tmp_path / name / "0.mcap", [odom(BEGIN + n * S, 0.0, 0.0)])
     memory = memory_of(tmp_path)
-    recordings = Recordings()
-    rows = recordings.shown(memory, memory, Call())["recordings"]
+    recordings = Recordings(memory)
+    rows = recordings.shown(memory, Call())["recordings"]
     assert isinstance(rows, list)
     names = [row["name"] for row in rows if isinstance(row, dict)]
     assert names == ["moments/y/e", "moments/x/d", "wren/c", "robin", "robin/b", "robin/a"]
     assert rows[3] == {"name": "robin", "start": BEGIN_S, "end": BEGIN_S + 1, "holds": 2}
-    assert len(recordings.alone(memory, "robin").index.snapshot().bags) == 2
+    assert len(recordings.alone("robin").index.snapshot().bags) == 2
 
 
 def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
@@ -391,7 +391,7 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
 
     def paths(start_s: int, stop_s: int) -> dict[str, tuple[float, float]]:
         window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
-        found: Any = Recordings().paths(memory, Call(), window)["paths"]
+        found: Any = Recordings(memory).paths(memory, Call(), window)["paths"]
         return {each["name"]: (each["x"][0], each["x"][-1]) for each in found}
 
     assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
@@ -412,7 +412,7 @@ def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_un
 
     def robots(start_s: int, stop_s: int) -> list[str]:
         window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
-        found: Any = Recordings().paths(memory, Call(), window)["paths"]
+        found: Any = Recordings(memory).paths(memory, Call(), window)["paths"]
         return [each["name"] for each in found]
 
     assert robots(0, 600) == ["robin", "wren"]
@@ -433,7 +433,7 @@ def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None
         return [each["label"] for each in shown(memory)["moments"]]
 
     assert sorted(labels(memory)) == ["of robin", "of wren"]
-    assert labels(Recordings().alone(memory, "wren")) == ["of wren"]
+    assert labels(Recordings(memory).alone("wren")) == ["of wren"]
 
 
 def test_a_transform_after_a_warm_up_gathers_no_static_ones(
@@ -446,7 +446,7 @@ def test_a_transform_after_a_warm_up_gathers_no_static_ones(
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [static, *moves, odom(at + S, 1.0, 0.0)])
     memory = memory_of(tmp_path)
     dispatcher = Dispatcher(memory, [], Replies(tmp_path, 9_000), call_timeout_s=5)
-    assert warm_up(memory, dispatcher)
+    assert warm_up(dispatcher)
     gathered = "ros2_memory.history.transforms._received"
     monkeypatch.setattr(gathered, lambda *_: pytest.fail("was gathered"))
     found = transform_at(View(memory, Call()), "odom", "camera", at + S)
@@ -458,11 +458,11 @@ async def test_a_warm_up_gives_way_to_a_question_and_goes_on_later(memory: Memor
     call = dispatcher.idle_call()
     assert call is not None
     assert not call.deadline.expired()
-    await dispatcher.look(lambda _memory, _call: {})
+    await dispatcher.look(lambda _call: {})
     assert call.deadline.expired()
     # Somebody who asked may ask again at once.
     assert dispatcher.idle_call() is None
-    assert not warm_up(memory, dispatcher)
+    assert not warm_up(dispatcher)
 
 
 async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes_is_refused(

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from dataclasses import replace
 from difflib import get_close_matches
+from functools import lru_cache, partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final
-from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
@@ -32,7 +30,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory, SnapshotSource
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.index.timeline import Timeline
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""
@@ -76,61 +73,46 @@ class OneRecording:
 class Recordings:
     """The recordings of a memory, and a memory for each that is looked at. Thread-safe."""
 
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._memories: OrderedDict[str, Memory] = OrderedDict()
-        self._listed: WeakKeyDictionary[Timeline, list[JsonObject]] = WeakKeyDictionary()
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+        self._narrowed = lru_cache(_MOST_MEMORIES)(partial(_narrowed, memory))
 
-    def alone(self, memory: Memory, name: str) -> Memory:
+    def alone(self, name: str) -> Memory:
         """Returns a memory that holds one recording, or those of one folder, and nothing else.
-
-        Its ages count from its newest message, and it has neither a recorder nor a budget.
 
         Raises:
             InvalidArgumentsError: none is named so.
         """
-        with self._lock:
-            found = self._memories.get(name)
-        if found is None:
-            limits = replace(memory.limits, now="latest", kept=None, recording=name)
-            index = OneRecording(memory.index, name)
-            found = replace(memory, index=index, limits=limits, memo=Memo())
+        found = self._narrowed(name)
         snapshot = found.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
-            near = get_close_matches(name, [str(each["name"]) for each in self._list(memory)], n=3)
+            near = get_close_matches(name, [str(each["name"]) for each in self._list()], n=3)
             similar = f"; similar: {', '.join(near)}" if near else ""
             raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
-        with self._lock:
-            found = self._memories.setdefault(name, found)
-            self._memories.move_to_end(name)
-            if len(self._memories) > _MOST_MEMORIES:
-                self._memories.popitem(last=False)
         return found
 
-    def shown(self, memory: Memory, chosen: Memory, call: Call) -> JsonObject:
-        """Returns the recordings of a memory, the newest first, and where robots are mixed.
-
-        Of the latter in what is chosen.
-        """
-        rows = self._list(memory)
-        newest: list[JsonValue] = [*rows[:MOST_RECORDINGS]]
+    def shown(self, chosen: Memory, call: Call) -> JsonObject:
+        """Returns the recordings, newest first, and where robots are mixed in what is chosen."""
+        rows = self._list()
         return {
-            "recordings": newest,
+            "recordings": [*rows[:MOST_RECORDINGS]],
             "recordings_total": len(rows),
             "mixed": [each.removesuffix(ADVICE) for each in describe_mixed(chosen, call)],
         }
 
-    def paths(self, memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
+    def paths(self, chosen: Memory, call: Call, window: TimeWindow) -> JsonObject:
         """Returns a path for each robot, where recordings are plainly of several; else none.
 
         Each is of one recording, or of a folder of recordings that do not overlap each other.
         Those that overlap come first, then the newest.
         """
-        names = _robots(memory, call, window)
+        names = _robots(chosen, call, window)
         found: list[JsonValue] = []
         for name in sorted(names[:MOST_PATHS]):
             try:
-                path = path_in(self.alone(memory, name), call, window)
+                one = self.alone(name)
+                limits = replace(one.limits, pose_topic=chosen.limits.pose_topic)
+                path = path_in(replace(one, limits=limits), call, window)
             except EpisodicError as error:
                 late = {"late": True} if isinstance(error, QueryTimeoutError) else {}
                 found.append({"name": name, "error": str(error), **late})
@@ -139,12 +121,18 @@ class Recordings:
                 found.append({"name": name, **path})
         return {"paths": found, "paths_left_out": len(names[MOST_PATHS:])}
 
-    def _list(self, memory: Memory) -> list[JsonObject]:
-        snapshot = memory.index.published or memory.index.snapshot()
-        rows = self._listed.get(snapshot.timeline)
-        if rows is None:
-            rows = self._listed[snapshot.timeline] = _rows(snapshot, str(memory.index.bag_dir))
-        return rows
+    def _list(self) -> list[JsonObject]:
+        index = self._memory.index
+        return _rows(index.published or index.snapshot(), str(index.bag_dir))
+
+
+def _narrowed(memory: Memory, name: str) -> Memory:
+    """Returns a memory of one recording: its ages count from its newest message.
+
+    It has neither a recorder nor a budget.
+    """
+    limits = replace(memory.limits, now="latest", kept=None, recording=name)
+    return replace(memory, index=OneRecording(memory.index, name), limits=limits, memo=Memo())
 
 
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:

@@ -67,29 +67,32 @@ def page_routes(
     dispatcher: Dispatcher, progress: Callable[[], Progress] | None = None
 ) -> list[Route]:
     """Returns the routes of the page; `progress`: how far the store of columns is filled."""
-    recordings = Recordings()
-    chosen = partial(_chosen, recordings)
+    memory = dispatcher.memory
+    recordings = Recordings(memory)
 
-    def span(given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        part, asked = chosen(given, memory), span_request(given)
-        shown = span_shown(part, call, asked, progress, dispatcher.questions)
+    def chosen(given: QueryParams) -> Memory:
+        """Returns the part of the memory that is asked, in which its `poses` place the robot."""
+        name = _short(given, "recording", _LONGEST_NAME)
+        part = recordings.alone(name) if name else memory
+        topic = _short(given, "poses", _LONGEST_NAME)
+        return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
+
+    def span(given: QueryParams, part: Memory, call: Call) -> JsonObject:
+        shown = span_shown(part, call, span_request(given), progress, dispatcher.questions)
         if "status" in shown:
-            shown |= recordings.shown(memory, part, call)
+            shown |= recordings.shown(part, call)
             shown |= {"memory": named(memory)} if given.get("named") == "1" else {}
         if shown.get("mixed") and "path" in shown:
             window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
             shown |= recordings.paths(part, call, window)
         return shown
 
-    def of_part(work: _Work, given: QueryParams, memory: Memory, call: Call) -> JsonObject:
-        return work(given, chosen(given, memory), call)
-
     def route(path: str, work: _Work) -> Route:
         async def answer(request: Request) -> Response:
             client = request.client.host if request.client else None
             given = request.query_params
             if path != MOMENT_PATH or "tool" not in given:
-                reply = await dispatcher.look(partial(work, given), client)
+                reply = await dispatcher.look(lambda call: work(given, chosen(given), call), client)
             else:
                 try:
                     arguments = tool_arguments(given)
@@ -103,6 +106,7 @@ def page_routes(
         return Route(path, answer, methods=["GET"])
 
     parts: dict[str, _Work] = {
+        SPAN_PATH: span,
         MOMENT_PATH: moment_asked,
         "/page/topics": lambda given, part, call: topics_shown(part, call, window_asked(given)),
         "/page/labels": lambda given, part, call: labels_shown(part, call, window_asked(given)),
@@ -110,16 +114,7 @@ def page_routes(
             part, call, window_asked(given), box_asked(given)
         ),
     }
-    of_parts = [route(path, partial(of_part, work)) for path, work in parts.items()]
-    return [route(SPAN_PATH, span), *of_parts]
-
-
-def _chosen(recordings: Recordings, given: QueryParams, memory: Memory) -> Memory:
-    """Returns the part of a memory that a query string names, in which its `poses` place it."""
-    name = _short(given, "recording", _LONGEST_NAME)
-    part = recordings.alone(memory, name) if name else memory
-    topic = _short(given, "poses", _LONGEST_NAME)
-    return replace(part, limits=replace(part.limits, pose_topic=topic)) if topic else part
+    return [route(path, work) for path, work in parts.items()]
 
 
 def named(memory: Memory) -> JsonObject:
@@ -132,14 +127,14 @@ def named(memory: Memory) -> JsonObject:
     return {"name": gethostname() if is_robot else folder.name, "folder": str(folder)}
 
 
-def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
+def warm_up(dispatcher: Dispatcher) -> bool:
     """Looks at the newest week while nobody asks, so that the first look of a page is a second one.
 
     And at the static transforms of the newest session, so that the first transform is, too.
     Returns whether that is done. What was joined until somebody asked stays, so that the next time
     goes on from there.
     """
-    call = dispatcher.idle_call()
+    call, memory = dispatcher.idle_call(), dispatcher.memory
     if call is None:
         return False
     request = SpanRequest(last_s=_WEEK_S, patient=True)
@@ -147,7 +142,7 @@ def warm_up(memory: Memory, dispatcher: Dispatcher) -> bool:
         view = View(memory, call)
         for bag in view.snapshot.bags[-1:]:
             static_transforms(view, sessions_of(view).of(bag.recording))
-        Recordings().shown(memory, memory, call)
+        Recordings(memory).shown(memory, call)
         for _ in range(_MOST_TRIES):
             shown = span_shown(memory, call, request)
             if shown["latest"] is None or shown.keys() >= {"path", "events", "things"}:
