@@ -291,48 +291,34 @@ _REGION_SCHEMA: Final[dict[str, JsonValue]] = {
     "type": [*REGION_KINDS],
     "examples": ["kitchen", "kitchen, hall", {"den": {"x": [0, 5], "y": [0, 9]}}],
 }
-_Where: TypeAlias = Annotated[
-    _Region,
-    WithJsonSchema({**_REGION_SCHEMA, "description": "Of the robot; forms: trajectory_summary."}),
-]
+
+
+def _region(description: str, **schema: JsonValue) -> WithJsonSchema:
+    """Returns the schema of a place: its name, or its bounds."""
+    return WithJsonSchema({**_REGION_SCHEMA, **schema, "description": description})
+
+
+_Where: TypeAlias = Annotated[_Region, _region("Of the robot; forms: trajectory_summary.")]
 _WhereInFull: TypeAlias = Annotated[
     _Region,
-    WithJsonSchema(
-        {
-            **_REGION_SCHEMA,
-            "description": "Where the robot was: kitchen | {x, y, radius_m} | "
-            "{x: [0, 5], y: [0, 9]}; in any of several: kitchen, hall | {den: {x: [0, 5], ...}}.",
-        }
+    _region(
+        "Where the robot was: kitchen | {x, y, radius_m} | {x: [0, 5], y: [0, 9]}; in any of "
+        "several: kitchen, hall | {den: {x: [0, 5], ...}}."
     ),
 ]
-_WhereOfThings: TypeAlias = Annotated[
-    _Region,
-    WithJsonSchema({**_REGION_SCHEMA, "description": "Of the things; forms: trajectory_summary."}),
-]
+_WhereOfThings: TypeAlias = Annotated[_Region, _region("Of the things; forms: trajectory_summary.")]
 _WhereOfBoth: TypeAlias = Annotated[
-    _Region,
-    WithJsonSchema(
-        {**_REGION_SCHEMA, "description": "Of robot and things; forms: trajectory_summary."}
-    ),
+    _Region, _region("Of robot and things; forms: trajectory_summary.")
 ]
 _Point: TypeAlias = Annotated[
-    _Region,
-    WithJsonSchema(
-        {
-            "type": [*REGION_KINDS],
-            "examples": [{"x": 1.5, "y": 0.5}],
-            "description": "Point {x, y} or place.",
-        }
-    ),
+    _Region, _region("Point {x, y} or place.", examples=[{"x": 1.5, "y": 0.5}])
 ]
 _Near: TypeAlias = Annotated[
     _Region,
-    WithJsonSchema(
-        {
-            "type": ["object", "string"],
-            "examples": [{"label": "table", "radius_m": 1.0}],
-            "description": "{label: table, radius_m: 1} or {x, y, radius_m}.",
-        }
+    _region(
+        "{label: table, radius_m: 1} or {x, y, radius_m}.",
+        type=["object", "string"],
+        examples=[{"label": "table", "radius_m": 1.0}],
     ),
 ]
 _Between: TypeAlias = Annotated[
