@@ -1,12 +1,10 @@
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from mcp import Client
 
-from ros2_memory import package_version
 from ros2_memory.bootstrap import (
     build_memory,
     build_reader,
@@ -18,7 +16,7 @@ from ros2_memory.core.errors import ConfigError
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from ros2_memory.tools.reply_size import to_json_text
-from tests.support.robot_run import ANSWERED, ask, ask_everything, write_run
+from tests.support.robot_run import ANSWERED, ask, write_run
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:

@@ -21,9 +21,8 @@ from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.cli import main
-from ros2_memory.cli.doctor import check_columns
 from ros2_memory.cli.maintenance.index import fill_store
-from ros2_memory.columns import fill, writing
+from ros2_memory.columns import fill
 from ros2_memory.columns.fill import Batch, Filling, Progress, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
@@ -98,22 +97,6 @@ def test_a_bag_that_cannot_be_stored_is_told_of_and_not_tried_for_ever(
         patched.setattr(fill, "decoded", damaged)
         assert fill_store(backfill) == Progress(1, 0, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
-
-
-def test_what_the_database_refuses_is_told_of_and_not_tried_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bag(tmp_path, 0)
-    memory, backfill = storing(tmp_path)
-
-    def too_large(*_: object) -> bytes:
-        raise OverflowError("too large")
-
-    with monkeypatch.context() as patched:
-        patched.setattr(writing, "packed_part", too_large)
-        assert fill_store(backfill) == Progress(1, 0, 0, 1)
-    (finding,) = check_columns(memory)
-    assert "1 bag could not be stored (too large)" in finding.seen
 
 
 def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
@@ -264,17 +247,3 @@ def test_a_missing_bag_directory_is_what_the_command_names(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert main(["index", "--bag-dir", str(tmp_path / "gone")]) == 2
     assert "the bag directory does not exist" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("own_logging")
-def test_the_command_counts_the_warnings_of_the_log_instead_of_showing_them(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "rec").mkdir()
-    (tmp_path / "rec" / "rec_0.mcap").touch()
-    hour_ago = time.time_ns() - 3600 * NS_PER_S
-    os.utime(tmp_path / "rec" / "rec_0.mcap", ns=(hour_ago, hour_ago))
-    assert main(["index", "--bag-dir", str(tmp_path)]) == 0
-    reply = capsys.readouterr().err
-    assert "1 warning logged (bag_damaged)" in reply
-    assert '"event"' not in reply

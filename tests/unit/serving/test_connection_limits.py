@@ -172,16 +172,6 @@ async def test_a_reply_that_is_not_read_ends_the_connection_and_the_call() -> No
                 served.app.under_way = 0
 
 
-async def test_requests_sent_without_waiting_are_answered_in_order() -> None:
-    async with serving() as served:
-        reader, writer = await served.connect()
-        writer.write(GET * 20 + (POST + b"0123456789") * 20)
-        async with asyncio.timeout(BOUND_S):
-            for _ in range(40):
-                assert (await reader.readuntil(b"\r\n\r\nok")).startswith(b"HTTP/1.1 200")
-        writer.close()
-
-
 async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -222,22 +212,6 @@ async def test_headers_without_end_and_what_is_no_http_are_refused(head: bytes) 
         shown = await served.reply(head)
         assert shown == b"" or shown.startswith(b"HTTP/1.1 4")  # may be cut by what was left unread
         await served.gone()
-
-
-async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
-    async with serving() as served:
-        _, writer = await served.connect()
-        async with asyncio.timeout(BOUND_S):
-            while not served.server.server_state.connections:
-                await asyncio.sleep(0.001)
-        [connection] = served.server.server_state.connections
-        connected = connection.transport.get_extra_info("socket")
-        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
-        assert waits == connection_limits.UNREAD_S * 1000
-        # Linux doubles what it is told, for its own bookkeeping.
-        kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
-        assert kept <= 2 * connection_limits.SEND_BUFFER_BYTES
-        writer.close()
 
 
 async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
@@ -384,3 +358,19 @@ async def test_peers_that_are_gone_fill_no_log(
     assert len(logged) == len({each["reason"] for each in logged})
     tracebacks = [each for each in caplog.records if each.exc_info]
     assert tracebacks == []
+
+
+async def test_the_system_keeps_little_and_gives_up_a_peer_that_vanished() -> None:
+    async with serving() as served:
+        _, writer = await served.connect()
+        async with asyncio.timeout(BOUND_S):
+            while not served.server.server_state.connections:
+                await asyncio.sleep(0.001)
+        [connection] = served.server.server_state.connections
+        connected = connection.transport.get_extra_info("socket")
+        waits = connected.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT)
+        assert waits == connection_limits.UNREAD_S * 1000
+        # Linux doubles what it is told, for its own bookkeeping.
+        kept = connected.getsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF)
+        assert kept <= 2 * connection_limits.SEND_BUFFER_BYTES
+        writer.close()

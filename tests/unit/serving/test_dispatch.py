@@ -180,26 +180,6 @@ async def test_each_call_is_logged_once_with_its_outcome_and_times(log: LogCaptu
     assert len({entry["correlation_id"] for entry in log.entries}) == 3
 
 
-async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
-    tools = [tool("ask", lambda _: value(1))]
-    replies = Replies(Path("bags"), 24_000)
-    silent = Dispatcher(NOBODY, tools, replies, call_timeout_s=25, log_arguments=False)
-    await silent.answer("ask", {"s3cret": "s3cret"})
-    await silent.answer("s3cret", {"s3cret": "s3cret"})
-    assert [(each["event"], each["tool"]) for each in log.entries] == [
-        ("tool_call", "ask"),
-        ("tool_call", "unknown"),
-    ]
-    assert "s3cret" not in str(log.entries)
-
-
-async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
-    async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
-        result = await client.call_tool("slow", {})
-        assert result.is_error
-        assert sent(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
-
-
 @pytest.mark.parametrize(("losses", "answer"), [(1, "value"), (2, "error")])
 async def test_a_question_whose_columns_were_deleted_meanwhile_is_asked_again(
     losses: int, answer: str
@@ -326,16 +306,6 @@ async def test_a_call_that_waits_for_all_of_its_time_is_told_that_the_server_is_
     assert dispatcher.blocking.waiting == 0
 
 
-async def test_questions_that_cannot_be_stopped_do_not_become_ever_more_threads() -> None:
-    held = Held()
-    dispatcher = served(tool("stuck", held.ask), timeout_s=0.02).dispatcher
-    for _ in range(3 * QUICK_AT_ONCE):
-        reply = await dispatcher.answer("stuck", {})
-        assert json.loads(reply.text)["error"] in {"timeout", "busy"}
-    assert held.begun == QUICK_AT_ONCE
-    held.released.set()
-
-
 async def test_more_calls_than_may_wait_are_told_so() -> None:
     held = Held()
     dispatcher = served(tool("slow", held.ask, blocking=True)).dispatcher
@@ -372,3 +342,16 @@ async def test_stopping_has_running_queries_give_up() -> None:
         server.dispatcher.stop()
     told = sent(results[0])
     assert (told["error"], "the server is stopping" in told["detail"]) == ("busy", True)
+
+
+async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
+    tools = [tool("ask", lambda _: value(1))]
+    replies = Replies(Path("bags"), 24_000)
+    silent = Dispatcher(NOBODY, tools, replies, call_timeout_s=25, log_arguments=False)
+    await silent.answer("ask", {"s3cret": "s3cret"})
+    await silent.answer("s3cret", {"s3cret": "s3cret"})
+    assert [(each["event"], each["tool"]) for each in log.entries] == [
+        ("tool_call", "ask"),
+        ("tool_call", "unknown"),
+    ]
+    assert "s3cret" not in str(log.entries)

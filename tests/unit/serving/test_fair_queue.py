@@ -47,19 +47,6 @@ def started(queue: FairQueue, gates: Gates, client: str, count: int) -> list[asy
     return [asyncio.create_task(queue.run(client, gates.ask(f"{client}{n}"))) for n in range(count)]
 
 
-async def test_clients_take_turns_and_each_keeps_its_own_order() -> None:
-    queue, gates = FairQueue("test", 1), Gates()
-    tasks = [
-        *started(queue, gates, "a", 4),
-        *started(queue, gates, "b", 2),
-        *started(queue, gates, "c", 1),
-    ]
-    await until(lambda: queue.waiting == 6)
-    gates.release()
-    await asyncio.gather(*tasks)
-    assert gates.begun == ["a0", "a1", "b0", "c0", "a2", "b1", "a3"]
-
-
 async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
     queue, gates = FairQueue("test", 3), Gates()
     tasks = [*started(queue, gates, "a", 4), *started(queue, gates, "b", 3)]
@@ -84,18 +71,6 @@ async def test_a_question_whose_caller_leaves_gives_its_place_in_the_queue_back(
     assert gates.begun == ["a0", "a2"]
 
 
-async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
-    queue, gates = FairQueue("test", 1), Gates()
-    stuck, following = started(queue, gates, "a", 2)
-    await until(lambda: gates.begun == ["a0"])
-    stuck.cancel()
-    await until(stuck.done)
-    assert (queue.running, queue.waiting) == (1, 1)
-    gates.release()
-    assert await following == "a1"
-    await until(lambda: queue.running == 0)
-
-
 @pytest.mark.parametrize("has_turn", [True, False])
 async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn: bool) -> None:
     queue, gates = FairQueue("test", 1), Gates()
@@ -112,3 +87,15 @@ async def test_a_turn_that_comes_as_its_caller_leaves_goes_to_the_next(has_turn:
     assert leaving.cancelled()
     assert gates.begun == ["a0", "a2"]
     await until(lambda: (queue.running, queue.waiting) == (0, 0))
+
+
+async def test_a_thread_that_is_left_behind_keeps_its_place_until_it_is_done() -> None:
+    queue, gates = FairQueue("test", 1), Gates()
+    stuck, following = started(queue, gates, "a", 2)
+    await until(lambda: gates.begun == ["a0"])
+    stuck.cancel()
+    await until(stuck.done)
+    assert (queue.running, queue.waiting) == (1, 1)
+    gates.release()
+    assert await following == "a1"
+    await until(lambda: queue.running == 0)

@@ -104,12 +104,6 @@ async def test_a_clock_that_stands_before_all_bags_is_a_problem(tmp_path: Path) 
     ]
 
 
-async def test_a_missing_bag_directory_is_told(tmp_path: Path) -> None:
-    reply = await Health(memory_at(tmp_path / "later"), "1")()
-    assert reply["bags"] == 0
-    assert reply["status"] == "degraded"
-
-
 async def test_a_live_recorder_is_shown(tmp_path: Path) -> None:
     write_heartbeat(tmp_path, replace(beat(RecorderState.RECORDING), restarts=2, missing=("/c",)))
     reply = await Health(memory_at(tmp_path, seconds=3), "1")()
@@ -181,22 +175,6 @@ async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
     assert {str(each["status"]) for each in reply} == {"degraded"}
     assert during <= before + 1
     assert len(looks) <= 1
-
-
-async def test_a_bag_that_closes_is_found_without_a_question(tmp_path: Path) -> None:
-    memory = memory_at(tmp_path)
-    patient = IndexManager(
-        tmp_path, memory.reader, memory.clock, refresh_s=3600.0, split_duration_s=10.0
-    )
-    assert patient.snapshot().bags == ()
-    write_mcap(tmp_path / "r" / "r_0.mcap", [text(T0, "a")])
-    assert patient.snapshot().bags == ()
-    async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_fresh, replace(memory, index=patient), 0.001)
-        with anyio.fail_after(10):
-            while not patient.snapshot().bags:
-                await anyio.lowlevel.checkpoint()
-        tasks.cancel_scope.cancel()
 
 
 async def test_a_scan_that_fails_is_logged_and_tried_again(tmp_path: Path) -> None:

@@ -59,13 +59,6 @@ async def read(client: Client, uri: str) -> Any:
     return json.loads(content.text)
 
 
-async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:
-    async with Client(server(tmp_path, "server.write_tools=true")) as client:
-        assert "remember_moment" not in {each.name for each in (await client.list_tools()).tools}
-        refused = await client.call_tool("remember_moment", {"label": "x"})
-        assert "remember_moment is not offered here: it needs a recorder" in str(refused.content)
-
-
 async def test_hints_say_what_a_call_changes(tmp_path: Path) -> None:
     chosen = ("server.write_tools=true", "recorder=ros2bag")
     async with Client(server(tmp_path, *chosen)) as client:
@@ -112,21 +105,6 @@ async def test_a_resource_that_is_not_offered_is_told_with_those_that_are(tmp_pa
             assert refused.value.error.code == INVALID_PARAMS
             assert refused.value.error.message.endswith("the resources are: episodic://topics")
             assert len(refused.value.error.message) < 300
-
-
-async def test_the_prompt_teaches_with_tools_that_there_are(tmp_path: Path) -> None:
-    async with Client(server(tmp_path)) as client:
-        [prompt] = (await client.list_prompts()).prompts
-        got = await client.get_prompt(prompt.name)
-        [message] = got.messages
-        assert isinstance(message.content, TextContent)
-        tools = {tool.name for tool in (await client.list_tools()).tools}
-        for name in ("find_matches", "recap", "visits", "memory_status", "data_time_range"):
-            assert name in tools
-            assert name in message.content.text
-        with pytest.raises(MCPError, match=prompt.name) as refused:
-            await client.get_prompt("another")
-    assert refused.value.error.code == INVALID_PARAMS
 
 
 @pytest.mark.parametrize("which", ["spec", "all"])
@@ -181,20 +159,6 @@ async def test_no_tool_names_another_that_is_not_offered(tmp_path: Path) -> None
     assert [(name, text) for name in lacking for text in read if name in text] == []
     # The words that are left out above: as names of tools they follow a colon.
     assert [text for text in read if re.search(r": (visits|compare|recap)\b", text)] == []
-
-
-async def test_lists_may_be_cached_and_shared_and_what_is_read_may_not(tmp_path: Path) -> None:
-    write_run(tmp_path)
-    async with Client(server(tmp_path)) as client:
-        lists: list[Any] = [
-            await client.list_tools(),
-            await client.list_prompts(),
-            await client.list_resources(),
-            await client.list_resource_templates(),
-        ]
-        status = await client.read_resource("episodic://status")
-    assert {(each.cache_scope, each.ttl_ms) for each in lists} == {("public", 3_600_000)}
-    assert (status.cache_scope, status.ttl_ms) == ("private", 0)
 
 
 def keep(bag_dir: Path, label: str) -> str:
@@ -264,3 +228,10 @@ async def test_a_client_that_asks_for_progress_receives_it(
     assert [each[0] for each in reported[:2]] == [1, 2]
     assert reported[0][2] == "40 % of the bags stored"
     assert str(reported[1][2]).startswith("60 % of the bags stored, about ")
+
+
+async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:
+    async with Client(server(tmp_path, "server.write_tools=true")) as client:
+        assert "remember_moment" not in {each.name for each in (await client.list_tools()).tools}
+        refused = await client.call_tool("remember_moment", {"label": "x"})
+        assert "remember_moment is not offered here: it needs a recorder" in str(refused.content)

@@ -27,12 +27,9 @@ from ros2_memory.cli.plot import opened
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.telemetry import Answered
-from ros2_memory.core.timebase import NS_PER_S, Deadline
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.transforms import transform_at
-from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
@@ -180,26 +177,6 @@ def test_nothing_is_looked_up_where_nothing_is_new(memory: Memory) -> None:
     assert set(shown(memory, f"version={version}")) == {"version", "unchanged", "now"}
 
 
-def test_an_empty_memory_says_so(tmp_path: Path) -> None:
-    found = shown(memory_of(tmp_path))
-    assert found["range"]["earliest"] is None
-    assert "path" not in found
-
-
-def test_named_places_are_those_of_the_frame(bag_dir: Path) -> None:
-    plain = memory_of(bag_dir)
-    places = (
-        Place("dock", "odom", Circle(0.0, 0.0, 1.0)),
-        Place("hall", "odom", Rectangle(1.0, 3.0, -1.0, 1.0)),
-        Place("moon", "map", Circle(0.0, 0.0, 1.0)),
-    )
-    found = shown(replace(plain, limits=replace(plain.limits, places=places)))
-    assert found["places"] == [
-        {"name": "dock", "circle": [0.0, 0.0, 1.0]},
-        {"name": "hall", "corners": [[1.0, -1.0], [3.0, -1.0], [3.0, 1.0], [1.0, 1.0]]},
-    ]
-
-
 def test_where_a_part_takes_too_long_the_others_are_shown(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,19 +189,6 @@ def test_where_a_part_takes_too_long_the_others_are_shown(
     assert "events" not in found
     assert "the events are not known yet: it takes too long" in found["notes"]
     assert found["path"]["x"][-1] == 30.0
-
-
-def test_numbers_come_in_bins_with_their_bounds(memory: Memory) -> None:
-    signal = "/odom:twist.twist.linear.x"
-    [found] = shown(memory, f"last=1000&signal={signal}")["signals"]
-    assert (found["topic"], found["field"]) == ("/odom", "twist.twist.linear.x")
-    assert min(found["low"]) == 0
-    assert max(found["high"]) == 1
-    assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))
-    assert found["t"] == sorted(found["t"])
-    [close] = shown(memory, f"start={BEGIN_S}&end={BEGIN_S + 9}&signal={signal}")["signals"]
-    assert close["mean"] == [1.0] * len(close["t"])
-    assert len(close["t"]) >= 80
 
 
 def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
@@ -436,23 +400,6 @@ def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None
     assert labels(Recordings(memory).alone("wren")) == ["of wren"]
 
 
-def test_a_transform_after_a_warm_up_gathers_no_static_ones(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    at = BEGIN
-    arm = transform(at, "base_link", "camera", (0.2, 0.0, 0.5))
-    moves = [tf(at + n * S, transform(at + n * S, "odom", "base_link", (n, 0, 0))) for n in (0, 1)]
-    static = tf(at, arm, topic="/tf_static")
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [static, *moves, odom(at + S, 1.0, 0.0)])
-    memory = memory_of(tmp_path)
-    dispatcher = Dispatcher(memory, [], Replies(tmp_path, 9_000), call_timeout_s=5)
-    assert warm_up(dispatcher)
-    gathered = "ros2_memory.history.transforms._received"
-    monkeypatch.setattr(gathered, lambda *_: pytest.fail("was gathered"))
-    found = transform_at(View(memory, Call()), "odom", "camera", at + S)
-    assert found.transform.translation == pytest.approx((1.2, 0.0, 0.5))
-
-
 async def test_a_warm_up_gives_way_to_a_question_and_goes_on_later(memory: Memory) -> None:
     dispatcher = Dispatcher(memory, [], Replies(memory.index.bag_dir, 9_000), call_timeout_s=5)
     call = dispatcher.idle_call()
@@ -504,13 +451,6 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
     away, _ = KDTree(cells).query(driven, p=np.inf)
     assert away.max(initial=0) <= 1.51 * side
     assert len(cells) <= 8_000
-
-
-def test_without_a_path_it_says_what_gives_one(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "bag.mcap", [fix(BEGIN, 0.0, 0.0)])
-    found = shown(memory_of(tmp_path))
-    assert found["path"] is None
-    assert "latitude and longitude are on /fix" in found["no_path"]
 
 
 def topics(memory: Memory, query: str) -> dict[str, Any]:
@@ -625,24 +565,3 @@ def test_of_a_path_driven_often_each_pixel_is_drawn_and_no_more(
     found: Any = path_in_box(memory, Call(), window, Box(-2, -2, 2, 3, 0.002))
     assert 100 < len(found["x"]) <= 400
     assert off_line(found, poses).max() <= 0.004
-
-
-@pytest.mark.parametrize(("first", "seconds"), [(True, 0.7), (False, 2.4)])
-def test_all_parts_of_a_first_look_have_the_time_of_one_part_of_another(
-    first: bool, seconds: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each takes all the time that it may: the clock goes on by that."""
-    monkeypatch.setattr(span, "_QUICK_S", 0.8)
-    now, took = 0.0, []
-
-    def part(call: Call) -> span.Shown:
-        nonlocal now
-        took.append(call.deadline.left_s())
-        now += took[-1]
-        return span.Shown({})
-
-    call = replace(Call(), deadline=Deadline.after(60.0, lambda: now))
-    parts = dict.fromkeys(("path", "events", "things"), part)
-    found = [*span._in_time(parts, call, span.SpanRequest(first=first))]
-    assert [name for name, _ in found] == ["path", "events", "things"]
-    assert sum(took) == pytest.approx(seconds)

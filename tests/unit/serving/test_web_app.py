@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, cast
 import anyio
 import httpx2
 import pytest
-from structlog.testing import capture_logs
 
 from ros2_memory import results
 from ros2_memory.core.model import Sample
@@ -113,9 +112,8 @@ async def test_whether_it_records_is_a_status_of_its_own(
         shown = await http.get("/health/recording")
     assert shown.status_code == status
     assert shown.json()["recording"] is (status == 200)
-    assert shown.json()["waiting_for"] == (recorder or {}).get("waiting_for")
-    assert shown.json()["degraded"] == (recorder or {}).get("degraded", [])
-    assert shown.json()["required_missing"] == (recorder or {}).get("required_missing", [])
+    for key in ("waiting_for", "degraded", "required_missing"):
+        assert (shown.json()[key] or None) == (recorder or {}).get(key)
     async with client(app(recorder=recorder, api_token=GOOD)) as http:
         hidden = await http.get("/health/recording")
     assert (hidden.status_code, hidden.json()) == (status, {"recording": status == 200})
@@ -146,15 +144,6 @@ async def test_a_token_is_demanded_wherever_tools_are_called(method: str, path: 
             response = await http.request(method, path, headers=MCP_HEADERS | headers)
             assert response.status_code == 401
             assert response.headers["www-authenticate"].startswith("Bearer ")
-
-
-async def test_a_page_of_another_site_is_refused_before_it_is_asked_for_a_token() -> None:
-    async with client(app(EVERYWHERE, api_token=GOOD)) as http:
-        for headers in ({}, SHOWN):
-            other = await http.get("/mcp", headers={"host": "evil.example"} | headers)
-            assert other.status_code == 421
-            its = {"host": "192.168.7.20:9203", "origin": "http://evil.example"}
-            assert (await http.get("/mcp", headers=its | headers)).status_code == 403
 
 
 async def test_a_tool_is_called_over_mcp_in_one_request_without_a_session() -> None:
@@ -262,16 +251,3 @@ async def test_a_person_may_follow_a_link_to_the_page_and_to_nothing_else(site: 
                 assert other.status_code == 403
             posted = await http.post("/", headers={"sec-fetch-site": site, **VISIT})
             assert posted.status_code == 403
-
-
-async def test_refusals_of_other_sites_are_counted_and_logged_now_and_then() -> None:
-    with capture_logs() as logged:
-        async with client(app()) as http:
-            for _ in range(50):
-                await http.get("/health", headers={"origin": "http://evil.example"})
-                await http.get("/health", headers={"sec-fetch-site": "cross-site"})
-    told = [(each["event"], each["reason"], each["refused"]) for each in logged]
-    assert told == [
-        ("request_refused", "the origin of another site", 1),
-        ("request_refused", "a request from another site", 1),
-    ]

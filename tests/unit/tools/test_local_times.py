@@ -70,17 +70,6 @@ def test_local_time_stands_beside_unix_time_where_days_must_be_told_apart(
             assert row["local"].startswith(f"{local:%a %Y-%m-%d}")
 
 
-def test_a_table_has_it_as_its_last_column(memory: Memory, folder: Path) -> None:
-    given = {"topic": "/odom", "fields": ["position.x"], "max_samples": 4}
-    long = asked(memory, folder, "get_topic_in_range", start=BEGIN, end=BEGIN + 2 * DAY_S, **given)
-    assert long["fields"] == ["timestamp", "position.x", "local"]
-    first, *_, last = long["rows"]
-    assert [len(row) for row in long["rows"]] == [3] * 4
-    assert first[2][:14] != last[2][:14]
-    short = asked(memory, folder, "get_topic_in_range", start=BEGIN, end=BEGIN + 60, **given)
-    assert short["fields"] == ["timestamp", "position.x"]
-
-
 def days_said(reply: Any) -> list[str]:
     return [row["local"] for row in _objects(reply) if "local" in row]
 

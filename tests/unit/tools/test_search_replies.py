@@ -326,23 +326,6 @@ def test_a_bag_that_was_read_in_spite_of_its_lies_was_read(
     assert never(recalling(bag_dir, recalls), bag_dir, tool) is None
 
 
-@pytest.mark.parametrize("known", [0, 2])
-def test_a_question_that_runs_out_of_time_says_how_far_the_catalogue_is(
-    bag_dir: Path, known: int
-) -> None:
-    memory = with_store(memory_of(bag_dir), bag_dir, part=known / 3)
-    call = Call(Deadline.after(0.0))
-    with pytest.raises(QueryTimeoutError) as late:
-        queries.find_last_match(memory, call, "/*", "contains", "never")
-    assert f"has {known} of 3 bags so far: wait for it, or " in str(late.value)
-    latest = memory.index.snapshot().latest
-    assert latest is not None
-    if late.value.searched_back_to is None:
-        assert "ask about a shorter window or a single topic" in str(late.value)
-    else:
-        assert late.value.searched_back_to <= latest + 1
-
-
 def test_a_search_that_got_somewhere_says_how_far_the_catalogue_is(bag_dir: Path) -> None:
     memory = with_store(memory_of(bag_dir), bag_dir, part=0.0)
     call = Call(Deadline.after(6.0, partial(next, map(float, count()))))
