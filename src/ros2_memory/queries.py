@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 from ros2_memory import results
 from ros2_memory.analysis.frames import TF_CACHE_NS
-from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS, Trajectory
+from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.errors import (
@@ -105,7 +105,7 @@ from ros2_memory.places.driven_inside import farthest_from
 from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import Extracted
@@ -490,8 +490,15 @@ def data_time_range(
         view.notes.add(snapshot.problem)
     if snapshot.dating.note:
         view.notes.add(snapshot.dating.note)
-    _note_odd_bags(view)
-    view.notes.add(*_describe_unshown(view))
+    # Except crashes and wrong clocks.
+    odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
+    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
+    thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
+    if thinned and (since is None or thinned[0].start < since):
+        before = "" if since is None else f" before {unix_text(since)}"
+        view.notes.add(
+            f"silences and steps of the clock within the days of memory/{before} are not known"
+        )
     view.notes.add(*describe_absent(memory.absent_splits(snapshot)))
     undecodable = undecodable_topics(view)
     steps = clock_steps(view, window)
@@ -514,14 +521,6 @@ def data_time_range(
         ),
         clock_steps=steps,
     )
-
-
-def _describe_unshown(view: View) -> Iterator[str]:
-    """Yields a sentence on days of `memory/` of which no more is known than their messages."""
-    thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
-    if thinned and (since is None or thinned[0].start < since):
-        before = "" if since is None else f" before {unix_text(since)}"
-        yield f"silences and steps of the clock within the days of memory/{before} are not known"
 
 
 def _newest_beside(
@@ -575,7 +574,10 @@ def trajectory_summary(
     unrecorded = unrecorded_length(view, name, path, elapsed)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
     driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path, unrecorded)
-    drawn = _with_few_waypoints(driven, max_waypoints)
+    drawn = driven
+    if max_waypoints < _FEWEST_OF_A_LINE:
+        last = driven.waypoints[-1:] if max_waypoints else ()
+        drawn = replace(driven, waypoints=last, waypoint_error_m=0.0)
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
         drawn = replace(drawn, waypoints=moved)
@@ -592,14 +594,6 @@ def trajectory_summary(
         away,
         notes=view.notes.sentences(),
     )
-
-
-def _with_few_waypoints(path: Trajectory, at_most: int) -> Trajectory:
-    """Returns a path without the waypoints that are too many where these are too few for a line."""
-    if at_most >= _FEWEST_OF_A_LINE:
-        return path
-    last = path.waypoints[-1:] if at_most else ()
-    return replace(path, waypoints=last, waypoint_error_m=0.0)
 
 
 def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
@@ -855,9 +849,3 @@ def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
 def _topics_of(bag: BagFile) -> frozenset[str]:
     """Returns the topics that a bag declares; one may be declared under several types."""
     return frozenset(each.topic for each in bag.summary.schema.topics)
-
-
-def _note_odd_bags(view: View) -> None:
-    """Notes what is wrong with the newest faulty bags, except crashes and wrong clocks."""
-    odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(view.snapshot)]
-    view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))

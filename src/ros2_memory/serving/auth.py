@@ -294,9 +294,7 @@ def api_token(env: Mapping[str, str]) -> SecretStr | None:
     if len(given) > 1:
         raise ConfigError(f"{' and '.join(given)} both give the API token; leave one of them")
     source = given[0]
-    text = _read_token(files[source], source) if source in files else env[VARIABLE]
-    _require_usable(text, source)
-    return SecretStr(text)
+    return SecretStr(_usable(files.get(source) or env[VARIABLE], source))
 
 
 def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[str]]:
@@ -308,8 +306,7 @@ def limited_tokens(robots: Mapping[Path, Sequence[str]]) -> dict[str, frozenset[
     tokens: dict[str, frozenset[str]] = {}
     for path, names in robots.items():
         source = f"fleet.tokens: {path}"
-        text = _read_token(path, source)
-        _require_usable(text, source)
+        text = _usable(path, source)
         if text in tokens:
             raise ConfigError(f"{source}: another file has the same token; {_HOW}")
         tokens[text] = frozenset(names)
@@ -339,23 +336,27 @@ def take_token(
     return token
 
 
-def _read_token(path: Path, source: str) -> str:
-    """Returns the file's text without the line's end; opens no pipe, which would block."""
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):
-            raise ConfigError(f"{source}: {str(path)!r} is not a regular file")
-        with path.open("rb") as file:
-            data = file.read(LONGEST_TOKEN + 3)
-    except OSError as error:
-        raise ConfigError(
-            f"{source}: {str(path)!r} cannot be read: {error.strerror}; "
-            "give the server's user a file that it may read"
-        ) from None
-    # Bytes that are not text are refused below, without being shown.
-    return data.decode("ascii", errors="replace").removesuffix("\n").removesuffix("\r")
+def _usable(given: str | Path, source: str) -> str:
+    """Returns a token, or that in a file without the line's end; opens no pipe, which would block.
 
-
-def _require_usable(text: str, source: str) -> None:
+    Raises:
+        ConfigError: it cannot be read, or cannot be sent in a header.
+    """
+    if isinstance(given, Path):
+        try:
+            if not stat.S_ISREG(given.stat().st_mode):
+                raise ConfigError(f"{source}: {str(given)!r} is not a regular file")
+            with given.open("rb") as file:
+                data = file.read(LONGEST_TOKEN + 3)
+        except OSError as error:
+            raise ConfigError(
+                f"{source}: {str(given)!r} cannot be read: {error.strerror}; "
+                "give the server's user a file that it may read"
+            ) from None
+        # Bytes that are not text are refused below, without being shown.
+        text = data.decode("ascii", errors="replace").removesuffix("\n").removesuffix("\r")
+    else:
+        text = given
     if len(text) < SHORTEST_TOKEN:
         length = f"has {len(text)} characters" if text else "is empty"
         raise ConfigError(
@@ -371,3 +372,4 @@ def _require_usable(text: str, source: str) -> None:
             f"{source}: the API token holds characters that an Authorization header cannot "
             f"hold; letters, digits and -._~+/ are allowed, with = at the end; {_HOW}"
         )
+    return text

@@ -80,9 +80,12 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
     if tracks is not None and not is_exact:
         lines = [*_every_pose(tracks, track, stretches)]
         is_exact = len(lines) == len(stretches)
-    older = stretches[: len(stretches) - len(lines)]
-    line = _joined([*(_of_track(track, each) for each in older), *lines[::-1]])
-    line = _drawn(line, box.pixel_m)
+    older = []
+    for first, last in stretches[: len(stretches) - len(lines)]:
+        part = slice(first, last + 1)
+        begins = np.arange(last + 1 - first) == 0
+        older.append(_Line(track.times[part], track.x[part], track.y[part], begins))
+    line = _drawn(_joined([*older, *lines[::-1]]), box.pixel_m)
     return {
         "frame": frame,
         "exact": is_exact,
@@ -127,12 +130,6 @@ def _every_pose(
         times, at = np.unique(poses.times[fine], return_index=True)
         begins = np.arange(len(times)) == 0
         yield _Line(times, poses.x[fine][at], poses.y[fine][at], begins)
-
-
-def _of_track(track: RobotTrack, stretch: tuple[int, int]) -> _Line:
-    part = slice(stretch[0], stretch[1] + 1)
-    times = track.times[part]
-    return _Line(times, track.x[part], track.y[part], np.arange(len(times)) == 0)
 
 
 def _joined(lines: Sequence[_Line]) -> _Line:

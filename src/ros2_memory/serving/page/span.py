@@ -143,17 +143,20 @@ def span_shown(
         QueryTimeoutError: the call's time is over.
     """
     filling = None if progress is None else progress()
-    snapshot = memory.index.snapshot(_reach(memory))
+    # Of a robot that is on up to a time past the newest bag, so that the folder is scanned.
+    snapshot = memory.index.snapshot(memory.clock.now() if memory.limits.now == "wall" else None)
     version = _version(snapshot, filling, 0 if questions is None else questions.count)
+    now = moment(memory.now(memory.clock.now(), snapshot.latest))
     if version == request.version:
-        return {"version": version, "unchanged": True, "now": moment(_now(memory, snapshot))}
+        return {"version": version, "unchanged": True, "now": now}
     earliest, latest = snapshot.dating.earliest, snapshot.dating.latest
     shown: JsonObject = {
         "version": version,
-        "now": moment(_now(memory, snapshot)),
+        "now": now,
         "latest": moment(latest),
         "filling": None
-        if filling is None or _keeps_up(filling)
+        # Without the newest of many bags, as while recording, the store is as good as full.
+        if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
         else {"closed": filling.closed, "waiting": filling.waiting},
     }
     if questions is not None and questions.is_on:
@@ -173,7 +176,9 @@ def span_shown(
         return shown
     window = request.window(earliest, latest)
     fresh = _fresh(snapshot, window, request.since_s)
-    shown |= {"start": _start_s(window), "end": _end_s(window), "since": _start_s(fresh)}
+    # Rounded away from the span, so that one that is asked again holds all that it did.
+    end_s = -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
+    shown |= {"start": _start_s(window), "end": end_s, "since": _start_s(fresh)}
     notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
@@ -228,15 +233,6 @@ def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> Tim
     return TimeWindow(max(begins, window.start), window.stop)
 
 
-def _reach(memory: Memory) -> Ns | None:
-    """Returns a time past the newest bag of a robot that is on, so that the folder is scanned."""
-    return memory.clock.now() if memory.limits.now == "wall" else None
-
-
-def _now(memory: Memory, snapshot: Snapshot) -> Ns:
-    return memory.now(memory.clock.now(), snapshot.latest)
-
-
 def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> str:
     """Returns another text whenever there is more to be shown."""
     counts = (
@@ -250,11 +246,6 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
     return "-".join(map(str, counts))
 
 
-def _keeps_up(filling: Progress) -> bool:
-    """Whether the store lacks nothing but the newest of many bags, as while recording."""
-    return filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
-
-
 def _s(at: Ns) -> float:
     """Returns Unix seconds to the millisecond: a pixel of the page is more."""
     return round(unix_from_ns(at), 3)
@@ -263,10 +254,6 @@ def _s(at: Ns) -> float:
 def _start_s(window: TimeWindow) -> float:
     """Returns the begin to the millisecond: asked from there, a span holds all that it did."""
     return (window.start + START_SLACK_NS) // NS_PER_MS / 1000
-
-
-def _end_s(window: TimeWindow) -> float:
-    return -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
 
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
