@@ -8,7 +8,6 @@ import re
 from typing import TYPE_CHECKING, Final
 
 import pytest
-from prometheus_client import CollectorRegistry, generate_latest
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import OWN_FOLDER
@@ -35,7 +34,7 @@ from ros2_memory.bootstrap import claim
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.history.context import Call
 from ros2_memory.insights.status import memory_status
-from ros2_memory.observability.prometheus import MemoryGauges, _Collector
+from ros2_memory.observability.prometheus import MemoryGauges, Metrics
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
@@ -193,5 +192,7 @@ async def test_nothing_more_is_served_or_deleted(
     health = Health(memory, "1")
     json.dumps(await health(), ensure_ascii=False).encode()
     health.stop()
-    generate_latest(_Collector(CollectorRegistry(), MemoryGauges(memory)(), "1"))
+    metrics = Metrics(MemoryGauges(memory), "1", timeout_s=60)
+    assert b"ros2_memory_bags" in (await metrics.exposition()).body
+    metrics.stop()
     assert deleted(root) <= right[1]

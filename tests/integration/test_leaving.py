@@ -6,26 +6,23 @@ import asyncio
 import json
 import threading
 from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import anyio
 import pytest
 
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.serving.web_app import web_app
-from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies
 from tests.soak.clients import modern, opening
 from tests.soak.wire import call, connected, head, posted
 from tests.support.processes import BOUND_S, listening
+from tests.unit.serving.test_dispatch import served, tool
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.context import Call
 
 
 class Endless:
@@ -45,24 +42,14 @@ class Endless:
 
 @asynccontextmanager
 async def serving(query: Endless) -> AsyncIterator[tuple[int, Dispatcher]]:
-    schema: dict[str, Any] = {"type": "object", "properties": {}}
-    asked = Tool(
-        "endless",
-        "Endless",
-        lambda: ("Never ends.", schema),
-        True,
-        lambda _: lambda _, call: query.ask(call),
-    )
-    replies = Replies(Path("bags"), 1000)
-    dispatcher = Dispatcher(cast("Memory", None), [asked], replies, call_timeout_s=3600)
-    server = EpisodicServer(dispatcher, name="x", version="1", instructions="")
+    server = served(tool("endless", query.ask, blocking=True), timeout_s=3600)
 
     async def health() -> Any:
         return {"status": "ok"}
 
     app = web_app(server, host="127.0.0.1", health=health, background=anyio.sleep_forever)
     async with listening(app, lifespan="on") as running:
-        yield running.servers[0].sockets[0].getsockname()[1], dispatcher
+        yield running.servers[0].sockets[0].getsockname()[1], server.dispatcher
 
 
 async def set_in_time(event: threading.Event) -> None:

@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import threading
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from mcp import Client, MCPError
 
-from ros2_memory import results
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
-from ros2_memory.core.model import Sample
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
-from ros2_memory.history.context import Memory
-from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.serving.mcp_server import EpisodicServer
-from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies
+from tests.unit.serving.test_dispatch import served, tool, value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from opentelemetry.sdk.trace import ReadableSpan
     from prometheus_client.metrics_core import Metric
+
+    from ros2_memory.history.context import Call
+    from ros2_memory.results import Answer
+    from ros2_memory.serving.mcp_server import EpisodicServer
 
 pytest.importorskip("prometheus_client", reason="needs the extra observability")
 pytest.importorskip("opentelemetry.sdk", reason="needs the extra observability")
@@ -77,16 +75,8 @@ class TestMetrics:
 
     async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
         metrics = Metrics(lambda: (), "1")
-        tools = [
-            Tool("full", "f", lambda: ("A.", {}), blocking=False, question=partial(asking, "full"))
-        ]
-        dispatcher = Dispatcher(
-            cast("Memory", None),
-            tools,
-            Replies(Path("bags"), 1000),
-            call_timeout_s=5,
-            telemetry=Telemetry((metrics,)),
-        )
+        full = tool("full", partial(asking, "full"))
+        dispatcher = served(full, telemetry=Telemetry((metrics,))).dispatcher
         hostile = ['a"} 1\nup 0\n#', "\\", "\x00", "\ud800", "x" * 100_000, "full\n", "", "{"]
         await dispatcher.answer("full", {})
         for n in range(200):
@@ -137,31 +127,17 @@ def spans(
     provider.shutdown()
 
 
-def asking(name: str, _given: Any) -> Any:
-    def asked(_memory: Any, call: Any) -> Any:
-        with call.stages.timed("read"):
-            if name == "empty":
-                raise NoDataError(NoDataReason.GAP, "a hole")
-            return results.TopicValue("/a", "a/msg/A", Sample(0, 7))
-
-    return asked
+def asking(name: str, call: Call) -> Answer:
+    with call.stages.timed("read"):
+        if name == "empty":
+            raise NoDataError(NoDataReason.GAP, "a hole")
+        return value(7)
 
 
 def traced() -> EpisodicServer:
-    schema: dict[str, Any] = {"type": "object", "properties": {}}
-    tools = [
-        Tool(name, name, lambda: ("Asks.", schema), blocking=False, question=partial(asking, name))
-        for name in ("full", "empty")
-    ]
+    tools = [tool(name, partial(asking, name)) for name in ("full", "empty")]
     provider: Any = trace.get_tracer_provider()
-    dispatcher = Dispatcher(
-        cast("Memory", None),
-        tools,
-        Replies(Path("bags"), 1000),
-        call_timeout_s=5,
-        telemetry=Telemetry((Traces(provider),)),
-    )
-    return EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
+    return served(*tools, telemetry=Telemetry((Traces(provider),)))
 
 
 def reply(exporter: InMemorySpanExporter, outcome: str) -> ReadableSpan:

@@ -57,10 +57,9 @@ def value(shown: Any) -> results.TopicValue:
     return results.TopicValue("/a", "a/msg/A", Sample(0, shown))
 
 
-def served(*tools: Tool, timeout_s: float = 25.0, max_chars: int = 24_000) -> EpisodicServer:
-    dispatcher = Dispatcher(
-        NOBODY, tools, Replies(Path("bags"), max_chars), call_timeout_s=timeout_s
-    )
+def served(*tools: Tool, timeout_s: float = 25.0, **options: Any) -> EpisodicServer:
+    replies = Replies(Path("bags"), 24_000)
+    dispatcher = Dispatcher(NOBODY, tools, replies, call_timeout_s=timeout_s, **options)
     return EpisodicServer(dispatcher, name="episodic", version="1.2.3", instructions="Ask away.")
 
 
@@ -345,9 +344,7 @@ async def test_stopping_has_running_queries_give_up() -> None:
 
 
 async def test_arguments_are_left_out_of_the_log_where_they_are_not_wanted(log: LogCapture) -> None:
-    tools = [tool("ask", lambda _: value(1))]
-    replies = Replies(Path("bags"), 24_000)
-    silent = Dispatcher(NOBODY, tools, replies, call_timeout_s=25, log_arguments=False)
+    silent = served(tool("ask", lambda _: value(1)), log_arguments=False).dispatcher
     await silent.answer("ask", {"s3cret": "s3cret"})
     await silent.answer("s3cret", {"s3cret": "s3cret"})
     assert [(each["event"], each["tool"]) for each in log.entries] == [

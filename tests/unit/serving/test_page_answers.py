@@ -65,6 +65,8 @@ if TYPE_CHECKING:
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
 BEGIN_S = 1_784_000_000
+NOTHING: Any = None
+moment_of = partial(moment_asked, memory=NOTHING, call=NOTHING)
 
 
 @pytest.fixture(scope="module")
@@ -229,8 +231,16 @@ def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
         (window_asked, "start=2&end=1", "give start"),
         (box_asked, "x0=0&y0=0&x1=1&y1=1", "give x0"),
         (box_asked, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
-        (partial(moment_asked, memory=None, call=None), "label=cup", "give t, or start and end"),
-        (partial(moment_asked, memory=None, call=None), f"t=1&label={'x' * 201}", "longer than"),
+        (
+            moment_of,
+            "label=cup",
+            "give t, or start and end",
+        ),
+        (
+            moment_of,
+            f"t=1&label={'x' * 201}",
+            "longer than",
+        ),
     ],
 )
 def test_what_cannot_be_asked_is_refused_with_the_reason(read: Any, query: str, why: str) -> None:

@@ -3,22 +3,15 @@ from __future__ import annotations
 import json
 import socket
 from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import anyio
 import httpx2
 import pytest
 
-from ros2_memory import results
-from ros2_memory.core.model import Sample
-from ros2_memory.history.context import Memory
-from ros2_memory.serving.dispatch import Dispatcher
-from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.serving.page.routes import page_routes
 from ros2_memory.serving.web_app import web_app
-from ros2_memory.tools.declaration import Tool
-from ros2_memory.tools.replies import Replies
+from tests.unit.serving.test_dispatch import served, tool, value
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -38,15 +31,7 @@ def app(
     api_token: str | None = None,
     recorder: dict[str, Any] | None = None,
 ) -> ASGIApp:
-    schema: dict[str, Any] = {"type": "object", "properties": {}}
-    reply = results.TopicValue("/a", "a/msg/A", Sample(0, 7))
-    tool = Tool(
-        "ask", "Ask", lambda: ("Asks.", schema), blocking=False, question=lambda _: lambda *_: reply
-    )
-    dispatcher = Dispatcher(
-        cast("Memory", None), [tool], Replies(Path("bags"), 1000), call_timeout_s=5
-    )
-    server = EpisodicServer(dispatcher, name="episodic", version="1", instructions="")
+    server = served(tool("ask", lambda _: value(7)))
 
     async def health() -> Any:
         known = {} if recorder is None else {"recorder": recorder}
@@ -58,7 +43,7 @@ def app(
         health=health,
         background=background,
         api_token=api_token,
-        page=page_routes(dispatcher),
+        page=page_routes(server.dispatcher),
     )
 
 
