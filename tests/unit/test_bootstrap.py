@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 from mcp import Client
 
+from ros2_memory import package_version
 from ros2_memory.bootstrap import (
     build_memory,
     build_reader,
@@ -95,13 +97,6 @@ async def test_the_server_is_built_as_configured(
         }
         assert info.version == version("ros2-memory") == package_version()
     assert expected in texts[key]
-
-
-async def test_the_whole_house_answers_every_question_from_a_bag(tmp_path: Path) -> None:
-    write_run(tmp_path)
-    chosen = settings(tmp_path, "data.now=latest")
-    async with Client(build_server(chosen, build_memory(chosen))) as client:
-        await ask_everything(client)
 
 
 async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:

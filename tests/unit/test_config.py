@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.recorder.base import NullRecorder
 from tests.support.config_folders import MCAP, NONE, ROS2BAG, ROSBAG2, refusal
 from tests.support.examples import examples
 
