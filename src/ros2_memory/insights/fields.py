@@ -45,8 +45,11 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         )
     failure = ""
     for topic in topics:
-        found = view.stream.newest(topic, TimeWindow.everything())
-        if found is None or found.type != type_name:
+        # A topic may have changed its type since.
+        last = timeline.totals(topic)[type_name].last
+        among = view.stream.messages([topic], TimeWindow.until(last), newest_first=True)
+        found = next((each for each in among if each.type == type_name), None)
+        if found is None:
             continue
         try:
             message = memory.reader.decode(found.record)
@@ -61,7 +64,7 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
         return TypeFields(type_name, tuple(topics), shown, notes=view.notes.sentences())
     raise NoDataError(
         NoDataReason.UNDECODABLE,
-        f"no newest message of this type can be read: {failure or 'others came after it'}",
+        f"no newest message of this type can be read: {failure or 'none is left'}",
     )
 
 

@@ -62,19 +62,21 @@ if TYPE_CHECKING:
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
 _PROOF_BYTES: Final = 200
+_LAST_NS: Final[Ns] = MAX_NS - 1
+"""The last possible log time; the first is 0, as in MCAP: so no length of time overflows."""
 _TOTALS: Final = """
     SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END AS topic, count(*),
            min(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
            max(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
            sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
-           timestamp IS ? AS impossible
+           timestamp NOT BETWEEN 0 AND ? AS impossible
     FROM messages NOT INDEXED GROUP BY topic, impossible
 """
 _PAUSES: Final = """
     SELECT before, timestamp FROM (
         SELECT timestamp, lag(timestamp) OVER (ORDER BY timestamp) AS before
         FROM messages NOT INDEXED
-        WHERE timestamp <= ? AND topic_id IN (SELECT value FROM json_each(?))
+        WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
     ) WHERE timestamp - before > ?
 """
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
@@ -157,9 +159,9 @@ class SqliteBags:
         """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
             found: list[tuple[int, int, int, int, int, int]]
-            found = base.execute(_TOTALS, (MAX_NS,)).fetchall()
+            found = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
             right = self._is_indexed_right(base, topics)
-            asked = (MAX_NS - 1, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
+            asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
         if any(wrong for *_, wrong, _ in found):
             raise UnreadableError(
@@ -334,7 +336,7 @@ def _ordered_rows(
 ) -> sqlite3.Cursor:
     """Returns log time, row and topic of the messages, in order; by an index if `indexed`."""
     query = _DESCENDING if newest_first else _ASCENDING
-    arguments = (window.start, window.stop, json.dumps(list(wanted)))
+    arguments = (max(window.start, 0), window.stop, json.dumps(list(wanted)))
     if not indexed:
         query = query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
     return base.execute(query, arguments)

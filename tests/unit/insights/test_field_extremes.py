@@ -98,3 +98,17 @@ def test_a_window_with_too_many_messages_to_read_says_so(
     answer = asked(tmp_path, driven, "pose.covariance")
     assert answer.extremes == ()
     assert fields.TOO_MANY in answer.notes
+
+
+@pytest.mark.parametrize("apart", [True, False])
+def test_a_type_that_a_topic_had_before_is_described(tmp_path: Path, apart: bool) -> None:
+    """Also where the last message of it and one of the new type have the same log time."""
+    said, flag = text(BEGIN, "a word", "/t"), boolean(BEGIN + apart * S, True, "/t")
+    if apart:
+        write_mcap(tmp_path / "a.mcap", [said])
+        write_mcap(tmp_path / "b.mcap", [flag])
+    else:
+        write_mcap(tmp_path / "a.mcap", [said, flag])
+    for message, kind in ((said, "text"), (flag, "boolean")):
+        answer = fields.describe_type(memory_of(tmp_path), Call(), message.type)
+        assert (answer.topics, answer.fields) == (("/t",), (("value", kind),))

@@ -9,6 +9,7 @@ import tracemalloc
 from contextlib import closing
 from typing import TYPE_CHECKING
 
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 import zstandard
@@ -23,7 +24,6 @@ from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.errors import (
     MAX_CHANNELS,
     MAX_CHUNK_MESSAGES,
-    MAX_CHUNKS,
     SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
@@ -77,9 +77,24 @@ def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
 
 
 class TestChunks:
-    def test_a_chunk_larger_than_allowed_is_left_out_and_named(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("stated", [10, 1 << 40])
+    @pytest.mark.parametrize(
+        ("compression", "packed"),
+        [("zstd", rle_frame(300 * MB)), ("lz4", lz4.frame.compress(bytes(300 * MB)))],
+    )
+    def test_a_chunk_larger_than_allowed_is_left_out_and_named(
+        self, tmp_path: Path, compression: str, packed: bytes, stated: int
+    ) -> None:
         whole = chunk_of(bytes_of([*STRINGS, string_message()]))
-        summary = McapReader(max_chunk_mb=1).summarize(bag(tmp_path, whole, bomb(2 * MB)))
+        large = chunk_of(b"", compression, packed=packed, size=stated, crc=0)
+        path = bag(tmp_path, whole, large)
+        tracemalloc.start()
+        try:
+            summary = McapReader(max_chunk_mb=1).summarize(path)
+            _, peak = tracemalloc.get_traced_memory()
+        finally:
+            tracemalloc.stop()
+        assert peak < 10 * MB
         assert summary.count == 1
         assert "larger than the 1 MiB allowed" in summary.notes[0]
         assert "reader.max_chunk_mb" in summary.notes[0]
@@ -166,14 +181,17 @@ class TestChunks:
             == 1
         )
 
-    def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(self, tmp_path: Path) -> None:
+    def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("ros2_memory.storage.mcap.chunk.MAX_CHUNKS", 20)
         first, each = (
             chunk_of(bytes_of([*STRINGS, string_message()])),
             chunk_of(string_message().data),
         )
-        summary = McapReader().summarize(bag(tmp_path, first, *[each] * (MAX_CHUNKS + 1)))
-        assert summary.count == MAX_CHUNKS
-        assert "more than 150000 chunks" in summary.notes[0]
+        summary = McapReader().summarize(bag(tmp_path, first, *[each] * 21))
+        assert summary.count == 20
+        assert "more than 20 chunks" in summary.notes[0]
 
 
 class TestTies:
